@@ -1,0 +1,118 @@
+"""Flat 2D Gaussians: raw, differentiable parameters, their activations, and initial values from points.
+
+N is the number of Gaussians; quaternions are wxyz and need not be unit.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial import cKDTree
+
+from a2tg_jax.numerics import normalize
+
+FLOATS_PER_GAUSSIAN = 58
+INITIAL_OPACITY = 0.1
+SH_C0 = 0.28209479177387814
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Gaussians:
+    """N flat Gaussians as unconstrained arrays, all of one float dtype."""
+
+    means: Array
+    """[N, 3] centres in the world."""
+    quats: Array
+    """[N, 4] rotations, wxyz, not necessarily unit."""
+    log_scales: Array
+    """[N, 2] logarithms of the standard deviations (s_x, s_y) along the first two axes."""
+    logit_opacities: Array
+    """[N] logits of the peak opacities."""
+    sh: Array
+    """[N, 16, 3] spherical-harmonic coefficients of the colour, degree 0 first."""
+
+    @property
+    def num(self) -> int:
+        """Number of rows N."""
+        return self.means.shape[0]
+
+    @property
+    def scales(self) -> Array:
+        """[N, 2] standard deviations, positive."""
+        return jnp.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Array:
+        """[N] peak opacities in (0, 1)."""
+        return jax.nn.sigmoid(self.logit_opacities)
+
+    def __getitem__(self, rows) -> "Gaussians":
+        """The Gaussians of the given rows (slice, mask or index array)."""
+        return jax.tree.map(lambda x: x[rows], self)
+
+
+def rotation_matrices(quats: Array) -> Array:
+    """Rotation matrices [..., 3, 3] of the quaternions [..., 4] (wxyz), which are normalised first."""
+    w, x, y, z = jnp.moveaxis(normalize(quats), -1, 0)
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+
+
+def logit(p: Array) -> Array:
+    """log(p / (1 - p)) for p in (0, 1)."""
+    return jnp.log(p) - jnp.log1p(-p)
+
+
+def init_from_points(points, colors, num: int | None = None, seed: int = 0) -> Gaussians:
+    """Initial Gaussians from points of a sparse reconstruction.
+
+    log-scale = log of the root mean square distance to the 3 nearest neighbours (both axes), uniformly random
+    rotations, opacity 0.1, SH degree 0 from the point's colour, higher degrees 0.
+
+    Args:
+      points: [P, 3] positions, P >= 2.
+      colors: [P, 3] colours in [0, 1].
+      num: how many Gaussians; None or anything >= P takes all the points, less draws that many without replacement.
+      seed: of the drawing and of the rotations.
+
+    Returns:
+      float32 Gaussians, min(num, P) of them.
+
+    Raises:
+      ValueError: if the shapes disagree or there are fewer than two points.
+    """
+    points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
+        raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
+    if num is not None and num < 2:
+        raise ValueError(f"num must be at least 2; got {num}")
+    rng = np.random.default_rng(seed)
+    if num is not None and num < len(points):
+        keep = np.sort(rng.choice(len(points), num, replace=False))
+        points, colors = points[keep], colors[keep]
+    if len(points) < 2:
+        raise ValueError(f"at least two points are needed to choose scales; got {len(points)}")
+    neighbours = min(3, len(points) - 1)
+    distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
+    scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
+    count = len(points)
+    sh = np.zeros((count, 16, 3))
+    sh[:, 0] = (colors - 0.5) / SH_C0
+    quats = rng.normal(size=(count, 4))
+    as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return Gaussians(
+        means=as_float(points),
+        quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
+        log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
+        logit_opacities=as_float(np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))),
+        sh=as_float(sh),
+    )

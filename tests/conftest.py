@@ -1,0 +1,30 @@
+"""Strictness for every test: no silent promotion of dtypes or ranks, warnings are errors (pyproject.toml)."""
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import pathlib
+
+import jax
+import pytest
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture
+def x64():
+    """Runs the test with 64-bit floats."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def shared():
+    """The folder of real scenes and LPIPS weights; the test is skipped where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip(f"real scenes and LPIPS weights are not at {SHARED}")
+    return SHARED
