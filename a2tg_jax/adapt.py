@@ -1,0 +1,263 @@
+"""Where texels go: the gradient statistic, the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
+
+An event of stage 2 reads: average the statistic, propose `next_sizes`, `select` who gets them, `reallocate`. All but
+the statistic runs on the host, on whole arrays.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.numerics import safe_divide
+from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
+
+BYTES_PER_TEXEL = 16
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class GradientStatistics:
+    """Sums for the average, over views, of the norm of Σ_pixels |∂L/∂mean| (A²TG, gradient-driven selection)."""
+
+    total: Array
+    """[N] sum of the norms since the last event."""
+    views: Array
+    """[N] int32, views so far in which the Gaussian was composited at one pixel at least."""
+
+    @staticmethod
+    def init(num: int, dtype=jnp.float32) -> "GradientStatistics":
+        """Empty sums for `num` Gaussians."""
+        return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
+
+    def accumulate(self, norms: Array, is_visible: Array) -> "GradientStatistics":
+        """Adds one view: `norms` [N] counts where `is_visible` [N]."""
+        total = self.total + jnp.where(is_visible, norms, 0.0)
+        return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
+
+    def average(self) -> Array:
+        """[N] average norm over the views that saw the Gaussian; 0 where none did."""
+        return safe_divide(self.total, self.views.astype(self.total.dtype))
+
+
+class ReallocateResult(NamedTuple):
+    """What `reallocate` returns."""
+
+    textures: Textures
+    layout: AtlasLayout
+    moments: Any
+    """As given, carried along with the texels."""
+
+
+def next_sizes(sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: bool = True) -> np.ndarray:
+    """The texture sizes one upscaling would give (A²TG, anisotropic upscaling).
+
+    s_x/s_y > k_A and s_y < k_S: Tu doubles. s_y/s_x > k_A and s_x < k_S: Tv doubles. Otherwise both double. Each
+    axis stops at the cap, so that a 4×1 texture becomes 4×2 at a cap of 4.
+
+    Args:
+      sizes: [N, 2] integers (Tv, Tu).
+      scales: [N, 2] standard deviations (s_x, s_y), in units of the normalised world.
+      k_a: aspect ratio above which a Gaussian is elongated.
+      k_s: shorter scale below which an elongated Gaussian is thin.
+      cap: largest side.
+      anisotropic: False doubles both axes always.
+
+    Returns:
+      [N, 2] int64 (Tv, Tu), nowhere below `sizes`.
+
+    Raises:
+      ValueError: if the shapes differ.
+    """
+    sizes, scales = np.asarray(sizes, np.int64), np.asarray(scales)
+    if sizes.ndim != 2 or sizes.shape[1] != 2 or sizes.shape != scales.shape:
+        raise ValueError(f"sizes and scales must both be [N, 2]; got {sizes.shape} and {scales.shape}")
+    s_x, s_y = scales.T
+    is_thin_u = anisotropic & (s_x > k_a * s_y) & (s_y < k_s)
+    is_thin_v = anisotropic & (s_y > k_a * s_x) & (s_x < k_s)
+    doubles = np.stack([~is_thin_u, ~is_thin_v], axis=1)
+    return np.where(doubles, np.maximum(sizes, np.minimum(2 * sizes, cap)), sizes)
+
+
+def select(
+    statistic,
+    sizes,
+    proposed,
+    *,
+    threshold: float | None = None,
+    fraction: float | None = None,
+    budget_bytes: float | None = None,
+) -> np.ndarray:
+    """Which Gaussians receive their proposed size. Exactly one of the three rules is given.
+
+    * threshold: those whose statistic exceeds it.
+    * fraction: the round(fraction·N) largest statistics, halves rounded up, out of the Gaussians that can still grow
+      and have a statistic above 0.
+    * budget_bytes: in descending order of statistic per added byte, each Gaussian whose added texels still fit in
+      what is left of the budget; one that does not fit is skipped and the search goes on. What stays unspent is less
+      than the cheapest upscale not chosen. Gaussians with a statistic of 0 come last.
+
+    Equal values are taken in the order of the Gaussians. A Gaussian that cannot grow is never selected.
+
+    Args:
+      statistic: [N], at least 0.
+      sizes: [N, 2] current (Tv, Tu).
+      proposed: [N, 2] from `next_sizes`.
+      threshold: in the unit of the statistic.
+      fraction: in [0, 1].
+      budget_bytes: bytes that this event may add (16 a texel), at least 0.
+
+    Returns:
+      [N] bool.
+
+    Raises:
+      ValueError: unless exactly one rule is given, in its range, and the shapes agree.
+    """
+    statistic, sizes, proposed = np.asarray(statistic), np.asarray(sizes), np.asarray(proposed)
+    if sizes.shape != (len(statistic), 2) or proposed.shape != sizes.shape:
+        raise ValueError(
+            f"statistic [N], sizes [N, 2] and proposed [N, 2] must agree; got {statistic.shape}, {sizes.shape}, "
+            f"{proposed.shape}"
+        )
+    if sum(rule is not None for rule in (threshold, fraction, budget_bytes)) != 1:
+        raise ValueError("select needs exactly one of threshold, fraction and budget_bytes")
+    added_bytes = BYTES_PER_TEXEL * (np.prod(proposed, axis=1) - np.prod(sizes, axis=1))
+    can_grow = added_bytes > 0
+    if fraction is not None:
+        return _select_fraction(statistic, can_grow, fraction)
+    if budget_bytes is not None:
+        return _select_budget(statistic, can_grow, added_bytes, budget_bytes)
+    return can_grow & (statistic > threshold)
+
+
+def event_budget(total_bytes: float, current_bytes: float, event_index: int, num_events: int) -> int:
+    """Bytes that event j of m may add: 1/(m - j + 1) of what is left of the memory budget, rounded down.
+
+    Args:
+      total_bytes: largest reported memory (`metrics.parameter_bytes`).
+      current_bytes: reported memory now.
+      event_index: j, from 1.
+      num_events: m.
+
+    Raises:
+      ValueError: if the budget is already exceeded or the event does not exist.
+    """
+    if not 1 <= event_index <= num_events:
+        raise ValueError(f"event_index must lie in 1..{num_events}; got {event_index}")
+    if total_bytes < current_bytes:
+        raise ValueError(
+            f"the memory budget of {total_bytes / 1e6:.3f} MB is below the {current_bytes / 1e6:.3f} MB the Gaussians "
+            "already take: raise the budget or lower the number of Gaussians"
+        )
+    return int((total_bytes - current_bytes) // (num_events - event_index + 1))
+
+
+def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None) -> ReallocateResult:
+    """Rebuilds the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
+
+    Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding
+    is (0, 0, 0, 1) in textures and 0 in moments.
+
+    Args:
+      textures: the present texels.
+      layout: their layout, of N Gaussians.
+      new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+      moments: any pytree of `Textures`, such as (mu, nu) of Adam.
+
+    Raises:
+      ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
+    """
+    new_sizes = np.asarray(new_sizes)
+    if new_sizes.shape != (layout.num, 2):
+        raise ValueError(f"new_sizes must be [{layout.num}, 2]; got {new_sizes.shape}")
+    new_layout, capacities = plan_layout(new_sizes)
+    moves = _plan_moves(layout, new_layout)
+
+    def rebuild(tree: Textures, padding: tuple[float, ...]) -> Textures:
+        old = [np.asarray(bucket) for bucket in tree.buckets]
+        return _move_texels(old, new_layout.resolutions, capacities, moves, padding)
+
+    def rebuild_moments(tree: Textures) -> Textures:
+        return rebuild(tree, (0.0, 0.0, 0.0, 0.0))
+
+    moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
+    return ReallocateResult(rebuild(textures, NEUTRAL_TEXEL), new_layout, moments)
+
+
+class _Move(NamedTuple):
+    """Textures that go from one bucket to another."""
+
+    old_bucket: int
+    new_bucket: int
+    old_rows: np.ndarray
+    new_rows: np.ndarray
+
+
+def _plan_moves(old: AtlasLayout, new: AtlasLayout) -> list[_Move]:
+    """One move per pair of buckets that some Gaussian connects."""
+    num_new = len(new.resolutions)
+    pairs = np.asarray(old.bucket, np.int64) * num_new + np.asarray(new.bucket)
+    order = np.argsort(pairs, kind="stable")
+    codes, starts = np.unique(pairs[order], return_index=True)
+    old_rows, new_rows = np.asarray(old.row)[order], np.asarray(new.row)[order]
+    stops = [*starts[1:], len(order)]
+    return [
+        _Move(int(code) // num_new, int(code) % num_new, old_rows[start:stop], new_rows[start:stop])
+        for code, start, stop in zip(codes, starts, stops, strict=True)
+    ]
+
+
+def _move_texels(old, resolutions, capacities, moves: list[_Move], padding: tuple[float, ...]) -> Textures:
+    """New buckets of the given shapes, filled with `padding` and then with the moved texels."""
+    dtype = old[0].dtype if old else np.float32
+    buckets = []
+    for capacity, resolution in zip(capacities, resolutions, strict=True):
+        buckets.append(np.broadcast_to(np.asarray(padding, dtype), (capacity, *resolution, 4)).copy())
+    for move in moves:
+        source, target = old[move.old_bucket], buckets[move.new_bucket]
+        v, u = (_nearest(source.shape[axis], target.shape[axis]) for axis in (1, 2))
+        target[move.new_rows] = source[move.old_rows][:, v][:, :, u]
+    return Textures(tuple(jnp.asarray(bucket) for bucket in buckets))
+
+
+def _nearest(old: int, new: int) -> np.ndarray:
+    """[new] index of the old texel nearest to each new one along a side: ⌊(j + 1/2)·old/new⌋, in integers."""
+    return (2 * np.arange(new) + 1) * old // (2 * new)
+
+
+def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: float) -> np.ndarray:
+    if not 0 <= fraction <= 1:
+        raise ValueError(f"fraction must lie in [0, 1]; got {fraction}")
+    candidates = np.flatnonzero(can_grow & (statistic > 0))
+    order = np.argsort(-statistic[candidates], kind="stable")
+    num = math.floor(fraction * len(statistic) + 0.5)
+    return _mask(len(statistic), candidates[order[:num]])
+
+
+def _select_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget: float) -> np.ndarray:
+    if not budget >= 0:
+        raise ValueError(f"budget_bytes must be at least 0; got {budget}")
+    candidates = np.flatnonzero(can_grow & (statistic >= 0))
+    gain = statistic[candidates].astype(np.float64) / cost[candidates]
+    queue = candidates[np.argsort(-gain, kind="stable")]
+    chosen = []
+    # Whatever fails once fails for good, for the rest of the budget only shrinks. So each round takes all up to the
+    # first that does not fit and drops everything dearer than the rest: one round per distinct cost at most.
+    while len(queue):
+        spent = np.cumsum(cost[queue])
+        num = int(np.searchsorted(spent, budget, side="right"))
+        chosen.append(queue[:num])
+        budget -= int(spent[num - 1]) if num else 0
+        queue = queue[num:]
+        queue = queue[cost[queue] <= budget]
+    return _mask(len(statistic), np.concatenate(chosen) if chosen else [])
+
+
+def _mask(num: int, chosen) -> np.ndarray:
+    mask = np.zeros(num, bool)
+    mask[np.asarray(chosen, np.int64)] = True
+    return mask

@@ -1,0 +1,301 @@
+"""The command line `a2tg`: demo, train, eval, render, info, sfm."""
+
+import dataclasses
+import inspect
+import os
+import shlex
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from a2tg_jax.config import DensifyConfig, TrainConfig
+from a2tg_jax.data import Scene, run_sfm
+from a2tg_jax.results.evaluate_run import evaluate_run
+from a2tg_jax.results.folder import PHASES, Phase, RunFolder, check_free, create_run, open_run
+from a2tg_jax.results.frames import Route, render_frames, write_video
+from a2tg_jax.results.info import describe_run
+from a2tg_jax.results.record import SYNTHETIC, RunRecord, SceneSource, changed_fields, read_record, write_record
+from a2tg_jax.results.summary import summary_text
+from a2tg_jax.results.train_run import train_run
+from a2tg_jax.startup import configure_cpu
+
+PRESETS = {"paper": TrainConfig.paper, "quick": TrainConfig.quick}
+DEMO_SOURCE = SceneSource(SYNTHETIC)
+DEMO_CONFIG = TrainConfig(stage1_iterations=600, stage2_iterations=400, densify=DensifyConfig(cap=2_000))
+
+OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
+
+Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
+
+  a2tg demo                            a whole run on a built-in scene, under 3 minutes on two cores
+  a2tg sfm photos/ scene/              camera poses for plain photographs, by COLMAP
+  a2tg train scene/ --out runs/scene   train in two stages, evaluate, write a report
+  a2tg eval runs/scene                 measure a run again
+  a2tg render runs/scene               frames and a video of a flight, or the test views
+  a2tg info runs/scene                 what a run folder holds
+
+a2tg COMMAND --help explains a command, a2tg --version tells the version.
+With A2TG_DEBUG=1 in the environment an error shows its traceback."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Train the built-in synthetic scene with textures and, for comparison, without.
+
+    Takes under 3 minutes on two cores and writes a report with pictures: open runs/demo/report.html.
+    """
+
+    out: Path = Path("runs/demo")
+    """Run folder."""
+    overwrite: bool = False
+    """Replace an earlier run in that folder."""
+
+    def run(self) -> None:
+        _begin(RunRecord(DEMO_SOURCE, DEMO_CONFIG, baseline=True), self.out, overwrite=self.overwrite)
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a scene in two stages, evaluate it and write a report.
+
+    Examples:
+      a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
+      a2tg train scenes/fox --out runs/fox --resume
+      a2tg train scenes/fox --out runs/small --texture.select budget --texture.budget-mb 20 --baseline
+
+    A checkpoint is written every tenth of a stage and at least every 500 iterations; the newest two are kept.
+    """
+
+    scene: Positional[str]
+    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic" for the built-in scene."""
+    out: Path
+    """Run folder: models, checkpoints, metrics, pictures and report.html go there."""
+    preset: Literal["paper", "quick"] = "paper"
+    """Where the numbers below start from; quick is useful on two cores in minutes."""
+    downscale: int = 1
+    """Use the images at 1/k of their size."""
+    test_every: int = 8
+    """Every k-th image is kept for testing."""
+    baseline: bool = False
+    """Also train a second stage of the same length without textures, to compare with."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the run folder."""
+    overwrite: bool = False
+    """Replace an earlier run in that folder."""
+    lpips_weights: Path | None = None
+    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+    config: Annotated[TrainConfig, arg(name="")] = dataclasses.field(default_factory=TrainConfig.paper)
+
+    def run(self) -> None:
+        if self.resume:
+            run = self._resumed()
+            _train_and_report(run, read_record(run).source.load(), self.lpips_weights)
+        else:
+            _begin(self.record, self.out, overwrite=self.overwrite, lpips_weights=self.lpips_weights)
+
+    @property
+    def record(self) -> RunRecord:
+        """The run that the flags ask for."""
+        path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
+        return RunRecord(SceneSource(path, self.downscale, self.test_every), self.config, self.baseline)
+
+    def _resumed(self) -> RunFolder:
+        """The existing run folder, after a check that no flag contradicts it."""
+        if self.overwrite:
+            raise ValueError("--resume goes on with a run and --overwrite deletes it: give one of them")
+        run = open_run(self.out)
+        kept = read_record(run)
+        if self.record.source.path != kept.source.path:
+            raise ValueError(f"{run.path} was trained on {kept.source.path}, not on {self.record.source.path}")
+        default = SceneSource(kept.source.path)
+        changed = changed_fields(self.record.source, default, kept.source)
+        changed += changed_fields(self.config, PRESETS[self.preset](), kept.config)
+        if changed:
+            flags = ", ".join("--" + name.replace("_", "-") for name in changed)
+            raise ValueError(f"--resume takes every number from {run.config}; leave out {flags}")
+        if self.baseline and not kept.baseline:
+            write_record(run, dataclasses.replace(kept, baseline=True))
+        return run
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Measure the finished stages of a run again and rewrite metrics, pictures and report.
+
+    Example:
+      a2tg eval runs/fox --lpips-weights lpips_alex.npz
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+    lpips_weights: Path | None = None
+    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+
+    def run(self) -> None:
+        run = open_run(self.folder)
+        print(summary_text(evaluate_run(run, lpips_weights=self.lpips_weights)))
+        print(f"report: {run.report}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render frames of a finished run: PNG files and, of a flight and where ffmpeg is installed, a video.
+
+    Examples:
+      a2tg render runs/fox --frames 240
+      a2tg render runs/fox --path test --out fox-test
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+    path: Route = "smooth"
+    """A smooth flight past the cameras, or the test views."""
+    frames: int = 120
+    """Length of the flight in frames, 30 a second."""
+    out: Path | None = None
+    """Folder for the frames (default: RUN/frames)."""
+    phase: Phase = "stage2"
+    """Whose model is drawn; baseline where the run has one."""
+
+    def run(self) -> None:
+        run = open_run(self.folder)
+        out = self.out or run.path / "frames"
+        paths = render_frames(run, out, route=self.path, num_frames=self.frames, phase=self.phase)
+        print(f"{len(paths)} frames in {out}")
+        if self.path == "smooth":
+            video = out / "flight.mp4"
+            made = write_video(out, video)
+            print(f"video: {video}" if made else "no video: ffmpeg is not installed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Print what a run folder holds: scene, progress of each stage, models, metrics."""
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+
+    def run(self) -> None:
+        print(describe_run(open_run(self.folder)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sfm:
+    """Find camera poses and points for plain photographs with COLMAP's features, matching and mapping.
+
+    Example:
+      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox
+    """
+
+    photos: Positional[Path]
+    """Folder of photographs of one scene."""
+    out: Positional[Path]
+    """Scene folder to make: images and sparse model, ready for a2tg train."""
+
+    def run(self) -> None:
+        run_sfm(self.photos, self.out)
+        print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
+
+
+Command = Demo | Train | Eval | Render | Info | Sfm
+COMMANDS: dict[str, type] = {"demo": Demo, "train": Train, "eval": Eval, "render": Render, "info": Info, "sfm": Sfm}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+      argv: arguments without the program's name; None: those of the process.
+
+    Returns:
+      The exit code: 0, 2 after a user's error (one line on stderr), 130 when interrupted.
+    """
+    name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
+    if name in ("-h", "--help", "--version"):
+        print(version("a2tg-jax") if name == "--version" else OVERVIEW)
+        return 0
+    if name not in COMMANDS:
+        return _fail(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
+    configure_cpu()
+    command = _parse(name, arguments)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            command.run()
+    except KeyboardInterrupt:
+        print(f"\na2tg: interrupted{_how_to_go_on(command)}", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        if os.environ.get("A2TG_DEBUG"):
+            raise
+        return _fail(str(error))
+    return 0
+
+
+def _fail(message: str) -> int:
+    """Prints an error as one line and returns its exit code."""
+    print(f"a2tg: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _parse(name: str, arguments: list[str]) -> Command:
+    """The command that the arguments ask for. A preset is looked at first: it decides the numbers' defaults."""
+    kind, default = COMMANDS[name], {}
+    if kind is Train:
+        config = PRESETS.get(_value_of("--preset", arguments), TrainConfig.paper)()
+        default = {"default": Train(scene=tyro.MISSING, out=tyro.MISSING, config=config)}
+    return tyro.cli(kind, prog=f"a2tg {name}", description=inspect.getdoc(kind), args=arguments, **default)
+
+
+def _value_of(flag: str, arguments: list[str]) -> str:
+    """The value after `flag`, as "--flag value" or "--flag=value"; empty without it."""
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        if word == flag:
+            return following
+        if word.startswith(flag + "="):
+            return word.split("=", 1)[1]
+    return ""
+
+
+def _begin(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None = None) -> None:
+    """Makes the run folder, once it is sure that the scene can be loaded, and trains."""
+    check_free(out, overwrite=overwrite)
+    scene = record.source.load()
+    run = create_run(out, overwrite=overwrite)
+    write_record(run, record)
+    _train_and_report(run, scene, lpips_weights)
+
+
+def _train_and_report(run: RunFolder, scene: Scene, lpips_weights: Path | None) -> None:
+    """Trains what is not trained yet, evaluates, and says where the report is."""
+    train_run(run, scene)
+    print(summary_text(evaluate_run(run, scene, lpips_weights=lpips_weights)))
+    print(f"report: {run.report}")
+
+
+def _how_to_go_on(command: Command) -> str:
+    """Where the newest checkpoint is and how to resume, if the command was training."""
+    if not isinstance(command, Demo | Train):
+        return ""
+    run = RunFolder(command.out)
+    checkpoints = [path for phase in PHASES for path in run.checkpoints(phase)]
+    if not run.config.is_file():
+        return ""
+    scene = command.scene if isinstance(command, Train) else SYNTHETIC
+    again = shlex.join(["a2tg", "train", scene, "--out", str(command.out), "--resume"])
+    last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
+    return f"; {last}; go on with: {again}"
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"a2tg: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+"""Scenes that COLMAP reconstructed: a sparse model (.bin or .txt) beside a folder of images."""
+
+import logging
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, read_pixels
+from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
+
+MODEL_FOLDERS = ("sparse/0", "sparse", ".")
+"""Where a scene folder keeps its model, in order of preference."""
+EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
+"""A points3D file with no points in it."""
+
+logger = logging.getLogger(__name__)
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder of the sparse model of a scene folder, or None."""
+    folders = [path / folder for folder in MODEL_FOLDERS]
+    return next((folder for folder in folders if _model_suffix(folder) is not None), None)
+
+
+def load_colmap(path: Path, *, downscale: int, test_every: int) -> Scene:
+    """Reads a COLMAP scene: every registered image as a pinhole view, and the sparse points.
+
+    Args:
+      path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) is looked for there,
+        beside the model, and up to two folders above it.
+      downscale, test_every: as in `load_scene`.
+
+    Raises:
+      FileNotFoundError: if there is no model, no folder of images, or an image of the model is missing.
+      ValueError: if the model or an image cannot be read, an image has another aspect than its camera, a camera is no
+        pinhole and cannot be made one, or no scene can be made of the views (`assemble_scene`).
+    """
+    model = find_model(path)
+    if model is None:
+        raise FileNotFoundError(f"{path}: has no sparse model; sparse/0 with cameras, images and points3D is wanted")
+    reconstruction = _read_model(model)
+    images_folder = _find_images_folder(path, model, downscale)
+    lenses = {key: Lens(camera) for key, camera in reconstruction.cameras.items()}
+    registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
+    _log_unregistered(images_folder, len(registered))
+
+    def shoot(image: Any) -> Shot:
+        return _shot(image, lenses[image.camera_id], images_folder, downscale)
+
+    train, test = every_kth(map_in_threads(shoot, registered), test_every)
+    return assemble_scene(path.resolve().name, train, test, read_points(reconstruction), source=str(path))
+
+
+def read_points(reconstruction: Any) -> PointCloud:
+    """The points of a pycolmap.Reconstruction, in the order of their ids."""
+    points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
+    return PointCloud(
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+    )
+
+
+def viewmat_of(image: Any) -> np.ndarray:
+    """World-to-camera matrix [4, 4] of a registered pycolmap.Image (a method since pycolmap 4, a property before)."""
+    pose = image.cam_from_world
+    viewmat = np.eye(4)
+    viewmat[:3] = (pose() if callable(pose) else pose).matrix()
+    return rigid_viewmat(viewmat, image.name)
+
+
+def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Shot:
+    """One registered image, undistorted and downscaled."""
+    file, still_to_downscale = locate_image(images_folder, image.name, downscale)
+    pixels = read_pixels(file)
+    check_aspect(file, pixels, *lens.size)
+    try:
+        pixels, K = lens.undistort(pixels, still_to_downscale)
+    except ValueError as error:
+        raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
+    return Shot(image.name, viewmat_of(image), K, pixels)
+
+
+def _model_suffix(folder: Path) -> str | None:
+    """ ".bin" or ".txt", whichever a folder keeps a model in (COLMAP prefers .bin), or None."""
+    for suffix in EMPTY_POINTS:
+        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def _read_model(model: Path) -> Any:
+    """The pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
+    try:
+        with _with_points_file(model) as folder:
+            return pycolmap().Reconstruction(str(folder))
+    except (ValueError, RuntimeError, IndexError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{model}: cannot be read as a COLMAP model ({reason}); export it again") from None
+
+
+@contextmanager
+def _with_points_file(model: Path) -> Iterator[Path]:
+    """The model's folder, or, where points3D is missing, a temporary one like it with an empty points3D."""
+    suffix = _model_suffix(model) or ".bin"
+    if (model / f"points3D{suffix}").is_file():
+        yield model
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for file in model.glob(f"*{suffix}"):
+            (Path(folder) / file.name).write_bytes(file.read_bytes())
+        (Path(folder) / f"points3D{suffix}").write_bytes(EMPTY_POINTS[suffix])
+        yield Path(folder)
+
+
+def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
+    """The folder `images` (it need not exist where `images_k` does) of the scene that the model belongs to."""
+    model = model.resolve()
+    for base in (path.resolve(), model, *model.parents[:2]):
+        if (base / "images").is_dir() or (downscale > 1 and (base / f"images_{downscale}").is_dir()):
+            return base / "images"
+    raise FileNotFoundError(f"{path}: has no folder 'images'; put the photographs of the model there")
+
+
+def _log_unregistered(images_folder: Path, num_registered: int) -> None:
+    """Tells how many files beside the registered images are left aside."""
+    if images_folder.is_dir():
+        others = sum(file.is_file() for file in images_folder.rglob("*")) - num_registered
+        if others > 0:
+            logger.info("%s: %d files have no pose in the model and are not used", images_folder, others)

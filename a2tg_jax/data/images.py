@@ -1,0 +1,98 @@
+"""Finding, reading and resizing photographs. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4]."""
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from PIL import Image
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+"""Tried in this order on image paths written without a suffix."""
+MAX_ASPECT_ERROR = 0.01
+"""Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
+    """The file of one image and the factor by which it is still to be downscaled.
+
+    Args:
+      folder: the folder of the full images; with downscale k, its sibling `<folder>_k` is preferred where it exists.
+      name: path of the image below the folder; the suffix may be missing.
+      downscale: k >= 1.
+
+    Raises:
+      FileNotFoundError: naming the image, if it is not there.
+    """
+    smaller = folder.with_name(f"{folder.name}_{downscale}")
+    if downscale > 1 and smaller.is_dir():
+        folder, downscale = smaller, 1
+    for candidate in (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)):
+        if candidate.is_file():
+            return candidate, downscale
+    raise FileNotFoundError(
+        f"{folder / name}: no such image, but the scene has a camera for it; "
+        f"put the image there or remove the camera from the model"
+    )
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """The pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
+
+    Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
+
+    Raises:
+      ValueError: naming the file, if it cannot be read as an image of 8 bits per channel.
+    """
+    try:
+        with Image.open(path) as image:
+            if image.mode.startswith(("I", "F")):
+                raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
+            has_alpha = "A" in image.getbands() or "transparency" in image.info
+            pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{path}: cannot be read as an image ({error}); replace or remove it") from error
+    return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
+
+
+def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The image at another size, each new pixel the average over its area (weighted with alpha where there is one)."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+
+
+def downscaled_size(width: int, height: int, downscale: int) -> tuple[int, int]:
+    """(width, height) divided by the factor, rounded, at least 1."""
+    return max(1, round(width / downscale)), max(1, round(height / downscale))
+
+
+def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> None:
+    """Raises ValueError if the image cannot be the camera's width × height at another size.
+
+    Raises:
+      ValueError: naming the file and both sizes.
+    """
+    image_height, image_width = pixels.shape[:2]
+    ratio = (image_width * height) / (image_height * width)
+    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(image_width, image_height)):
+        raise ValueError(
+            f"{path}: is {image_width}x{image_height}, but its camera is {width}x{height}, of another aspect; "
+            f"use the image that the camera was estimated from"
+        )
+
+
+def scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int]) -> np.ndarray:
+    """K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
+    return np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
+
+
+def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """[function(item) for item in items], several at a time; decoding and resizing images leave Python's lock."""
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        return list(pool.map(function, items))

@@ -1,0 +1,112 @@
+"""From any camera model of COLMAP to a pinhole: its intrinsics and its image without distortion."""
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsics
+
+PINHOLE_TOLERANCE = 1e-3
+"""Pixels by which a camera may differ from a pinhole, anywhere in its image, and still be taken for one."""
+ROWS_AT_ONCE = 128
+"""Rows of an image that are undistorted together; bounds the memory."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lens:
+    """A calibrated camera of any COLMAP model. Pixel centres lie at +0.5, as COLMAP has them."""
+
+    camera: Any
+    """pycolmap.Camera, at the size it was calibrated for."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the images it was calibrated for."""
+        return self.camera.width, self.camera.height
+
+    @cached_property
+    def is_pinhole(self) -> bool:
+        """Whether the camera projects as its calibration matrix does (models with zero distortion do)."""
+        width, height = self.size
+        grid = np.stack(np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5)), -1).reshape(-1, 2)
+        rays = np.asarray(self.camera.cam_from_img(grid))
+        projected = _homogeneous(rays) @ self.camera.calibration_matrix()[:2].T
+        return bool(np.abs(projected - grid).max() <= PINHOLE_TOLERANCE)  # False for NaN: no ray, no pinhole
+
+    @cached_property
+    def pinhole(self) -> tuple[np.ndarray, tuple[int, int]]:
+        """K [3, 3] and (width, height) of the undistorted image: same focal lengths, the largest area without blanks.
+
+        Raises:
+          ValueError: if the model has no pinhole equivalent (panoramas).
+        """
+        if self.is_pinhole:
+            return self.camera.calibration_matrix(), self.size
+        try:
+            pinhole = pycolmap().undistort_camera(pycolmap().UndistortCameraOptions(), self.camera)
+        except (ValueError, RuntimeError):
+            raise ValueError(f"{self.camera.model_name} cannot be undistorted to a pinhole camera") from None
+        return pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
+
+    def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """The pinhole image of a photograph, at the photograph's resolution divided by `downscale`.
+
+        Args:
+          pixels: [h, w, C] uint8, of the calibrated size or that size scaled.
+          downscale: k >= 1; the image is undistorted first, so that it stays as sharp as it can.
+
+        Returns:
+          (pixels [h', w', C] uint8, K [3, 3] for them).
+        """
+        K, size = self.pinhole
+        image_size = pixels.shape[1], pixels.shape[0]
+        if not self.is_pinhole:
+            scales = np.divide(image_size, self.size)
+            undistorted_size = round(size[0] * scales[0]), round(size[1] * scales[1])
+            pixels = self._warp(pixels, scaled_intrinsics(K, size, undistorted_size), undistorted_size)
+            image_size = undistorted_size
+        new_size = downscaled_size(*image_size, downscale)
+        return resize_pixels(pixels, *new_size), scaled_intrinsics(K, size, new_size)
+
+    def _warp(self, pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Samples the photograph (bilinear) where the pixels of a pinhole image K of the given size see it."""
+        width, height = size
+        planes = _premultiplied(pixels)
+        warped = np.empty((height, width, planes.shape[2]), np.float32)
+        for top in range(0, height, ROWS_AT_ONCE):
+            rows = warped[top : top + ROWS_AT_ONCE]
+            coordinates = self._seen_at(K, width, range(top, top + len(rows)), pixels.shape[1::-1])
+            for channel in range(planes.shape[2]):
+                rows[..., channel] = map_coordinates(planes[..., channel], coordinates, order=1, mode="nearest")
+        return _straight(warped)
+
+    def _seen_at(self, K: np.ndarray, width: int, rows: range, image_size: tuple[int, int]) -> np.ndarray:
+        """Array coordinates (row, column) [2, rows, width] in a photograph of what a pinhole K sees at some rows."""
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.asarray(rows) + 0.5)
+        rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ np.linalg.inv(K).T
+        places = np.asarray(self.camera.img_from_cam(rays)) * np.divide(image_size, self.size) - 0.5
+        return places[:, ::-1].T.reshape(2, len(rows), width)
+
+
+def _homogeneous(points: np.ndarray) -> np.ndarray:
+    """[P, 2] → [P, 3] with a last coordinate of 1."""
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def _premultiplied(pixels: np.ndarray) -> np.ndarray:
+    """float32 pixels in which colour is multiplied by alpha, so that transparent neighbours do not bleed."""
+    planes = pixels.astype(np.float32)
+    if planes.shape[2] == 4:
+        planes[..., :3] *= planes[..., 3:] / 255
+    return planes
+
+
+def _straight(planes: np.ndarray) -> np.ndarray:
+    """uint8 pixels with straight alpha, the inverse of `_premultiplied`."""
+    if planes.shape[2] == 4:
+        planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
+    return np.clip(np.rint(planes), 0, 255).astype(np.uint8)

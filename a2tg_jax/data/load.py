@@ -1,0 +1,51 @@
+"""One function for every kind of scene on disk."""
+
+import os
+from pathlib import Path
+
+from a2tg_jax.data.colmap import find_model, load_colmap
+from a2tg_jax.data.scene import Scene
+from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
+
+
+def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int = 8) -> Scene:
+    """Reads photographs, cameras and points, and normalises the world.
+
+    Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
+    nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`).
+    Distorted cameras are undistorted to pinholes. Images in the folder without a pose are left aside.
+
+    Args:
+      path: the scene folder, or a transforms.json.
+      downscale: k >= 1; images are read from `images_k` where that exists and made from the full ones, in memory, where
+        not.
+      test_every: every k-th of the name-sorted views, the first among them, is a test view; 0 keeps none. Has no
+        effect where the scene names its test views itself.
+
+    Returns:
+      The scene, in its normalised world; `Scene.transform` leads there from the input's.
+
+    Raises:
+      FileNotFoundError: if the path or an image does not exist, or nothing there is a scene.
+      ValueError: if an argument, the model, a pose or an image is unusable, or fewer than two views are left.
+    """
+    path = Path(path)
+    if downscale < 1 or downscale != int(downscale):
+        raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such scene folder")
+    options = {"downscale": int(downscale), "test_every": test_every}
+    if path.is_file():
+        return load_transforms(path, **options)
+    if find_model(path) is not None:
+        return load_colmap(path, **options)
+    if (path / NERFSTUDIO_FILE).is_file():
+        return load_transforms(path / NERFSTUDIO_FILE, **options)
+    if (path / BLENDER_FILES[0]).is_file():
+        return load_blender(path, **options)
+    raise FileNotFoundError(
+        f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
+        f"for plain photographs, run `a2tg sfm {path} SCENE` first"
+    )

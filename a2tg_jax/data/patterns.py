@@ -1,0 +1,149 @@
+"""Procedural colours for the synthetic scene: float32 images [rows, columns, 3] in [0, 1], made by numpy alone.
+
+Sizes are in texels. Details are a few texels wide on purpose: much finer than a Gaussian, coarse enough for a camera.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import zoom
+
+Color = tuple[float, float, float]
+
+CREAM: Color = (0.93, 0.88, 0.76)
+INK: Color = (0.10, 0.13, 0.22)
+BRICK: Color = (0.66, 0.34, 0.25)
+MORTAR: Color = (0.86, 0.80, 0.70)
+TEAL: Color = (0.12, 0.47, 0.50)
+GOLD: Color = (0.93, 0.67, 0.20)
+CORAL: Color = (0.88, 0.36, 0.27)
+SKY: Color = (0.35, 0.62, 0.85)
+LEAF: Color = (0.42, 0.62, 0.28)
+
+
+def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v) of the texel centres, each [rows, columns] float32 in (0, 1); u along the columns."""
+    u = (np.arange(columns, dtype=np.float32) + 0.5) / columns
+    v = (np.arange(rows, dtype=np.float32) + 0.5) / rows
+    return np.broadcast_to(u, (rows, columns)), np.broadcast_to(v[:, None], (rows, columns))
+
+
+def mix(first: Color, second: Color, weight: np.ndarray) -> np.ndarray:
+    """(1 - weight)·first + weight·second, [rows, columns, 3]."""
+    return np.float32(first) + weight[..., None].astype(np.float32) * (np.float32(second) - np.float32(first))
+
+
+def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 4) -> np.ndarray:
+    """Smooth noise [rows, columns] with mean 0 and values in about ±1; `cells` lattice cells along the rows at first."""
+    noise = np.zeros((rows, columns), np.float32)
+    for octave in range(octaves):
+        lattice = (cells << octave, max(1, round((cells << octave) * columns / rows)))
+        values = rng.uniform(-1, 1, (lattice[0] + 1, lattice[1] + 1)).astype(np.float32)
+        factors = rows / values.shape[0], columns / values.shape[1]
+        noise += zoom(values, factors, order=1, grid_mode=True, mode="nearest") * 0.5**octave
+    return noise
+
+
+def bricks(rng: np.random.Generator, rows: int, columns: int, size: tuple[int, int]) -> np.ndarray:
+    """A brick wall; `size` is (height, width) of a brick with its mortar, in texels."""
+    row, column = np.indices((rows, columns))
+    course = row // size[0]
+    shifted = column + (course % 2) * (size[1] // 2)
+    shades = rng.uniform(-1, 1, (course.max() + 1, shifted.max() // size[1] + 1)).astype(np.float32)
+    shade = shades[course, shifted // size[1]]
+    color = np.float32(BRICK) * (1 + 0.28 * shade[..., None]) + shade[..., None] * np.float32((0.0, 0.05, 0.06))
+    gap = max(2, size[0] // 6)
+    is_mortar = (row % size[0] < gap) | (shifted % size[1] < gap)
+    color = np.where(is_mortar[..., None], np.float32(MORTAR), color)
+    return color * (1 + 0.06 * fractal_noise(rng, rows, columns, 24)[..., None])
+
+
+def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
+    """A round mosaic: rings of nearly square stones, `ring` texels wide, in bands of zigzags, checks and stripes."""
+    y, x = (np.indices((side, side), np.float32) + 0.5) - side / 2
+    radius, angle = np.hypot(x, y) / ring, np.arctan2(y, x) / (2 * np.pi) + 0.5
+    index = radius.astype(int)
+    sectors = 6 * np.maximum(index, 1)
+    along = angle * sectors
+    stone = np.minimum(along.astype(int), sectors - 1)
+    palette = np.float32([CREAM, INK, CORAL, TEAL, GOLD])
+    kind = np.select(
+        [index % 9 < 4, index % 9 == 4, index % 9 < 8],
+        [np.where((stone + index) % 2 == 0, 0, 1), 4, np.where((stone + 2 * index) % 6 < 3, 2, 0)],
+        3,
+    )
+    shade = rng.uniform(0.82, 1.08, (index.max() + 1, sectors.max())).astype(np.float32)[index, stone]
+    to_edge = np.minimum(radius - index, index + 1 - radius) * ring
+    along_edge = np.minimum(along - stone, stone + 1 - along) * (2 * np.pi * radius * ring / sectors)
+    grout = np.clip(np.minimum(to_edge, along_edge) - 0.6, 0, 1)[..., None]
+    return palette[kind] * shade[..., None] * grout + np.float32((0.45, 0.42, 0.38)) * (1 - grout)
+
+
+def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
+    """Dark-veined stone."""
+    u, v = coordinates(rows, columns)
+    phase = 9 * u + 5 * v + 1.6 * fractal_noise(rng, rows, columns, 4, octaves=5)
+    veins = np.abs(np.sin(np.pi * phase)) ** 0.6
+    return mix((0.16, 0.30, 0.33), (0.90, 0.92, 0.88), veins)
+
+
+def globe(rows: int, columns: int) -> np.ndarray:
+    """A ball in latitude and longitude: wedges of colour, checks of growing frequency, an inscribed equator."""
+    u, v = coordinates(rows, columns)
+    wedges = np.float32([CORAL, CREAM, GOLD, CREAM, TEAL, CREAM])[(u * 24).astype(int) % 6]
+    checks = ((u * 48).astype(int) + (v * 24).astype(int)) % 2
+    color = np.where((np.abs(v - 0.5) < 0.17)[..., None], mix(CREAM, INK, checks), wedges)
+    is_line = (np.abs(np.abs(v - 0.5) - 0.185) < 0.012) | (np.abs(np.abs(v - 0.5) - 0.40) < 0.012)
+    return np.where(is_line[..., None], np.float32(INK), color)
+
+
+def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
+    """A column: oblique stripes whose frequency doubles upwards, between bands of keys."""
+    u, v = coordinates(rows, columns)
+    frequency = np.select([v < 0.34, v < 0.67], [16, 12], 8)
+    stripe = ((u * frequency + v * 14) % 1.0) < 0.5
+    color = np.where(stripe[..., None], np.float32(TEAL), np.float32(CREAM))
+    near_band = np.minimum(np.abs(v - 0.34), np.abs(v - 0.67))
+    keys = ((u * 40).astype(int) % 2 == 0) & (near_band < 0.018)
+    color = np.where((near_band < 0.03)[..., None], np.where(keys[..., None], np.float32(GOLD), np.float32(INK)), color)
+    return color * (1 + 0.05 * fractal_noise(rng, rows, columns, 8)[..., None])
+
+
+def wood(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
+    """Grain along the columns."""
+    u, v = coordinates(rows, columns)
+    rings = np.sin(2 * np.pi * (7 * v + 0.9 * fractal_noise(rng, rows, columns, 2, octaves=3) + 0.4 * u))
+    return mix((0.42, 0.25, 0.13), (0.74, 0.52, 0.30), 0.5 + 0.5 * rings)
+
+
+def lettering(text: str, rows: int, columns: int, height: float, ink: Color, paper: Color) -> np.ndarray:
+    """Text `height` texels high, centred on plain paper; repeated along the columns if it is shorter than they are."""
+    return mix(paper, ink, _text_mask(text, rows, columns, height, repeat=True))
+
+
+def letter_block(letters: Sequence[str], side: int, colors: Sequence[Color]) -> np.ndarray:
+    """The faces of toy blocks side by side: a framed letter each, the frame checked."""
+    faces = []
+    for letter, color in zip(letters, colors, strict=True):
+        u, v = coordinates(side, side)
+        edge = np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v))
+        checks = ((u * 12).astype(int) + (v * 12).astype(int)) % 2
+        face = mix(color, CREAM, np.where(edge < 1 / 12, checks, edge > 1.6 / 12))
+        mask = _text_mask(letter, side, side, 0.62 * side, repeat=False)
+        faces.append(face + mask[..., None] * (np.float32(color) * 0.8 - face))
+    return np.concatenate(faces, axis=1)
+
+
+def _text_mask(text: str, rows: int, columns: int, height: float, *, repeat: bool) -> np.ndarray:
+    """Coverage [rows, columns] in [0, 1] of text in Pillow's own font, vertically centred."""
+    font = ImageFont.load_default(height)
+    canvas = Image.new("L", (columns, rows))
+    draw = ImageDraw.Draw(canvas)
+    left, top, right, bottom = font.getbbox(text)
+    y = (rows - (bottom - top)) / 2 - top
+    x = 0.0 if repeat else (columns - (right - left)) / 2 - left
+    while x < columns:
+        draw.text((x, y), text, fill=255, font=font, stroke_width=max(1, round(height / 40)), stroke_fill=255)
+        x += right - left + 0.6 * height if repeat else columns
+    return np.asarray(canvas, np.float32) / 255

@@ -1,0 +1,185 @@
+"""What every loader makes: a scene of photographs with exact pinhole cameras, and points, in the normalised world."""
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similarity, scene_scale
+
+NUM_RANDOM_POINTS = 10_000
+MAX_SKEW = 1e-2
+"""Largest deviation of a pose's rotation from an orthonormal matrix that still passes as rounding."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class View:
+    """One photograph with its camera."""
+
+    name: str
+    """Path of the image below the scene's image folder, with forward slashes; unique in its scene."""
+    camera: Camera
+    """Its camera in the normalised world, float32, of the image's size."""
+    image: np.ndarray
+    """[H, W, 3] uint8."""
+    alpha: np.ndarray | None = None
+    """[H, W] uint8 opacity (straight: `image` is not multiplied by it), or None where the photograph is opaque."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """Photographs, cameras and points in the normalised world. Lives on the host; not a pytree."""
+
+    name: str
+    train: tuple[View, ...]
+    """Views to train on, sorted by name; at least one."""
+    test: tuple[View, ...]
+    """Views kept for testing, sorted by name; may be empty."""
+    points: np.ndarray
+    """[P, 3] float32 surface points to start from, P >= 2."""
+    colors: np.ndarray
+    """[P, 3] float32 colours of the points in [0, 1]."""
+    transform: Similarity
+    """Leads from the original world of the input to the normalised world; its inverse brings results back."""
+    scale: float
+    """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shot:
+    """One photograph with its pose in the original world, before normalisation."""
+
+    name: str
+    viewmat: np.ndarray
+    """[4, 4] float64 world to camera (OpenCV)."""
+    K: np.ndarray
+    """[3, 3] float64 intrinsics in pixels of `pixels`."""
+    pixels: np.ndarray
+    """[H, W, 3] or [H, W, 4] uint8, with straight alpha."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points in the original world."""
+
+    points: np.ndarray
+    """[P, 3]."""
+    colors: np.ndarray
+    """[P, 3] uint8."""
+
+
+def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """The view's image as floats, over a background where it is transparent.
+
+    Args:
+      view: one view.
+      background: [3] colour in [0, 1], or an image [H, W, 3] of colours.
+
+    Returns:
+      [H, W, 3] float32 in [0, 1].
+    """
+    color = view.image.astype(np.float32) / np.float32(255)
+    if view.alpha is None:
+        return color
+    alpha = view.alpha.astype(np.float32)[..., None] / np.float32(255)
+    return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
+
+
+def assemble_scene(
+    name: str, train: Sequence[Shot], test: Sequence[Shot], cloud: PointCloud | None, *, source: str
+) -> Scene:
+    """Normalises the world and makes the scene.
+
+    Args:
+      name: of the scene.
+      train: shots to train on, any order.
+      test: shots to test on; may be empty.
+      cloud: surface points; None or fewer than two are replaced, with a warning, by random points in the cube around
+        the cameras and the point they look at.
+      source: the input, as error messages name it.
+
+    Raises:
+      ValueError: if there are fewer than two shots or none to train on, two have one name, a pose is not finite or not
+        rigid, or all the cameras stand at one place.
+    """
+    shots = sorted([*train, *test], key=lambda shot: shot.name)
+    _check_shots(shots, len(train), source)
+    try:
+        transform = normalizing_similarity(np.stack([shot.viewmat for shot in shots]))
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
+    centers = camera_centers(np.stack(list(viewmats.values())))
+    if cloud is None or len(cloud.points) < 2:
+        message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS} random points instead"
+        warnings.warn(message, stacklevel=3)
+        points, colors = random_points(np.zeros(3), float(np.abs(centers).max()))
+    else:
+        points, colors = transform.apply(cloud.points), cloud.colors
+
+    def views(group: Sequence[Shot]) -> tuple[View, ...]:
+        return tuple(_view(shot, viewmats[shot.name]) for shot in sorted(group, key=lambda shot: shot.name))
+
+    return Scene(
+        name=name,
+        train=views(train),
+        test=views(test),
+        points=np.asarray(points, np.float32),
+        colors=colors.astype(np.float32) / np.float32(255),
+        transform=transform,
+        scale=scene_scale(centers),
+    )
+
+
+def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
+    """(train, test): shots 0, k, 2k, … of the name-sorted ones are the test; k = 0 keeps none for it."""
+    ordered = sorted(shots, key=lambda shot: shot.name)
+    is_test = [test_every > 0 and index % test_every == 0 for index in range(len(ordered))]
+    train = [shot for shot, test in zip(ordered, is_test, strict=True) if not test]
+    return train, [shot for shot, test in zip(ordered, is_test, strict=True) if test]
+
+
+def random_points(center: np.ndarray, half_side: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points [NUM_RANDOM_POINTS, 3] uniform in a cube and mid-grey colours (uint8) of the same shape."""
+    offsets = np.random.default_rng(seed).uniform(-half_side, half_side, (NUM_RANDOM_POINTS, 3))
+    return center + offsets, np.full((NUM_RANDOM_POINTS, 3), 128, np.uint8)
+
+
+def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
+    """The rigid motion nearest to a nearly rigid matrix [4, 4], as poses rounded to a few digits are.
+
+    Raises:
+      ValueError: naming `what`, if the matrix is not finite or its rotation is not one.
+    """
+    rotation = viewmat[:3, :3]
+    if not np.isfinite(viewmat).all():
+        raise ValueError(f"{what}: its pose is not finite; remove it from the scene or correct the pose")
+    left, singular_values, right = np.linalg.svd(rotation)
+    if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = left @ right, viewmat[:3, 3]
+    return rigid
+
+
+def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
+    """Raises ValueError if no scene can be made of the shots, which are sorted by name."""
+    if len(shots) < 2:
+        raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
+    if num_train < 1:
+        raise ValueError(f"{source}: keeps every view for testing; choose another test_every, or 0 for no test views")
+    for shot, following in itertools.pairwise(shots):
+        if shot.name == following.name:
+            raise ValueError(f"{source}: lists {shot.name} twice; remove one of the two")
+
+
+def _view(shot: Shot, viewmat: np.ndarray) -> View:
+    """The shot with its camera in the normalised world."""
+    height, width, channels = shot.pixels.shape
+    camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height)
+    alpha = shot.pixels[..., 3].copy() if channels == 4 else None
+    return View(shot.name, camera, np.ascontiguousarray(shot.pixels[..., :3]), alpha)

@@ -1,0 +1,175 @@
+"""Scenes described by a transforms.json: nerfstudio's and instant-ngp's, and Blender's with one file per split.
+
+Poses are camera-to-world in OpenGL's camera frame (x right, y up, z backward). nerfstudio's `applied_transform` tells
+what was done to COLMAP's world before the file was written; poses and `ply_file_path` points have both gone through
+it, so both are in the file's own world, which is the original world here.
+"""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, read_pixels
+from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
+
+NERFSTUDIO_FILE = "transforms.json"
+BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
+BLENDER_HALF_SIDE = 1.3
+"""The objects of the NeRF-synthetic scenes fit into the cube of ± this."""
+OPENCV_KEYS = ("k1", "k2", "p1", "p2")
+FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+
+logger = logging.getLogger(__name__)
+
+
+def load_transforms(file: Path, *, downscale: int, test_every: int) -> Scene:
+    """Reads a nerfstudio or instant-ngp scene.
+
+    The lists train_filenames, test_filenames and val_filenames decide about the split where the file has them (val is
+    the test where there is no test list), test_every where it has none.
+
+    Args:
+      file: path of transforms.json.
+      downscale, test_every: as in `load_scene`.
+
+    Raises:
+      FileNotFoundError: if an image or the point file is missing.
+      ValueError: if the JSON, a frame, an image or a pose is unusable, or no scene can be made (`assemble_scene`).
+    """
+    meta = _read_json(file)
+    shots = _read_shots(file, meta, downscale)
+    listed = {key: _names(meta[f"{key}_filenames"]) for key in ("train", "val", "test") if f"{key}_filenames" in meta}
+    if listed:
+        test_names = listed.get("test") or listed.get("val") or set()
+        test = [shot for shot in shots if shot.name in test_names]
+        train_names = listed.get("train", {shot.name for shot in shots} - test_names)
+        train = [shot for shot in shots if shot.name in train_names - test_names]
+    else:
+        train, test = every_kth(shots, test_every)
+    cloud = read_ply_points(file.parent / meta["ply_file_path"]) if meta.get("ply_file_path") else None
+    return assemble_scene(file.resolve().parent.name, train, test, cloud, source=str(file))
+
+
+def load_blender(folder: Path, *, downscale: int, test_every: int) -> Scene:
+    """Reads a Blender scene as NeRF's are: transforms_train.json and transforms_test.json, images with alpha.
+
+    Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
+    test_every-th training view is a test view.
+
+    Args:
+      folder: the scene folder.
+      downscale, test_every: as in `load_scene`.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_transforms`.
+    """
+    train_file, test_file = (folder / name for name in BLENDER_FILES)
+    train = _read_shots(train_file, _read_json(train_file), downscale)
+    test: list[Shot] = []
+    if test_file.is_file():
+        test = _read_shots(test_file, _read_json(test_file), downscale)
+    else:
+        train, test = every_kth(train, test_every)
+    cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
+    logger.info("%s: a Blender scene, starting from %d random points", folder, len(cloud.points))
+    return assemble_scene(folder.resolve().name, train, test, cloud, source=str(folder))
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    """The JSON object in a file, which has a non-empty list `frames`."""
+    try:
+        meta = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+        raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is wanted")
+    return meta
+
+
+def _read_shots(file: Path, meta: dict[str, Any], downscale: int) -> list[Shot]:
+    """The frames of a transforms file, undistorted and downscaled, in the file's order."""
+
+    def shoot(frame: dict[str, Any]) -> Shot:
+        return _shot(file, {**meta, **frame}, downscale)
+
+    return map_in_threads(shoot, meta["frames"])
+
+
+def _shot(file: Path, frame: dict[str, Any], downscale: int) -> Shot:
+    """One frame; `frame` holds the file's global values too, under the frame's own."""
+    if "file_path" not in frame or "transform_matrix" not in frame:
+        raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
+    path = file.parent / frame["file_path"]
+    name = Path(frame["file_path"]).as_posix()
+    # Only a folder of images below the scene has siblings of the form images_k.
+    image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
+    image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
+    pixels = read_pixels(image_file)
+    lens = _lens(frame, pixels, f"{file}: {name}")
+    check_aspect(image_file, pixels, *lens.size)
+    try:
+        pixels, K = lens.undistort(pixels, still_to_downscale)
+    except ValueError as error:
+        raise ValueError(f"{file}: {name}: its camera model {error}") from None
+    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, pixels)
+
+
+def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
+    """World to camera (OpenCV) from camera to world (OpenGL)."""
+    try:
+        pose = np.asarray(transform_matrix, np.float64)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got shape {pose.shape}")
+    camera_to_world = np.eye(4)
+    camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]
+    return np.linalg.inv(rigid_viewmat(camera_to_world, what))
+
+
+def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str) -> Lens:
+    """The camera of a frame; sizes default to the image's, the principal point to the centre."""
+    width, height = int(frame.get("w") or pixels.shape[1]), int(frame.get("h") or pixels.shape[0])
+    fx, fy = _focal_lengths(frame, width, height, what)
+    model, distortion = _distortion(frame, what)
+    center = [float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
+    params = [fx, fy, *center, *distortion]
+    return Lens(pycolmap().Camera(model=model, width=width, height=height, params=params))
+
+
+def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) -> tuple[float, float]:
+    """(fx, fy) in pixels, from fl_x and fl_y or from the angles of view; one stands for both if alone."""
+    lengths = {}
+    for axis, size in (("x", width), ("y", height)):
+        if f"fl_{axis}" in frame:
+            lengths[axis] = float(frame[f"fl_{axis}"])
+        elif f"camera_angle_{axis}" in frame:
+            lengths[axis] = size / (2 * np.tan(float(frame[f"camera_angle_{axis}"]) / 2))
+    if not lengths or min(lengths.values()) <= 0:
+        raise ValueError(f"{what}: has no focal length; give fl_x or camera_angle_x, above 0")
+    return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
+
+
+def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
+    """COLMAP's model and its distortion parameters, which mean what nerfstudio's of the same names mean."""
+    model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
+    values = {key: float(frame.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    if model == "OPENCV_FISHEYE":
+        return model, [values[key] for key in FISHEYE_KEYS]
+    if model not in PERSPECTIVE_MODELS:
+        raise ValueError(f"{what}: has the camera_model {model}; a perspective one or OPENCV_FISHEYE is wanted")
+    if values["k4"] != 0:
+        raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
+    return "FULL_OPENCV", [*(values[key] for key in OPENCV_KEYS), values["k3"], 0.0, 0.0, 0.0]
+
+
+def _names(file_names: list[str]) -> set[str]:
+    """File names of a split, written as the shots' names are."""
+    return {Path(name).as_posix() for name in file_names}

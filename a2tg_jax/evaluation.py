@@ -1,0 +1,156 @@
+"""Image quality and speed of a trained model on given views."""
+
+import dataclasses
+import functools
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.data import View, view_image
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.metrics import load_lpips, lpips, psnr, ssim
+from a2tg_jax.render import RenderSettings, appearance_of, plan_render, render_color
+from a2tg_jax.texture import AtlasLayout, Textures
+
+Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewMetrics:
+    """Quality of one view, its image clipped to [0, 1]."""
+
+    name: str
+    psnr: float
+    """dB, higher is better."""
+    ssim: float
+    """At most 1, higher is better."""
+    lpips: float | None
+    """Lower is better; None where no weights were given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Quality of all the views, and the speed at which they are drawn."""
+
+    per_view: tuple[ViewMetrics, ...]
+    lpips_network: str | None
+    """The network of the LPIPS figures, which cannot be compared with another's; None where there are none."""
+    frames_per_second: float
+    """Median over all the views evaluated together, compiled and warm."""
+    renders: tuple[np.ndarray, ...]
+    """Images of the first views, uint8 [H, W, 3]; as many as were asked for."""
+
+    def __getitem__(self, views: slice) -> "Evaluation":
+        """The figures of some of the views."""
+        return dataclasses.replace(self, per_view=self.per_view[views], renders=self.renders[views])
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.psnr for view in self.per_view]))
+
+    @property
+    def ssim(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.ssim for view in self.per_view]))
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean over the views; None without weights."""
+        return None if self.lpips_network is None else float(np.mean([view.lpips for view in self.per_view]))
+
+
+def evaluate(
+    views: Sequence[View],
+    gaussians: Gaussians,
+    textures: Textures | None = None,
+    layout: AtlasLayout | None = None,
+    *,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    background: Color = BLACK,
+    lpips_weights: str | os.PathLike | None = None,
+    num_renders: int = 0,
+) -> Evaluation:
+    """Renders every view and compares it with its photograph (host).
+
+    Args:
+      views: at least one.
+      gaussians, textures, layout, settings: what `render_image` takes; the capacity is found here.
+      background: RGB behind the Gaussians, and behind photographs with an alpha channel.
+      lpips_weights: a weights file for LPIPS; None leaves it out.
+      num_renders: return the images of the first so many views, too.
+
+    Raises:
+      ValueError: if there are no views.
+      FileNotFoundError: if `lpips_weights` is not there.
+    """
+    if not views:
+        raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
+    weights = None if lpips_weights is None else load_lpips(lpips_weights)
+    cameras = [view.camera for view in views]
+    draw = compiled_renderer(cameras, gaussians, textures, layout, settings=settings, background=background)
+    psnr_and_ssim = jax.jit(lambda image, target: (psnr(image, target), ssim(image, target)))
+    per_view, seconds, renders = [], [], []
+    for view in views:
+        image, target = draw(view.camera), jnp.asarray(view_image(view, background))
+        seconds.append(_seconds_to_draw(draw, view.camera))
+        decibels, similarity = psnr_and_ssim(image, target)
+        distance = None if weights is None else float(lpips(image, target, weights))
+        per_view.append(ViewMetrics(view.name, float(decibels), float(similarity), distance))
+        if len(renders) < num_renders:
+            renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))
+    network = None if weights is None else weights.network
+    return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
+
+
+def compiled_renderer(
+    cameras: Iterable[Camera],
+    gaussians: Gaussians,
+    textures: Textures | None = None,
+    layout: AtlasLayout | None = None,
+    *,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    background: Color = BLACK,
+) -> Callable[[Camera], Array]:
+    """A function that draws the model's colours [H, W, 3] from any of `cameras`, compiled once per image size (host).
+
+    Models of equal shapes, seen by the same cameras, share what is compiled.
+
+    Raises:
+      ValueError: from the function returned, if a camera that was not among `cameras` needs more room.
+    """
+    planned = plan_render(gaussians, list(cameras), textures, layout, settings=settings)
+    draw = _jitted_renderer(planned, background)
+
+    def checked(camera: Camera) -> Array:
+        color, overflow = draw(camera, gaussians, textures, layout)
+        if bool(overflow):
+            raise ValueError("a camera needs more room than those planned for; give it to compiled_renderer too")
+        return color
+
+    return checked
+
+
+@functools.lru_cache(maxsize=8)
+def _jitted_renderer(settings: RenderSettings, background: Color) -> Callable[..., tuple[Array, Array]]:
+    """The colour and the overflow flag at a planned capacity."""
+
+    def draw(camera, gaussians, textures, layout):
+        rule = appearance_of(gaussians, textures, layout, settings)
+        return render_color(gaussians, camera, rule, jnp.asarray(background, gaussians.means.dtype), settings)
+
+    return jax.jit(draw)
+
+
+def _seconds_to_draw(draw: Callable[[Camera], Array], camera: Camera) -> float:
+    """Time of one image; `draw` has drawn this size before."""
+    start = time.perf_counter()
+    jax.block_until_ready(draw(camera))
+    return time.perf_counter() - start

@@ -1,0 +1,81 @@
+"""Archives: named arrays with a JSON header in one uncompressed .npz, readable by numpy alone.
+
+The entry "header" holds the JSON text as bytes; its "format" and "version" say what the file is.
+"""
+
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.io.atomic import replacing
+
+FORMAT = "a2tg-jax checkpoint"
+VERSION = 1
+HEADER = "header"
+
+
+def write_archive(
+    path: str | os.PathLike, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, format: str = FORMAT
+) -> None:
+    """Writes an archive; an older file of that name is replaced once the new one is whole.
+
+    Args:
+      path: the file, by custom *.npz.
+      header: JSON-able values; "format" and "version" are added.
+      arrays: named arrays of plain dtypes; the name "header" is taken.
+      format: what kind of archive this is; `read_archive` wants the same.
+    """
+    text = json.dumps({"format": format, "version": VERSION, **header})
+    entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **entries)  # type: ignore[arg-type]
+
+
+def read_archive(path: str | os.PathLike, *, format: str = FORMAT) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header and the arrays that `write_archive` was given.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not such an archive, is damaged, or is of another version.
+    """
+    header = read_archive_header(path, format=format)
+    return header, _read_entries(Path(path), format, lambda name: name != HEADER)
+
+
+def read_archive_header(path: str | os.PathLike, *, format: str = FORMAT) -> dict[str, Any]:
+    """The header alone, without reading the arrays. Raises as `read_archive` does."""
+    path = Path(path)
+    try:
+        entry = _read_entries(path, format, lambda name: name == HEADER)
+        header = json.loads(entry[HEADER].tobytes().decode())
+    except (KeyError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise _damaged(path, format) from error
+    if header.get("format") != format:
+        raise ValueError(f"{path}: is an {header.get('format')}, not an {format}")
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path}: is an {format} of version {header.get('version')}; this program reads version {VERSION}, "
+            "so use the version of a2tg-jax that wrote it"
+        )
+    return header
+
+
+def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
+    """The wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such {format}")
+    try:
+        with open(path, "rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            return {name: archive[name] for name in archive.files if is_wanted(name)}
+    except (ValueError, EOFError, OSError, AttributeError, zipfile.BadZipFile) as error:
+        raise _damaged(path, format) from error
+
+
+def _damaged(path: Path, format: str) -> ValueError:
+    return ValueError(f"{path}: is not an {format}, or is damaged")

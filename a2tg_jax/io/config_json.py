@@ -1,0 +1,77 @@
+"""Configuration dataclasses as JSON-able dictionaries, and back."""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+ConfigT = TypeVar("ConfigT")
+
+
+def config_to_dict(config: Any) -> dict[str, Any]:
+    """A dataclass of numbers, texts, tuples and dataclasses as nested dictionaries; tuples become lists."""
+    return {field.name: _to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
+
+
+def config_from_dict(kind: type[ConfigT], data: Mapping[str, Any], where: str = "config") -> ConfigT:
+    """The dataclass `kind` that `config_to_dict` was given.
+
+    Args:
+      kind: the dataclass.
+      data: one entry per field.
+      where: what the errors call this place, such as the name of the file.
+
+    Raises:
+      ValueError: if a field is missing or unknown, or has a value of another type; the field is named.
+    """
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {data!r}")
+    hints = typing.get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    for name in data:
+        if name not in names:
+            raise ValueError(f"{where}.{name} is not a field of {kind.__name__}; it was written by another version")
+    for name in names:
+        if name not in data:
+            raise ValueError(f"{where}.{name} is missing; it was written by another version")
+    return kind(**{name: _from_json(hints[name], data[name], f"{where}.{name}") for name in names})
+
+
+def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
+    """The leaves of a configuration by dotted name, as the command line calls them: {"texture.cap": 4, ...}."""
+    leaves: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        name = prefix + field.name
+        leaves |= flatten_config(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
+    return leaves
+
+
+def _to_json(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return config_to_dict(value)
+    return [_to_json(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _from_json(hint: Any, value: Any, where: str) -> Any:
+    """`value` as the type that the annotation asks for."""
+    if dataclasses.is_dataclass(hint):
+        return config_from_dict(typing.cast(type, hint), value, where)
+    alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for alternative in alternatives:
+        if _fits(alternative, value):
+            return tuple(value) if isinstance(value, list) else value
+    raise ValueError(f"{where} must be {getattr(hint, '__name__', hint)}; got {value!r}")
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    """Whether a JSON value is of a plain type; an integer is a good float, a truth value is not a number."""
+    origin = typing.get_origin(hint)
+    if origin is typing.Literal:
+        return value in typing.get_args(hint)
+    if origin is tuple:
+        return isinstance(value, list)
+    if isinstance(value, bool):
+        return hint is bool
+    return isinstance(value, (int, float) if hint is float else hint)

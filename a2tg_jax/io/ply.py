@@ -1,0 +1,136 @@
+"""PLY files of Gaussians with the attribute names of 2DGS.
+
+x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 rot_0..3, little-endian float32: opacities as logits,
+scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all of red,
+then green, then blue. Textures have no place in this format.
+"""
+
+import os
+import warnings
+from pathlib import Path
+from typing import BinaryIO
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.data.world import Similarity
+from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.transform import transform_gaussians
+
+MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" for i in range(45))
+SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
+ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
+REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
+NUMPY_TYPES = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")
+OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
+
+
+def save_ply(path: str | os.PathLike, gaussians: Gaussians, transform: Similarity | None = None) -> None:
+    """Writes Gaussians as 2DGS does, normals along the splats' own.
+
+    Args:
+      path: the file; an older one is replaced once the new one is whole.
+      gaussians: N Gaussians.
+      transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
+        brought back to the original world first, SH included. None writes them as they are.
+    """
+    if transform is not None:
+        gaussians = transform_gaussians(gaussians, transform.inverse())
+    sh = np.asarray(gaussians.sh)
+    columns = [
+        np.asarray(gaussians.means),
+        np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
+        sh[:, 0],
+        sh[:, 1:].transpose(0, 2, 1).reshape(-1, 45),
+        np.asarray(gaussians.logit_opacities)[:, None],
+        np.asarray(gaussians.log_scales),
+        np.asarray(gaussians.quats),
+    ]
+    properties = "".join(f"property float {name}\n" for name in ATTRIBUTES)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {gaussians.num}\n{properties}end_header\n"
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+
+
+def load_ply(path: str | os.PathLike) -> Gaussians:
+    """Reads Gaussians from a PLY file of 2DGS, or of a program that uses its attribute names.
+
+    Fewer SH degrees than 3 are filled up with zeros; further attributes are left aside. A 3DGS file (scale_2) holds
+    ellipsoids, another primitive: its third axis is dropped, with a warning.
+
+    Returns:
+      float32 Gaussians in the world of the file.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not a binary little-endian PLY, is cut off, or lacks an attribute.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such PLY file")
+    with open(path, "rb") as file:
+        count, dtype = _read_header(file, path)
+        data = file.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise ValueError(f"{path}: is cut off; {count} vertices of {dtype.itemsize} bytes were announced")
+    return _gaussians_of(np.frombuffer(data, dtype, count), path)
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype]:
+    """Number of vertices and the type of one, with the file left at the first vertex."""
+    if file.readline().strip() != b"ply":
+        raise ValueError(f"{path}: is not a PLY file")
+    count: int | None = None
+    fields: list[tuple[str, str]] = []
+    elements: list[str] = []
+    while (words := file.readline().decode("ascii", "replace").split()) != ["end_header"]:
+        match words:
+            case []:
+                raise ValueError(f"{path}: its PLY header does not end")
+            case ["format", encoding, *_] if encoding != "binary_little_endian":
+                raise ValueError(f"{path}: is a PLY in {encoding}; save it as binary_little_endian")
+            case ["element", name, number]:
+                elements.append(name)
+                count = int(number) if name == "vertex" else count
+            case ["property", kind, name] if elements == ["vertex"] and kind in PLY_TYPES:
+                fields.append((name, PLY_TYPES[kind]))
+            case ["property", *_] if elements == ["vertex"]:
+                raise ValueError(f"{path}: cannot read the vertex property '{' '.join(words[1:])}'")
+    if count is None or elements[0] != "vertex":
+        raise ValueError(f"{path}: vertices must be the first element of the PLY; it has {elements}")
+    return count, np.dtype(fields)
+
+
+def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
+    """Gaussians from the structured array of the vertices."""
+    names = vertices.dtype.names or ()
+    missing = [name for name in REQUIRED if name not in names]
+    if missing:
+        raise ValueError(f"{path}: has no attribute {', '.join(missing)}; a PLY of 2D Gaussians is wanted")
+    if "scale_2" in names:
+        message = f"{path}: holds 3D Gaussians (scale_2), another primitive; their third axis is dropped"
+        warnings.warn(message, stacklevel=3)
+    rest = [name for name in SH_REST if name in names]
+    if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
+        raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
+
+    def columns(wanted) -> np.ndarray:
+        return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
+
+    sh = np.zeros((len(vertices), 16, 3), np.float32)
+    sh[:, 0] = columns(SH_DEGREE0)
+    if rest:
+        per_channel = columns(rest).reshape(len(vertices), 3, -1)
+        sh[:, 1 : 1 + per_channel.shape[2]] = per_channel.transpose(0, 2, 1)
+    return Gaussians(
+        means=jnp.asarray(columns(MEANS)),
+        quats=jnp.asarray(columns(QUATS)),
+        log_scales=jnp.asarray(columns(SCALES)),
+        logit_opacities=jnp.asarray(vertices["opacity"].astype(np.float32)),
+        sh=jnp.asarray(sh),
+    )

@@ -1,0 +1,280 @@
+"""Images of textured 2D Gaussians: project, list the tiles, composite, with capacities planned on the host.
+
+N splats, H×W pixels. `render_image` called eagerly plans for itself; under jit or vmap it takes the capacity from its
+settings, which `plan_render` fills in.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import AppearanceRule, PlainAppearance
+from a2tg_jax.cameras import Camera
+from a2tg_jax.compositor import Compositing, Splats, composite
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.geometry import ScreenBounds, homographies, screen_bounds
+from a2tg_jax.lookup import TextureOptions, textured_appearance
+from a2tg_jax.sh import sh_colors
+from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
+
+HEAD_ROOM = 1.25
+BATCH_ON_ACCELERATOR = 4096
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderSettings:
+    """Static choices of a rendering; hashable, so that it can be closed over or passed to jit as static."""
+
+    tile_size: int = 8
+    """Side of a tile in pixels; the image does not depend on it."""
+    near_plane: float = 0.2
+    """Splats and hits nearer than this do not show."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics used, 0 to 3."""
+    texture: TextureOptions = TextureOptions()
+    """How textures are read."""
+    capacity: int | None = None
+    """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
+    tile_batch: int | None = None
+    """Tiles composited at once: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
+
+    @staticmethod
+    def official() -> "RenderSettings":
+        """The authors' own texture conventions."""
+        return RenderSettings(texture=TextureOptions.official())
+
+
+class RenderOutput(NamedTuple):
+    """What a view shows. Depth and normal are weighted sums, not divided by alpha; the background has no part in them."""
+
+    color: Array
+    """[H, W, 3], background included, not clipped."""
+    alpha: Array
+    """[H, W] in [0, 1], 1 − the final transmittance."""
+    depth: Array
+    """[H, W] Σ z·α·T."""
+    normal: Array
+    """[H, W, 3] Σ n·α·T, in the world, facing the camera."""
+    overflow: Array
+    """Boolean: the capacity did not suffice; the image is then the background and must not be used."""
+    distortion: Array
+    """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
+
+
+class Projection(NamedTuple):
+    """What every rendering of one view starts from."""
+
+    splats: Splats
+    bounds: ScreenBounds
+    depths: Array
+
+
+def render_image(
+    gaussians: Gaussians,
+    camera: Camera,
+    textures: Textures | None = None,
+    layout: AtlasLayout | None = None,
+    *,
+    background: Any = (0, 0, 0),
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> RenderOutput:
+    """Renders a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
+
+    Args:
+      gaussians: N Gaussians.
+      camera: the view.
+      textures, layout: their textures; neither, and the splats are plain 2DGS.
+      background: [3] colour behind everything.
+      settings: static choices. An eager call, also under `jax.grad`, needs no capacity and never overflows.
+
+    Raises:
+      ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, or if the layout
+        is of another number of Gaussians.
+    """
+    rule = appearance_of(gaussians, textures, layout, settings)
+    return render_appearance(gaussians, camera, rule, background=background, settings=settings)
+
+
+def render_appearance(
+    gaussians: Gaussians,
+    camera: Camera,
+    rule: AppearanceRule,
+    *,
+    background: Any = (0, 0, 0),
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> RenderOutput:
+    """As `render_image`, of splats that show what `rule` says."""
+    if settings.capacity is None:
+        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings))
+    background = jnp.asarray(background, gaussians.means.dtype)
+    rendered = _render_channels(gaussians, camera, rule, settings, has_geometry=True)
+    channels, transmittance, overflow = rendered
+    weight, depth, squared = 1 - transmittance, channels[3], channels[4]
+    return RenderOutput(
+        color=_over_background(channels, transmittance, background),
+        alpha=weight,
+        depth=depth,
+        normal=jnp.moveaxis(channels[5:8], 0, -1),
+        overflow=overflow,
+        distortion=weight * squared - depth * depth,
+    )
+
+
+def render_color(
+    gaussians: Gaussians,
+    camera: Camera,
+    rule: AppearanceRule,
+    background: Array,
+    settings: RenderSettings,
+    *,
+    sh_degree: Any = None,
+    num_live: Any = None,
+    tap: Array | None = None,
+) -> tuple[Array, Array]:
+    """The colour alone [H, W, 3], and the overflow flag: what training renders at every step.
+
+    Args:
+      sh_degree: overrides the settings' by a value that may be traced.
+      num_live: only the first so many rows show; may be traced.
+      tap: [N, 4] zeros, at which the gradient is the absolute positional gradient (`compositor.composite`).
+    """
+    channels, transmittance, overflow = _render_channels(
+        gaussians, camera, rule, settings, has_geometry=False, sh_degree=sh_degree, num_live=num_live, tap=tap
+    )
+    return _over_background(channels, transmittance, background), overflow
+
+
+def plan_render(
+    gaussians: Gaussians,
+    cameras: Camera | Sequence[Camera],
+    textures: Textures | None = None,
+    layout: AtlasLayout | None = None,
+    *,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> RenderSettings:
+    """The settings with a capacity that suffices for every one of the cameras, with head room (host).
+
+    Raises:
+      ValueError: if called under a transformation, where shapes cannot be chosen.
+    """
+    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    rule = appearance_of(gaussians, textures, layout, settings)
+    most = max(pairs_of_view(gaussians, camera, rule, settings) for camera in cameras)
+    return dataclasses.replace(settings, capacity=capacity_for(most))
+
+
+def capacity_for(pairs: int) -> int:
+    """A capacity with head room for so many pairs, rounded up so that few distinct shapes occur."""
+    return max(1024, -(-int(pairs * HEAD_ROOM) // 1024) * 1024)
+
+
+def appearance_of(
+    gaussians: Gaussians, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
+) -> AppearanceRule:
+    """The rule for textures, or plain 2DGS where there are none."""
+    if (textures is None) != (layout is None):
+        raise ValueError("textures and layout belong together: give both or neither")
+    if textures is None or layout is None:
+        return PlainAppearance()
+    if layout.num != gaussians.num:
+        raise ValueError(f"layout is of {layout.num} textures, but there are {gaussians.num} gaussians")
+    return textured_appearance(textures, layout, settings.texture, is_vectorised=_tile_batch(settings) != 1)
+
+
+def pairs_of_view(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
+    """(splat, tile) pairs of one view, before the outline test (host)."""
+    try:
+        return int(_count_pairs(gaussians, camera, rule, settings.tile_size, settings.near_plane))
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
+
+
+@functools.lru_cache(maxsize=None)
+def _jitted_count():
+    return jax.jit(_count_pairs_of, static_argnums=(3, 4))
+
+
+def _count_pairs(gaussians, camera, rule, tile_size, near_plane):
+    return _jitted_count()(gaussians, camera, rule, tile_size, near_plane)
+
+
+def _count_pairs_of(gaussians, camera, rule, tile_size, near_plane):
+    M, _ = homographies(gaussians, camera)
+    bounds = screen_bounds(M, rule.cutoff(rule.params, gaussians.opacities), near_plane)
+    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
+
+
+def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
+    values = jax.tree.map(_primal_value, (gaussians, camera, rule))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
+        raise ValueError(
+            "settings.capacity is needed under jit and vmap, where shapes are fixed: "
+            "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
+        )
+    return capacity_for(pairs_of_view(*values, settings))
+
+
+def _primal_value(x):
+    """The concrete array behind the tracers of `jax.grad`; the tracer itself where jit or vmap hide the value."""
+    while isinstance(x, jax.core.Tracer):
+        try:
+            return np.asarray(jax.lax.stop_gradient(x))
+        except jax.errors.TracerArrayConversionError:
+            inner = getattr(x, "primal", None)
+            if inner is None:
+                return x
+            x = inner
+    return x
+
+
+def _tile_batch(settings: RenderSettings) -> int:
+    if settings.tile_batch is None:
+        return 1 if jax.default_backend() == "cpu" else BATCH_ON_ACCELERATOR
+    return settings.tile_batch
+
+
+def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> Projection:
+    M, normals = homographies(gaussians, camera)
+    opacities = gaussians.opacities
+    cutoff = rule.cutoff(rule.params, opacities)
+    if num_live is not None:
+        cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
+    frozen = jax.lax.stop_gradient(M)
+    bounds = screen_bounds(frozen, jax.lax.stop_gradient(cutoff), settings.near_plane)
+    # Rows that are drawn nowhere may hold anything; a finite stand-in keeps 0 · inf out of the gradients.
+    is_drawn = (frozen[:, 2, 2] >= settings.near_plane)[:, None, None]
+    M = jnp.where(is_drawn, M, jnp.eye(3, dtype=M.dtype)[None])
+    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
+    return Projection(Splats(M, colors, opacities, normals), bounds, frozen[:, 2, 2])
+
+
+def _render_channels(
+    gaussians, camera, rule, settings, *, has_geometry, sh_degree=None, num_live=None, tap=None
+) -> tuple[Array, Array, Array]:
+    """Channels [D, H, W], final transmittance [H, W] and the overflow flag."""
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    degree = settings.sh_degree if sh_degree is None else sh_degree
+    view = _project(gaussians, camera, rule, settings, degree, num_live)
+    lists = tile_lists(view.bounds, view.depths, grid, settings.capacity)
+    how = Compositing(
+        grid=grid,
+        near_plane=settings.near_plane,
+        has_geometry=has_geometry,
+        has_statistic=tap is not None,
+        tile_batch=min(_tile_batch(settings) or grid.num, grid.num),
+    )
+    jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
+    tap = jnp.zeros((gaussians.num, 4), view.splats.M.dtype) if tap is None else tap
+    channels, transmittance = composite(how, view.splats, rule, lists, jacobian, tap)
+    return channels, transmittance, lists.overflow
+
+
+def _over_background(channels: Array, transmittance: Array, background: Array) -> Array:
+    return jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]

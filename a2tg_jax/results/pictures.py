@@ -1,0 +1,125 @@
+"""Pictures made from renders: errors, crops, side-by-side sheets, texture resolutions.
+
+Images are uint8 [H, W, 3] unless said otherwise.
+"""
+
+import base64
+import dataclasses
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib import colormaps
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import uniform_filter
+
+from a2tg_jax.gaussians import SH_C0, Gaussians
+from a2tg_jax.io.atomic import replacing
+from a2tg_jax.texture import AtlasLayout, Textures
+
+ERROR_GAIN = 4
+MARGIN, CAPTION_HEIGHT = 6, 22
+
+
+def to_uint8(image) -> np.ndarray:
+    """8-bit pixels of a float image, clipped to [0, 1] and rounded."""
+    return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
+
+
+def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Absolute difference, brightened ERROR_GAIN times."""
+    difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
+    return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Crop:
+    """A square part of an image."""
+
+    top: int
+    left: int
+    side: int
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        return image[self.top : self.top + self.side, self.left : self.left + self.side]
+
+
+def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> Crop:
+    """The square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`."""
+    height, width = target.shape[:2]
+    side = max(8, min(height, width) // 4)
+    gain = np.sum(_squared_error(before, target) - _squared_error(after, target), axis=-1)
+    summed = uniform_filter(gain, size=side, mode="constant", origin=-(side // 2))
+    inside = summed[: max(1, height - side + 1), : max(1, width - side + 1)]
+    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+    return Crop(int(top), int(left), side)
+
+
+def _squared_error(image: np.ndarray, target: np.ndarray) -> np.ndarray:
+    return (image.astype(np.float32) - target.astype(np.float32)) ** 2
+
+
+def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
+    """One sheet of images in a row, each under its caption."""
+    height, width = images[0].shape[:2]
+    sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
+    for index, (image, caption) in enumerate(zip(images, captions, strict=True)):
+        left = index * (width + MARGIN)
+        draw.text((left + 2, 2), caption, fill="black", font=font)
+        sheet.paste(Image.fromarray(image), (left, CAPTION_HEIGHT))
+    return sheet
+
+
+def picture_name(view_name: str) -> str:
+    """File name of a view's picture: folders become part of it."""
+    return os.path.splitext(view_name)[0].replace("/", "_") + ".png"
+
+
+def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> None:
+    """Writes a PNG, whole or not at all."""
+    picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
+    with replacing(path) as temporary:
+        picture.save(temporary, format="PNG", optimize=True)
+
+
+def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
+    """An image as a data: URI, enlarged `zoom` times without smoothing."""
+    picture = Image.fromarray(np.ascontiguousarray(image))
+    picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=quality, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def png_uri(path: Path) -> str:
+    """A PNG file as a data: URI."""
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def resolution_colors(num_levels: int) -> np.ndarray:
+    """[num_levels, 3] colours of textures with 2⁰, 2¹, … texels, dark to bright."""
+    return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
+
+
+def texel_levels(layout: AtlasLayout) -> np.ndarray:
+    """[N] integers log₂(Tu·Tv), rounded."""
+    return np.rint(np.log2(layout.sizes.prod(axis=1))).astype(int)
+
+
+def colored_by_resolution(
+    gaussians: Gaussians, textures: Textures, layout: AtlasLayout
+) -> tuple[Gaussians, Textures, AtlasLayout]:
+    """The model with every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
+
+    Alpha textures stay, RGB residuals go.
+    """
+    levels = texel_levels(layout)
+    sh = np.zeros(gaussians.sh.shape)
+    sh[:, 0] = (resolution_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
+    plain = jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures)
+    return dataclasses.replace(gaussians, sh=jnp.asarray(sh, gaussians.sh.dtype)), plain, layout

@@ -1,0 +1,52 @@
+"""Training in a run folder: phase after phase, with checkpoints, and from where an earlier attempt stopped."""
+
+from a2tg_jax.data import Scene
+from a2tg_jax.io.model import Model, load_model, save_model
+from a2tg_jax.results.folder import Phase, RunFolder
+from a2tg_jax.results.history import write_history
+from a2tg_jax.results.record import read_record
+from a2tg_jax.training import Checkpoint, FitResult, fit_stage1, fit_stage2, load_checkpoint, save_checkpoint
+
+LONGEST_WITHOUT_CHECKPOINT = 500
+"""Iterations."""
+
+
+def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
+    """Trains every phase that the run's record asks for and that is not finished yet.
+
+    A phase goes on from its newest checkpoint. When it ends, its model and its history are written.
+
+    Args:
+      run: a run folder with its record.
+      scene: the scene of the record.
+      progress: show a progress bar.
+
+    Raises:
+      ValueError: as `fit` does, or if a checkpoint is damaged or of another version.
+    """
+    record = read_record(run)
+    for phase in record.phases:
+        if not run.model(phase).is_file():
+            result = _train_phase(run, phase, scene, record.phase_config(phase), progress)
+            write_history(run.history(phase), result.history)
+            save_model(run.model(phase), Model(result.gaussians, result.textures, result.layout))
+
+
+def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config, progress: bool) -> FitResult:
+    """One phase from its newest checkpoint, or from its beginning."""
+    newest = run.checkpoints(phase)[-1:]
+    num_iterations = config.stage1_iterations if phase == "stage1" else config.stage2_iterations
+
+    def keep(checkpoint: Checkpoint) -> None:
+        save_checkpoint(run.checkpoint(phase, checkpoint.iteration), checkpoint)
+        run.drop_old_checkpoints(phase)
+
+    options = {
+        "resume": load_checkpoint(newest[0]) if newest else None,
+        "on_checkpoint": keep,
+        "checkpoint_every": max(1, min(LONGEST_WITHOUT_CHECKPOINT, num_iterations // 10)),
+        "progress": progress,
+    }
+    if phase == "stage1":
+        return fit_stage1(scene, config, **options)
+    return fit_stage2(scene, load_model(run.model("stage1")).gaussians, config, **options)

@@ -1,0 +1,74 @@
+"""Settings of JAX that have to be made before its first computation. The library itself never makes them."""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+
+CHECKED_JAX_VERSIONS = ((0, 10), (0, 11))
+"""Versions known to have the flags below; an unknown flag would end the process."""
+WHOLE_LOOPS_FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
+
+
+def configure_cpu(*, use_cache: bool = True) -> None:
+    """Makes JAX about twice as fast at this library's work on CPUs; call it once, before JAX computes anything.
+
+    Adds two flags to XLA_FLAGS, of which the user's own settings have precedence: while-loops are compiled whole
+    (a tile's compositing is one), and vectors are 512 bits wide where the processor has AVX-512. A GPU is not affected.
+    The command line calls this; programs and notebooks may.
+
+    Args:
+      use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
+        unless JAX has a cache already or reading one would be too noisy (`is_cache_quiet`).
+    """
+    features = _processor_features()
+    add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
+    if use_cache and is_cache_quiet(features) and jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(compilation_cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[str, ...]:
+    """The XLA flags that help on a processor with these features, as far as this JAX is known to have them."""
+    if jax_version not in CHECKED_JAX_VERSIONS:
+        return ()
+    return (WHOLE_LOOPS_FLAG, WIDE_VECTORS_FLAG) if "avx512f" in features else (WHOLE_LOOPS_FLAG,)
+
+
+def is_cache_quiet(features: frozenset[str]) -> bool:
+    """Whether programs are read from a cache without a page of alarming lines for each.
+
+    With AVX-512, XLA finds two tuning hints of its own missing from the processor's features and says at length that it
+    may crash; it does not (openxla/xla#44565). Only TF_CPP_MIN_LOG_LEVEL=3, set before JAX is imported, silences that.
+    """
+    return "avx512f" not in features or os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "3"
+
+
+def add_xla_flags(flags: tuple[str, ...]) -> None:
+    """Appends flags to the environment's XLA_FLAGS, except those that the user has set already."""
+    own = os.environ.get("XLA_FLAGS", "").split()
+    taken = {flag.split("=", 1)[0] for flag in own}
+    os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
+
+
+def compilation_cache_folder() -> Path:
+    """The folder of compiled programs, one per processor and jaxlib: code for one may not run on another.
+
+    It is $XDG_CACHE_HOME/a2tg-jax/… (~/.cache/a2tg-jax/…) and may be deleted at any time.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
+    key = hashlib.sha256(processor.encode()).hexdigest()[:12]
+    return base / "a2tg-jax" / f"jaxlib-{jax.lib.__version__}-{key}"
+
+
+def _processor_features() -> frozenset[str]:
+    """The processor's features as Linux lists them; empty elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return frozenset()
+    return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))

@@ -1,0 +1,133 @@
+"""Textures of mixed resolutions: padded buckets, the layout beside them, and the lookup at (u, v).
+
+N Gaussians; texture i is [Tv, Tu, 4] = signed RGB residual and alpha factor; u indexes columns (Tu), v rows (Tv).
+Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past the used ones are padding.
+`Textures` holds parameters only and is differentiable; `AtlasLayout` says which row of which bucket is whose.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+MAX_SIDE = 16
+NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Textures:
+    """The texels of all Gaussians, bucketed by resolution."""
+
+    buckets: tuple[Array, ...]
+    """Bucket b is [capacity_b, Tv_b, Tu_b, 4]."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class AtlasLayout:
+    """Where the texture of each Gaussian lies. Integers only: not differentiable, kept apart from `Textures`."""
+
+    bucket: Array
+    """[N] int32, the bucket of Gaussian i."""
+    row: Array
+    """[N] int32, its row in that bucket."""
+    resolutions: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
+    """(Tv, Tu) of each bucket, ascending."""
+
+    @property
+    def num(self) -> int:
+        """Number of Gaussians N."""
+        return self.bucket.shape[0]
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """[N, 2] integers (Tv, Tu) on the host."""
+        return np.asarray(self.resolutions, np.int64).reshape(-1, 2)[np.asarray(self.bucket)]
+
+    @property
+    def num_texels(self) -> int:
+        """Texels in use, padding not counted (host)."""
+        return int(np.prod(self.sizes, axis=1).sum())
+
+
+def bucket_capacity(count: int) -> int:
+    """Rows allotted to `count` textures: rounded up to 1/16 of its power of two, so few shapes occur."""
+    if count == 0:
+        return 0
+    granule = max(1, 2 ** (count.bit_length() - 4))
+    return -(-count // granule) * granule
+
+
+def plan_layout(sizes) -> tuple[AtlasLayout, tuple[int, ...]]:
+    """The layout for textures of the given sizes, and the capacity of each bucket (host).
+
+    Args:
+      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+
+    Raises:
+      ValueError: if a size is out of range.
+    """
+    sizes = np.asarray(sizes)
+    if sizes.ndim != 2 or sizes.shape[1] != 2 or not np.issubdtype(sizes.dtype, np.integer):
+        raise ValueError(f"sizes must be integers [N, 2] as (Tv, Tu); got {sizes.dtype} {sizes.shape}")
+    if sizes.size and (sizes.min() < 1 or sizes.max() > MAX_SIDE):
+        raise ValueError(f"texture sides must lie in 1..{MAX_SIDE}; got {sizes.min()}..{sizes.max()}")
+    codes, bucket, counts = np.unique(sizes @ np.array([64, 1]), return_inverse=True, return_counts=True)
+    order = np.argsort(bucket, kind="stable")
+    starts = np.repeat(np.cumsum(counts) - counts, counts)
+    row = np.empty(len(sizes), np.int32)
+    row[order] = np.arange(len(sizes)) - starts
+    layout = AtlasLayout(
+        bucket=jnp.asarray(bucket, jnp.int32),
+        row=jnp.asarray(row),
+        resolutions=tuple((int(code) // 64, int(code) % 64) for code in codes),
+    )
+    return layout, tuple(bucket_capacity(int(count)) for count in counts)
+
+
+def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Textures, AtlasLayout]:
+    """Textures of the given sizes whose texels are all (rgb, rgb, rgb, 1): with rgb = 0 they show nothing.
+
+    Args:
+      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+      rgb: initial RGB residual.
+      dtype: of the texels.
+    """
+    layout, capacities = plan_layout(sizes)
+    texel = jnp.asarray([rgb, rgb, rgb, 1.0], dtype)
+    shapes = zip(capacities, layout.resolutions, strict=True)
+    buckets = tuple(jnp.broadcast_to(texel, (capacity, *resolution, 4)) for capacity, resolution in shapes)
+    return Textures(buckets), layout
+
+
+def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
+    """Buckets made from N arrays [Tv, Tu, 4] of one float dtype; the inverse of `texture_arrays`.
+
+    Raises:
+      ValueError: if an array is not [Tv, Tu, 4] with sides of 1 to 16, naming it.
+    """
+    arrays = [np.asarray(array) for array in arrays]
+    for index, array in enumerate(arrays):
+        if array.ndim != 3 or array.shape[2] != 4:
+            raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
+    layout, capacities = plan_layout(np.array([a.shape[:2] for a in arrays], np.int64).reshape(-1, 2))
+    dtype = np.result_type(*arrays) if arrays else np.float32
+    filled = [
+        np.tile(np.asarray(NEUTRAL_TEXEL, dtype), (capacity, *resolution, 1))
+        for capacity, resolution in zip(capacities, layout.resolutions, strict=True)
+    ]
+    for array, bucket, row in zip(arrays, np.asarray(layout.bucket), np.asarray(layout.row), strict=True):
+        filled[bucket][row] = array
+    return Textures(tuple(jnp.asarray(bucket) for bucket in filled)), layout
+
+
+def texture_arrays(textures: Textures, layout: AtlasLayout) -> list[np.ndarray]:
+    """The N textures as numpy arrays [Tv, Tu, 4], in the order of the Gaussians (host)."""
+    buckets = [np.asarray(bucket) for bucket in textures.buckets]
+    places = zip(np.asarray(layout.bucket), np.asarray(layout.row), strict=True)
+    return [buckets[bucket][row] for bucket, row in places]

@@ -1,0 +1,144 @@
+"""Which splats touch which tile, in depth order, at a fixed capacity.
+
+A pair is one splat in one tile. Pairs are emitted splat by splat in depth order, those whose outline misses the tile
+are dropped, and one stable sort by tile makes the lists. Tiles of P = tile_size² pixels are numbered row by row.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.geometry import ScreenBounds
+
+
+class TileGrid(NamedTuple):
+    """The tiles that cover an image of width × height pixels; all static."""
+
+    width: int
+    height: int
+    tile_size: int
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.tile_size)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // self.tile_size)
+
+    @property
+    def num(self) -> int:
+        return self.columns * self.rows
+
+
+class TileLists(NamedTuple):
+    """The splats of each tile, front to back."""
+
+    ids: Array
+    """[capacity] splat indices, tile after tile."""
+    starts: Array
+    """[tiles + 1] where the list of each tile begins in `ids`."""
+    overflow: Array
+    """Boolean: the pairs did not fit; the lists are then incomplete and must not be used."""
+
+
+class _Rectangles(NamedTuple):
+    """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + rows of each splat, and how many these are."""
+
+    x0: Array
+    y0: Array
+    columns: Array
+    counts: Array
+
+
+def _tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> _Rectangles:
+    limits = jnp.asarray([grid.width, grid.height])
+    as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
+    first = jnp.clip(as_pixels(jnp.ceil(bounds.lower - 0.5)), 0, limits[None, :])
+    last = jnp.minimum(as_pixels(jnp.floor(bounds.upper - 0.5)), limits[None, :] - 1)
+    is_empty = jnp.any(last < first, axis=-1)
+    begin, end = first // grid.tile_size, last // grid.tile_size + 1
+    extent = jnp.where(is_empty[:, None], 0, end - begin)
+    return _Rectangles(begin[:, 0], begin[:, 1], extent[:, 0], extent[:, 0] * extent[:, 1])
+
+
+def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
+    """Pairs before the outline test, as a float (it cannot wrap): what the capacity must hold."""
+    return jnp.sum(_tile_rectangles(bounds, grid).counts.astype(jnp.float32))
+
+
+def _outline_touches(bounds: ScreenBounds, x0: Array, y0: Array, tile_size: int) -> Array:
+    """Whether each splat's outline reaches a pixel centre of its tile, whose first pixel is (x0, y0)."""
+
+    def distance_to_box(origin_x, origin_y):
+        left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
+        return left, left + (tile_size - 1), top, top + (tile_size - 1)
+
+    left, right, top, bottom = distance_to_box(bounds.ellipse_center[:, 0], bounds.ellipse_center[:, 1])
+    xx, xy, yy = bounds.ellipse[:, 0], bounds.ellipse[:, 1], bounds.ellipse[:, 2]
+    # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
+    x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
+    y_on_side = jnp.clip(xy / xx * x_side, top, bottom)
+    x_on_side = jnp.clip(xy / yy * y_side, left, right)
+
+    def squared_distance(x, y):
+        return yy * x * x - 2 * xy * x * y + xx * y * y
+
+    nearest = jnp.minimum(squared_distance(x_side, y_on_side), squared_distance(x_on_side, y_side))
+    is_in_ellipse = nearest <= (xx * yy - xy * xy)
+    left, right, top, bottom = distance_to_box(bounds.means2d[:, 0], bounds.means2d[:, 1])
+    nearest = jnp.clip(0.0, left, right) ** 2 + jnp.clip(0.0, top, bottom) ** 2
+    return is_in_ellipse | (nearest <= bounds.low_pass_radius**2) | bounds.is_clipped
+
+
+def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: int) -> TileLists:
+    """Lists of the splats that touch each tile, ordered by depth, ties by index.
+
+    Args:
+      bounds: of N splats.
+      depths: [N] of the means.
+      grid: the tiles.
+      capacity: how many pairs there is room for, before the outline test; `overflow` tells when it did not suffice.
+    """
+    order = jnp.argsort(depths, stable=True)
+    rectangles = jax.tree.map(lambda x: x[order], _tile_rectangles(bounds, grid))
+    total = jnp.sum(rectangles.counts.astype(jnp.float32))
+    overflow = total > capacity
+    counts = jnp.where(overflow, 0, rectangles.counts)
+    ends = jnp.cumsum(counts)
+    num = depths.shape[0]
+    rank = jnp.repeat(jnp.arange(num, dtype=jnp.int32), counts, total_repeat_length=capacity)
+    position = jnp.arange(capacity, dtype=jnp.int32)
+    local = position - (ends - counts)[rank]
+    columns = jnp.maximum(rectangles.columns[rank], 1)
+    x = rectangles.x0[rank] + local % columns
+    y = rectangles.y0[rank] + local // columns
+    ids = order[rank].astype(jnp.int32)
+    dtype = bounds.lower.dtype
+    per_pair = jax.tree.map(lambda leaf: leaf[ids], bounds)
+    tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
+    is_kept = (position < ends[-1]) & _outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
+    tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
+    ids, starts = _sort_by_tile(tile, rank, order, grid.num)
+    return TileLists(ids, starts, overflow)
+
+
+def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:
+    """Splat indices sorted by tile, then by depth rank; and the start of each tile's list.
+
+    Where both fit 32 bits they are packed into one key: sorting keys alone is several times faster than pairs.
+    """
+    num = order.shape[0]
+    rank_bits = max(1, (num - 1).bit_length())
+    if num_tiles.bit_length() + rank_bits <= 32:
+        key = jnp.sort(tile.astype(jnp.uint32) << rank_bits | rank.astype(jnp.uint32))
+        sorted_tile, sorted_rank = (key >> rank_bits).astype(jnp.int32), key & ((1 << rank_bits) - 1)
+        ids = order[sorted_rank].astype(jnp.int32)
+    else:
+        tile_type = jnp.uint16 if num_tiles < 2**16 else jnp.uint32
+        sorted_tile, sorted_rank = jax.lax.sort((tile.astype(tile_type), rank), num_keys=1, is_stable=True)
+        ids, sorted_tile = order[sorted_rank].astype(jnp.int32), sorted_tile.astype(jnp.int32)
+    starts = jnp.searchsorted(sorted_tile, jnp.arange(num_tiles + 1, dtype=jnp.int32), method="scan_unrolled")
+    return ids, starts.astype(jnp.int32)

@@ -1,0 +1,232 @@
+"""Adaptation: the table of the rule, the laws of the selection, the rebuild against a naive loop."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from a2tg_jax.adapt import GradientStatistics, event_budget, next_sizes, reallocate, select
+from a2tg_jax.texture import Textures, allocate_textures, texture_arrays, textures_from_arrays
+
+ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
+
+
+@pytest.mark.parametrize(
+    "size, scales, wanted",
+    [
+        ((1, 1), ROUND, (2, 2)),
+        ((1, 1), WIDE, (1, 2)),
+        ((1, 1), TALL, (2, 1)),
+        ((1, 1), WIDE_BUT_LARGE, (2, 2)),
+        ((1, 1), (0.036, 0.009), (2, 2)),  # a ratio of exactly k_A is not above it
+        ((1, 2), WIDE, (1, 4)),
+        ((1, 4), WIDE, (1, 4)),
+        ((4, 1), ROUND, (4, 2)),
+        ((4, 1), WIDE, (4, 2)),
+        ((4, 4), ROUND, (4, 4)),
+        ((3, 3), ROUND, (4, 4)),
+        ((8, 1), ROUND, (8, 2)),  # larger than the cap already: never shrunk
+    ],
+)
+def test_table_of_next_sizes(size, scales, wanted):
+    proposed = next_sizes([size], [scales], k_a=4, k_s=0.01, cap=4)
+    np.testing.assert_array_equal(proposed, [wanted])
+
+
+def test_without_anisotropy_both_axes_double():
+    sizes = np.ones((3, 2), int)
+    proposed = next_sizes(sizes, np.array([ROUND, WIDE, TALL]), k_a=4, k_s=0.01, cap=4, anisotropic=False)
+    np.testing.assert_array_equal(proposed, 2 * sizes)
+
+
+def random_event(num, seed, distinct_sizes=True):
+    """Statistics with ties and zeros, mixed sizes, and their proposals."""
+    rng = np.random.default_rng(seed)
+    statistic = np.round(rng.exponential(size=num), 2)
+    sizes = rng.choice([1, 2, 4], (num, 2)) if distinct_sizes else np.ones((num, 2), int)
+    scales = np.exp(rng.normal(-5, 1.5, (num, 2)))
+    return statistic, sizes, next_sizes(sizes, scales, k_a=4, k_s=0.01, cap=8 if seed % 2 else 4)
+
+
+def added_bytes(sizes, proposed):
+    return 16 * (np.prod(proposed, 1) - np.prod(sizes, 1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_threshold_takes_exactly_those_above(seed):
+    statistic, sizes, proposed = random_event(200, seed)
+    mask = select(statistic, sizes, proposed, threshold=0.5)
+    np.testing.assert_array_equal(mask, (statistic > 0.5) & (proposed != sizes).any(1))
+
+
+@pytest.mark.parametrize("fraction, num", [(0.0, 0), (0.25, 3), (0.24, 2), (0.5, 5), (1.0, 10)])
+def test_fraction_rounds_halves_up(fraction, num):
+    mask = select(np.arange(1.0, 11.0), np.ones((10, 2), int), np.full((10, 2), 2), fraction=fraction)
+    np.testing.assert_array_equal(np.flatnonzero(mask), np.arange(10 - num, 10))
+
+
+def test_fraction_breaks_ties_by_index_and_leaves_out_the_unseen_and_the_full():
+    statistic = np.array([0.0, 2.0, 1.0, 1.0, 1.0, 9.0])
+    sizes = np.ones((6, 2), int)
+    proposed = np.full((6, 2), 2)
+    proposed[5] = 1
+    np.testing.assert_array_equal(np.flatnonzero(select(statistic, sizes, proposed, fraction=0.5)), [1, 2, 3])
+    np.testing.assert_array_equal(np.flatnonzero(select(statistic, sizes, proposed, fraction=1.0)), [1, 2, 3, 4])
+
+
+def greedy(statistic, sizes, proposed, budget):
+    """The rule of the budget, one Gaussian at a time."""
+    cost = added_bytes(sizes, proposed)
+    mask = np.zeros(len(cost), bool)
+    can_grow = np.flatnonzero(cost > 0)
+    for index in sorted(can_grow, key=lambda i: -statistic[i] / cost[i]):
+        if cost[index] <= budget:
+            mask[index] = True
+            budget -= cost[index]
+    return mask
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("budget", [0, 15, 16, 1000, 7777, 20_000, 10**9])
+def test_budget_is_the_greedy_choice_and_leaves_less_than_the_cheapest(seed, budget):
+    statistic, sizes, proposed = random_event(300, seed)
+    mask = select(statistic, sizes, proposed, budget_bytes=budget)
+    np.testing.assert_array_equal(mask, greedy(statistic, sizes, proposed, budget))
+    cost = added_bytes(sizes, proposed)
+    left = budget - cost[mask].sum()
+    assert left >= 0
+    possible = cost[~mask & (cost > 0)]
+    assert len(possible) == 0 or left < possible.min()
+
+
+@pytest.mark.parametrize("rules", [{}, {"threshold": 1, "fraction": 0.5}, {"fraction": 0.1, "budget_bytes": 5}])
+def test_exactly_one_rule(rules):
+    with pytest.raises(ValueError, match="exactly one of"):
+        select(*random_event(5, 0), **rules)
+
+
+@pytest.mark.parametrize("rule, name", [({"fraction": 1.5}, "fraction"), ({"budget_bytes": -1}, "budget_bytes")])
+def test_rules_out_of_range_are_named(rule, name):
+    with pytest.raises(ValueError, match=name):
+        select(*random_event(5, 0), **rule)
+
+
+def test_shapes_that_disagree_are_named():
+    with pytest.raises(ValueError, match="must agree"):
+        select(np.zeros(3), np.ones((4, 2), int), np.ones((4, 2), int), threshold=0)
+    with pytest.raises(ValueError, match="must both be"):
+        next_sizes(np.ones((4, 2), int), np.ones((3, 2)), k_a=4, k_s=0.01, cap=4)
+
+
+def test_event_budgets_share_what_is_left():
+    assert event_budget(1000, 400, 1, 2) == 300
+    assert event_budget(1000, 700, 2, 2) == 300
+    assert event_budget(1000, 1000, 1, 3) == 0
+    with pytest.raises(ValueError, match="below"):
+        event_budget(999, 1000, 1, 2)
+    with pytest.raises(ValueError, match="event_index"):
+        event_budget(1000, 400, 3, 2)
+
+
+def test_events_never_exceed_the_budget_and_end_near_it():
+    """Whole stages: all events in turn, at several budgets."""
+    rng = np.random.default_rng(0)
+    scales = np.exp(rng.normal(-5, 1.5, (500, 2)))
+    for total in (500 * 16, 10_000, 55_555):
+        sizes = np.ones((500, 2), int)
+        for event in (1, 2, 3):
+            proposed = next_sizes(sizes, scales, k_a=4, k_s=0.01, cap=8)
+            budget = event_budget(total, 16 * np.prod(sizes, 1).sum(), event, 3)
+            mask = select(rng.exponential(size=500), sizes, proposed, budget_bytes=budget)
+            cost = added_bytes(sizes, proposed)
+            sizes = np.where(mask[:, None], proposed, sizes)
+        used = 16 * np.prod(sizes, 1).sum()
+        assert used <= total and total - used < cost[~mask & (cost > 0)].min()
+
+
+def random_textures(seed, num=40, dtype=np.float32):
+    rng = np.random.default_rng(seed)
+    sizes = rng.choice([1, 2, 3, 4], (num, 2))
+    return [rng.normal(size=(*size, 4)).astype(dtype) for size in sizes], sizes
+
+
+def nearest_copy(texture, size):
+    """The rule of the rebuild, one texel at a time."""
+    (old_v, old_u), (new_v, new_u) = texture.shape[:2], size
+    out = np.empty((new_v, new_u, 4), texture.dtype)
+    for j in range(new_v):
+        for i in range(new_u):
+            out[j, i] = texture[int((j + 0.5) * old_v / new_v), int((i + 0.5) * old_u / new_u)]
+    return out
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_reallocate_copies_the_nearest_texel(seed):
+    """Growing, shrinking, odd ratios, and moments that go along."""
+    arrays, _ = random_textures(seed)
+    other_arrays, _ = random_textures(seed)
+    textures, layout = textures_from_arrays(arrays)
+    moments = (
+        Textures(tuple(2 * b for b in textures.buckets)),
+        {"nu": Textures(tuple(b * b for b in textures.buckets))},
+    )
+    new_sizes = np.random.default_rng(seed + 9).choice([1, 2, 4, 7, 16], (len(other_arrays), 2))
+    new_textures, new_layout, (mu, rest) = reallocate(textures, layout, new_sizes, moments)
+    np.testing.assert_array_equal(new_layout.sizes, new_sizes)
+    trees = (new_textures, mu, rest["nu"])
+    for tree, change in zip(trees, (lambda x: x, lambda x: 2 * x, lambda x: x * x), strict=True):
+        assert all(bucket.dtype == jnp.float32 for bucket in tree.buckets)
+        for got, old, size in zip(texture_arrays(tree, new_layout), arrays, new_sizes, strict=True):
+            np.testing.assert_array_equal(got, nearest_copy(change(old), size))
+
+
+def test_doubling_repeats_texels_and_a_round_trip_is_the_identity():
+    arrays, sizes = random_textures(5)
+    textures, layout = textures_from_arrays(arrays)
+    larger, larger_layout, moments = reallocate(textures, layout, 2 * sizes)
+    assert moments is None
+    for got, old in zip(texture_arrays(larger, larger_layout), arrays, strict=True):
+        np.testing.assert_array_equal(got, np.repeat(np.repeat(old, 2, 0), 2, 1))
+    back = reallocate(larger, larger_layout, sizes)
+    jax.tree.map(np.testing.assert_array_equal, texture_arrays(back.textures, back.layout), arrays)
+
+
+def test_padding_is_neutral_and_has_no_moments():
+    textures, layout = allocate_textures(np.ones((100, 2), int))
+    zeros = jax.tree.map(jnp.zeros_like, textures)
+    new_sizes = np.where(np.arange(100)[:, None] < 33, 2, 1)
+    new_textures, _, moments = reallocate(textures, layout, new_sizes, zeros)
+    for bucket, moment in zip(new_textures.buckets, moments.buckets, strict=True):
+        np.testing.assert_array_equal(bucket, np.broadcast_to(np.float32([0, 0, 0, 1]), bucket.shape))
+        np.testing.assert_array_equal(moment, 0)
+
+
+def test_reallocate_refuses_other_counts():
+    textures, layout = allocate_textures(np.ones((3, 2), int))
+    with pytest.raises(ValueError, match=r"new_sizes must be \[3, 2\]"):
+        reallocate(textures, layout, np.ones((4, 2), int))
+
+
+def test_an_event_of_a_million_takes_seconds():
+    """A loop over Gaussians would take minutes; the bound is loose on purpose."""
+    num = 1_000_000
+    rng = np.random.default_rng(0)
+    textures, layout = allocate_textures(np.ones((num, 2), int))
+    scales = np.exp(rng.normal(-5, 1.5, (num, 2)))
+    start = time.perf_counter()
+    proposed = next_sizes(layout.sizes, scales, k_a=4, k_s=0.01, cap=4)
+    mask = select(rng.exponential(size=num), layout.sizes, proposed, budget_bytes=5_000_007)
+    result = reallocate(textures, layout, np.where(mask[:, None], proposed, 1))
+    assert time.perf_counter() - start < 30
+    assert result.layout.num_texels - num <= 5_000_007 // 16
+
+
+def test_statistics_average_over_the_views_that_saw_it():
+    stats = GradientStatistics.init(3)
+    accumulate = jax.jit(GradientStatistics.accumulate)
+    stats = accumulate(stats, jnp.asarray([1.0, 5.0, jnp.nan]), jnp.asarray([True, True, False]))
+    stats = accumulate(stats, jnp.asarray([3.0, 7.0, 0.0]), jnp.asarray([True, False, False]))
+    np.testing.assert_array_equal(stats.average(), [2.0, 5.0, 0.0])
+    np.testing.assert_array_equal(stats.views, [2, 1, 0])

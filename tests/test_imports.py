@@ -1,0 +1,85 @@
+"""Imports run downward only, and importing the package changes no setting of JAX."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
+LAYERS = (
+    {"config", "numerics", "startup"},
+    {"gaussians", "cameras", "sh", "geometry"},
+    {"texture", "tiles", "data", "appearance"},
+    {"lookup", "compositor", "kernels", "io", "paths"},
+    {"losses"},
+    {"render", "optim", "metrics"},
+    {"adapt", "mcmc"},
+    {"training", "evaluation"},
+    {"results"},
+    {"cli"},
+)
+"""Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""
+SIBLINGS = {("geometry", "cameras"), ("texture", "tiles")}
+"""Imports allowed within one layer: (importer, imported)."""
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def component(path: Path) -> str:
+    """The module or subpackage of the package that a file belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported_components(path: Path) -> set[str]:
+    """The modules and subpackages of the package that a file imports, anywhere in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} imports relatively"
+            names = [node.module or ""]
+            if node.module == "a2tg_jax":
+                names = [f"a2tg_jax.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        found |= {name.split(".")[1] for name in names if name.startswith("a2tg_jax.")}
+    return found
+
+
+def layer(name: str) -> int:
+    return next(index for index, names in enumerate(LAYERS) if name in names)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_run_downward(path):
+    importer = component(path)
+    for imported in imported_components(path) - {importer}:
+        is_below = layer(imported) < layer(importer) or (importer, imported) in SIBLINGS
+        assert is_below, f"{path.relative_to(PACKAGE)} imports {imported}, which is not below {importer}"
+
+
+def test_adaptation_and_mcmc_know_neither_render_nor_each_other():
+    for name, forbidden in (("adapt", {"render", "mcmc"}), ("mcmc", {"render", "adapt"})):
+        assert not imported_components(PACKAGE / f"{name}.py") & forbidden
+
+
+def test_jaxopt_has_one_importer():
+    importers = [path.name for path in MODULES if "jaxopt" in path.read_text(encoding="utf-8").split()]
+    assert importers in (["optim.py"], [])
+
+
+def test_import_leaves_jax_alone():
+    """The import compiles nothing, starts no device, and leaves configuration and environment as they were."""
+    script = """
+import os, jax
+before = dict(jax.config.values), dict(os.environ)
+import a2tg_jax, a2tg_jax.startup, a2tg_jax.training, a2tg_jax.render
+assert dict(jax.config.values) == before[0], "configuration changed"
+assert dict(os.environ) == before[1], "environment changed"
+from jax._src import xla_bridge
+assert not xla_bridge._backends, "a device was started"
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

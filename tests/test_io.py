@@ -1,0 +1,281 @@
+"""PLY files, archives, configurations as JSON, and the change of world."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.config import DensifyConfig, TextureConfig, TrainConfig
+from a2tg_jax.data.world import Similarity
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
+from a2tg_jax.io.model import Model, load_model, save_model
+from a2tg_jax.io.ply import ATTRIBUTES, load_ply, save_ply
+from a2tg_jax.io.transform import sh_rotation, transform_gaussians
+from a2tg_jax.render import render_image
+from a2tg_jax.sh import sh_basis
+from a2tg_jax.texture import texture_arrays, textures_from_arrays
+
+
+def some_gaussians(num: int = 7, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    draw = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)  # noqa: E731
+    return Gaussians(draw(num, 3), draw(num, 4), draw(num, 2) - 2, draw(num), 0.3 * draw(num, 16, 3))
+
+
+def some_world(seed: int = 1) -> Similarity:
+    rng = np.random.default_rng(seed)
+    return Similarity(1.7, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+
+
+def assert_same(a: Gaussians, b: Gaussians, atol: float = 0.0) -> None:
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(np.asarray(x), np.asarray(y), atol=atol, rtol=0)
+
+
+def write_ply(path, names, rows, encoding="binary_little_endian") -> None:
+    """A PLY file written apart from the package."""
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat {encoding} 1.0\ncomment made by hand\nelement vertex {len(rows)}\n{properties}end_header\n"
+    path.write_bytes(header.encode() + np.asarray(rows, "<f4").tobytes())
+
+
+# PLY
+
+
+def test_ply_round_trip(tmp_path):
+    gaussians = some_gaussians()
+    save_ply(tmp_path / "g.ply", gaussians)
+    assert_same(load_ply(tmp_path / "g.ply"), gaussians)
+
+
+def test_ply_attributes_in_the_order_of_2dgs(tmp_path):
+    gaussians = some_gaussians()
+    save_ply(tmp_path / "g.ply", gaussians)
+    header, data = (tmp_path / "g.ply").read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property float ")]
+    rows = np.frombuffer(data, "<f4").reshape(7, 61)
+    column = dict(zip(names, rows.T, strict=True))
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"] + [f"f_rest_{i}" for i in range(45)]
+    assert names == [*expected, "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+    np.testing.assert_array_equal(column["opacity"], gaussians.logit_opacities)
+    np.testing.assert_array_equal(column["scale_1"], gaussians.log_scales[:, 1])
+    np.testing.assert_array_equal(column["rot_0"], gaussians.quats[:, 0])
+    np.testing.assert_array_equal(column["f_rest_1"], gaussians.sh[:, 2, 0])
+    np.testing.assert_array_equal(column["f_rest_15"], gaussians.sh[:, 1, 1])
+    np.testing.assert_array_equal(column["f_rest_44"], gaussians.sh[:, 15, 2])
+
+
+def test_ply_goes_back_to_the_original_world(tmp_path):
+    original, world = some_gaussians(), some_world()
+    save_ply(tmp_path / "g.ply", transform_gaussians(original, world), transform=world)
+    unit = original.quats / jnp.linalg.norm(original.quats, axis=-1, keepdims=True)
+    loaded = load_ply(tmp_path / "g.ply")
+    sign = jnp.sign(jnp.sum(loaded.quats * unit, axis=-1, keepdims=True))
+    expected = dataclasses.replace(original, quats=unit)
+    assert_same(dataclasses.replace(loaded, quats=loaded.quats * sign), expected, atol=2e-6)
+
+
+def test_ply_of_lower_degree_is_filled_with_zeros(tmp_path):
+    names = [name for name in ATTRIBUTES if not name.startswith(("f_rest_", "n"))] + [f"f_rest_{i}" for i in range(9)]
+    rows = np.random.default_rng(0).normal(size=(3, len(names)))
+    write_ply(tmp_path / "g.ply", names, rows)
+    sh = np.asarray(load_ply(tmp_path / "g.ply").sh)
+    np.testing.assert_allclose(sh[:, 1:4, 1], rows[:, names.index("f_rest_3") :][:, :3], rtol=1e-6)
+    assert np.all(sh[:, 4:] == 0)
+
+
+def test_ply_of_3d_gaussians_warns(tmp_path):
+    write_ply(tmp_path / "g.ply", (*ATTRIBUTES, "scale_2"), np.ones((2, 62)))
+    with pytest.warns(UserWarning, match="3D Gaussians"):
+        assert load_ply(tmp_path / "g.ply").num == 2
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: path.write_bytes(b"not a ply\n"), "is not a PLY file"),
+        (lambda path: path.write_bytes(b"ply\nformat ascii 1.0\n"), "save it as binary_little_endian"),
+        (lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\n"), "header does not end"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "is cut off"),
+        (lambda path: write_ply(path, ("x", "y", "z"), np.ones((2, 3))), "no attribute f_dc_0"),
+    ],
+)
+def test_bad_ply_is_one_clear_line(tmp_path, spoil, message):
+    path = tmp_path / "bad.ply"
+    save_ply(path, some_gaussians())
+    spoil(path)
+    with pytest.raises(ValueError, match=message) as raised:
+        load_ply(path)
+    assert "bad.ply" in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_missing_ply(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.ply"):
+        load_ply(tmp_path / "nowhere.ply")
+
+
+# Change of world
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rotated_sh_have_the_same_colours(x64, seed):
+    rng = np.random.default_rng(seed)
+    rotation, coefficients = Rotation.random(rng=rng).as_matrix(), rng.normal(size=16)
+    directions = rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before = sh_basis(jnp.asarray(directions)) @ coefficients
+    after = sh_basis(jnp.asarray(directions @ rotation.T)) @ (sh_rotation(rotation) @ coefficients)
+    np.testing.assert_allclose(after, before, atol=1e-13)
+
+
+def test_sh_rotations_compose():
+    a, b = (Rotation.random(rng=seed).as_matrix() for seed in (0, 1))
+    np.testing.assert_allclose(sh_rotation(a @ b), sh_rotation(a) @ sh_rotation(b), atol=1e-13)
+    np.testing.assert_allclose(sh_rotation(a.T), sh_rotation(a).T, atol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_world_and_camera_moved_together_show_the_same(x64, seed):
+    rng = np.random.default_rng(seed)
+    as_double = lambda x: jnp.asarray(x, jnp.float64)  # noqa: E731
+    gaussians = jax.tree.map(as_double, some_gaussians(20, seed))
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[2, 3] = Rotation.random(rng=rng).as_matrix(), 5
+    camera = Camera(as_double(viewmat), as_double([[30, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
+    textures, layout = textures_from_arrays([rng.uniform(size=(2, 4, 4)) for _ in range(20)])
+    world = some_world(seed)
+    moved = dataclasses.replace(camera, viewmat=as_double(world.apply_to_viewmat(viewmat)))
+    before = render_image(gaussians, camera, textures, layout)
+    after = render_image(transform_gaussians(gaussians, world), moved, textures, layout)
+    np.testing.assert_allclose(after.color, before.color, atol=1e-12)
+    np.testing.assert_allclose(after.alpha, before.alpha, atol=1e-12)
+    np.testing.assert_allclose(after.depth, world.scale * before.depth, atol=1e-12)
+    np.testing.assert_allclose(after.normal, before.normal @ world.rotation.T, atol=1e-12)
+    assert before.alpha.mean() > 0.2
+
+
+# Archives
+
+
+def test_archive_round_trip(tmp_path):
+    arrays = {"a/b": np.arange(6.0).reshape(2, 3), "scalar": np.int64(3), "empty": np.zeros((0, 4), np.float32)}
+    write_archive(tmp_path / "a.npz", {"stage": 2, "names": ["x"]}, arrays)
+    header, loaded = read_archive(tmp_path / "a.npz")
+    assert header == {"format": "a2tg-jax checkpoint", "version": 1, "stage": 2, "names": ["x"]}
+    assert header == read_archive_header(tmp_path / "a.npz")
+    assert set(loaded) == set(arrays)
+    for name, array in arrays.items():
+        assert loaded[name].dtype == array.dtype
+        np.testing.assert_array_equal(loaded[name], array)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_failed_write_keeps_the_old_archive(tmp_path):
+    write_archive(tmp_path / "a.npz", {"stage": 1}, {})
+    with pytest.raises(TypeError):
+        write_archive(tmp_path / "a.npz", {"stage": object()}, {})
+    assert read_archive_header(tmp_path / "a.npz")["stage"] == 1
+
+
+def test_other_version_is_refused(tmp_path):
+    header = json.dumps({"format": "a2tg-jax checkpoint", "version": 99}).encode()
+    np.savez(tmp_path / "a.npz", header=np.frombuffer(header, np.uint8))
+    with pytest.raises(ValueError, match=r"a\.npz: is an a2tg-jax checkpoint of version 99; .* version 1"):
+        read_archive(tmp_path / "a.npz")
+
+
+def test_other_kind_is_refused(tmp_path):
+    save_model(tmp_path / "a.npz", Model(some_gaussians()))
+    with pytest.raises(ValueError, match="is an a2tg-jax model, not an a2tg-jax checkpoint"):
+        read_archive(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+def test_truncated_archive_is_one_clear_line(tmp_path, share):
+    path = tmp_path / "cut.npz"
+    write_archive(path, {}, {"a": np.arange(1000)})
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(ValueError, match=r"cut\.npz: is not an a2tg-jax checkpoint, or is damaged"):
+        read_archive(path)
+
+
+def test_damaged_archive_is_one_clear_line(tmp_path):
+    path = tmp_path / "bits.npz"
+    write_archive(path, {}, {"a": np.arange(1000)})
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(bytes(data))
+    with pytest.raises(ValueError, match="or is damaged"):
+        read_archive(path)
+
+
+def test_npz_without_header_is_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.arange(3))
+    with pytest.raises(ValueError, match="is not an a2tg-jax checkpoint"):
+        read_archive(tmp_path / "other.npz")
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_archive(tmp_path / "nowhere.npz")
+
+
+# Models
+
+
+def test_model_round_trip(tmp_path):
+    rng = np.random.default_rng(0)
+    arrays = [rng.normal(size=(tv, tu, 4)).astype(np.float32) for tv, tu in [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2)]]
+    save_model(tmp_path / "m.npz", Model(some_gaussians(5), *textures_from_arrays(arrays)))
+    loaded = load_model(tmp_path / "m.npz")
+    assert_same(loaded.gaussians, some_gaussians(5))
+    for array, again in zip(arrays, texture_arrays(loaded.textures, loaded.layout), strict=True):
+        np.testing.assert_array_equal(array, again)
+
+
+def test_model_without_textures(tmp_path):
+    save_model(tmp_path / "m.npz", Model(some_gaussians()))
+    assert load_model(tmp_path / "m.npz").textures is None
+
+
+# Configurations
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        TrainConfig.paper(),
+        TrainConfig.quick(),
+        TrainConfig(texture=TextureConfig(upscale_at=(0.1, 0.5), budget_mb=3)),
+    ],
+)
+def test_config_round_trip(config):
+    text = json.dumps(config_to_dict(config))
+    assert config_from_dict(TrainConfig, json.loads(text)) == config
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: data.update(colour=1), "config.colour is not a field of TrainConfig"),
+        (lambda data: data["densify"].pop("cap"), "config.densify.cap is missing"),
+        (lambda data: data["densify"].update(cap="many"), "config.densify.cap must be int; got 'many'"),
+        (lambda data: data.update(background="green"), "config.background must be .*'green'"),
+        (lambda data: data.update(seed=True), "config.seed must be int; got True"),
+        (lambda data: data.update(loss=3), "config.loss must hold the fields of LossConfig; got 3"),
+    ],
+)
+def test_bad_config_names_the_field(spoil, message):
+    data = config_to_dict(TrainConfig.paper())
+    spoil(data)
+    with pytest.raises(ValueError, match=message):
+        config_from_dict(TrainConfig, data)
+
+
+def test_flat_names_are_those_of_the_command_line():
+    leaves = flatten_config(TrainConfig(densify=DensifyConfig(cap=7)))
+    assert leaves["densify.cap"] == 7 and leaves["seed"] == 0

@@ -1,0 +1,154 @@
+"""Losses: SSIM against scikit-image, normals of a depth map against a plane, gradients against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from skimage.metrics import structural_similarity
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.losses import (
+    depth_normals,
+    mean_opacity,
+    mean_scale,
+    normal_consistency,
+    photometric_loss,
+    ssim,
+)
+
+
+def random_pair(height, width, noise, dtype=np.float64, seed=0):
+    """A smooth random image and a disturbed copy that leaves [0, 1]."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(width) / width, np.arange(height) / height)
+    image = 0.5 + 0.4 * np.stack([np.sin(9 * x + 5 * y + phase) for phase in rng.uniform(0, 6, 3)], -1)
+    return image.astype(dtype), (image + noise * rng.normal(size=image.shape)).astype(dtype)
+
+
+def reference_ssim(image, target):
+    return structural_similarity(
+        image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
+    )
+
+
+@pytest.mark.parametrize("shape", [(11, 11), (11, 30), (37, 24)])
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.5])
+def test_ssim_equals_scikit_image(x64, shape, noise):
+    image, target = random_pair(*shape, noise)
+    np.testing.assert_allclose(ssim(jnp.asarray(image), jnp.asarray(target)), reference_ssim(image, target), atol=1e-12)
+
+
+def test_ssim_in_float32():
+    image, target = random_pair(60, 50, 0.1, np.float32)
+    value = ssim(jnp.asarray(image), jnp.asarray(target))
+    assert value.dtype == jnp.float32
+    np.testing.assert_allclose(value, reference_ssim(image.astype(np.float64), target.astype(np.float64)), atol=2e-5)
+
+
+def test_photometric_loss_is_its_formula(x64):
+    image, target = random_pair(20, 16, 0.1)
+    wanted = 0.8 * np.abs(image - target).mean() + 0.2 * (1 - reference_ssim(image, target))
+    np.testing.assert_allclose(photometric_loss(jnp.asarray(image), jnp.asarray(target)), wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_gradient_equals_central_differences_at_every_pixel(x64, weight):
+    image, target = map(jnp.asarray, random_pair(13, 12, 0.1))
+
+    def loss(flat):
+        return photometric_loss(flat.reshape(image.shape), target, ssim_weight=weight)
+
+    eps = 1e-6
+    steps = eps * jnp.eye(image.size)
+    differences = jax.vmap(lambda step: (loss(image.ravel() + step) - loss(image.ravel() - step)) / (2 * eps))(steps)
+    np.testing.assert_allclose(jax.grad(loss)(image.ravel()), differences, rtol=1e-5, atol=1e-9)
+
+
+def test_ssim_of_a_batch_under_vmap_and_jit():
+    pairs = [random_pair(14, 15, 0.1, np.float32, seed) for seed in range(3)]
+    images, targets = (jnp.stack([jnp.asarray(x) for x in side]) for side in zip(*pairs, strict=True))
+    batched = jax.jit(jax.vmap(jax.value_and_grad(ssim)))(images, targets)
+    for index in range(3):
+        value, gradient = jax.value_and_grad(ssim)(images[index], targets[index])
+        np.testing.assert_allclose(batched[0][index], value, rtol=1e-5)
+        np.testing.assert_allclose(batched[1][index], gradient, rtol=1e-3, atol=1e-6)
+
+
+def test_flat_images_have_a_finite_gradient():
+    gradient = jax.grad(photometric_loss)(jnp.zeros((12, 12, 3)), jnp.zeros((12, 12, 3)))
+    assert np.isfinite(gradient).all()
+
+
+def test_bad_images_are_named():
+    image = jnp.zeros((12, 12, 3))
+    with pytest.raises(ValueError, match="at least 11 by 11"):
+        ssim(image[:10], image[:10])
+    with pytest.raises(ValueError, match="must both be"):
+        photometric_loss(image, image[:11])
+    with pytest.raises(ValueError, match="must be floats"):
+        photometric_loss(image, jnp.zeros((12, 12, 3), jnp.uint8))
+    assert photometric_loss(image[:4], image[:4], ssim_weight=0.0) == 0
+
+
+def plane_view(width=17, height=13):
+    """A turned camera and the depth map it sees of a tilted plane, whose world normal faces it."""
+    angle = 0.4
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, (0.3, -0.2, 0.5)
+    K = np.array([[20.0, 0, 8], [0, 22, 7], [0, 0, 1]])
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T
+    normal = np.array([0.3, -0.4, -1.0]) / np.linalg.norm([0.3, -0.4, -1.0])
+    depth = normal[2] * 4 / (rays @ normal)
+    camera = Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
+    return camera, jnp.asarray(depth), jnp.asarray(rotation.T @ normal)
+
+
+def test_depth_normals_of_a_plane_are_its_normal(x64):
+    camera, depth, normal = plane_view()
+    normals, is_defined = depth_normals(depth, depth > 0, camera)
+    assert is_defined.all()
+    np.testing.assert_allclose(normals, jnp.broadcast_to(normal, normals.shape), atol=1e-12)
+
+
+def test_normal_consistency_is_zero_on_its_own_plane_at_any_alpha(x64):
+    camera, depth, normal = plane_view()
+    alpha = jnp.linspace(0.1, 1.0, depth.size).reshape(depth.shape)
+    rendered = alpha[..., None] * normal[None, None]
+    np.testing.assert_allclose(normal_consistency(rendered, depth * alpha, alpha, camera), 0, atol=1e-12)
+    turned = normal_consistency(-rendered, depth * alpha, alpha, camera)
+    np.testing.assert_allclose(turned, 2 * alpha[1:-1, 1:-1].sum() / alpha.size, rtol=1e-12)
+
+
+def test_normal_consistency_leaves_out_pixels_without_a_surface(x64):
+    camera, depth, _ = plane_view()
+    hole = jnp.ones_like(depth).at[5, 6].set(0.0)
+
+    def loss(alpha):
+        return normal_consistency(jnp.zeros((*depth.shape, 3)), depth * alpha, alpha, camera)
+
+    value, gradient = jax.value_and_grad(loss)(hole)
+    np.testing.assert_allclose(value, (11 * 15 - 5) / depth.size, rtol=1e-12)
+    assert np.isfinite(gradient).all()
+
+
+def test_normal_consistency_gradient(x64):
+    camera, depth, normal = plane_view(7, 6)
+    rng = np.random.default_rng(0)
+    alpha = jnp.asarray(rng.uniform(0.3, 1, depth.shape))
+    rendered = alpha[..., None] * normal[None, None] + 0.2 * jnp.asarray(rng.normal(size=(6, 7, 3)))
+    bumpy = depth * jnp.asarray(rng.uniform(0.9, 1.1, depth.shape))
+    check_grads(lambda *x: normal_consistency(*x, camera), (rendered, bumpy * alpha, alpha), 1, modes=["rev"], eps=1e-6)
+
+
+def test_regularisers_see_live_rows_only():
+    rng = np.random.default_rng(0)
+    gaussians = init_from_points(rng.normal(size=(8, 3)), rng.uniform(size=(8, 3)))
+    np.testing.assert_allclose(jax.jit(mean_opacity)(gaussians, 5), gaussians.opacities[:5].mean(), rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(mean_scale)(gaussians, 5), gaussians.scales[:5].mean(), rtol=1e-6)
+    gradient = jax.grad(mean_scale)(gaussians, 5).log_scales
+    assert (gradient[:5] > 0).all() and (gradient[5:] == 0).all()
+    assert mean_opacity(gaussians, 0) == 0

@@ -1,0 +1,128 @@
+"""Metrics: clipping, LPIPS against the official package's figures, bytes by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.metrics import load_lpips, lpips, padding_bytes, parameter_bytes, psnr, ssim
+from a2tg_jax.texture import allocate_textures
+
+
+def random_image(seed, shape=(24, 20, 3)):
+    """Values on both sides of [0, 1]."""
+    return np.random.default_rng(seed).uniform(-0.3, 1.3, shape)
+
+
+def test_psnr_and_ssim_equal_scikit_image_on_clipped_images(x64):
+    image, target = random_image(0), random_image(1)
+    clipped = np.clip(image, 0, 1), np.clip(target, 0, 1)
+    np.testing.assert_allclose(psnr(image, target), peak_signal_noise_ratio(*clipped, data_range=1), rtol=1e-12)
+    wanted = structural_similarity(
+        *clipped, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
+    )
+    np.testing.assert_allclose(ssim(image, target), wanted, atol=1e-12)
+
+
+def test_equal_images_are_perfect():
+    image = jnp.asarray(random_image(0), jnp.float32)
+    assert psnr(image, image) == np.inf
+    np.testing.assert_allclose(ssim(image, image), 1, atol=1e-6)
+
+
+def test_images_of_different_shape_are_refused():
+    with pytest.raises(ValueError, match="must both be"):
+        psnr(jnp.zeros((4, 4, 3)), jnp.zeros((4, 5, 3)))
+
+
+@pytest.mark.parametrize("network, distances", [("alex", (0.722, 0.138)), ("squeeze", (0.711, 0.148))])
+def test_lpips_known_answers(shared, network, distances):
+    weights = load_lpips(shared / "lpips" / f"lpips_{network}.npz")
+    assert weights.network == network
+    reference, *others = (read_example(shared, name) for name in ("ex_ref", "ex_p0", "ex_p1"))
+    for other, distance in zip(others, distances, strict=True):
+        np.testing.assert_allclose(lpips(reference, other, weights), distance, atol=5e-4)
+
+
+def read_example(shared, name):
+    image = Image.open(shared / "lpips" / "example" / f"{name}.png").convert("RGB")
+    return jnp.asarray(np.asarray(image), jnp.float32) / 255
+
+
+@pytest.fixture(scope="module")
+def random_squeeze(tmp_path_factory):
+    """A weights file of SqueezeNet's layout with random numbers in it."""
+    rng = np.random.default_rng(0)
+    arrays = {}
+
+    def add(name, out, inputs, size):
+        arrays[f"{name}.weight"] = rng.normal(0, (2 / (inputs * size**2)) ** 0.5, (out, inputs, size, size))
+        arrays[f"{name}.bias"] = np.zeros(out)
+
+    add("features.0", 64, 3, 3)
+    inputs = 64
+    for index, squeezed, expanded in [(3, 16, 64), (4, 16, 64), (6, 32, 128), (7, 32, 128), (9, 48, 192)] + [
+        (10, 48, 192),
+        (11, 64, 256),
+        (12, 64, 256),
+    ]:
+        add(f"features.{index}.squeeze", squeezed, inputs, 1)
+        add(f"features.{index}.expand1x1", expanded, squeezed, 1)
+        add(f"features.{index}.expand3x3", expanded, squeezed, 3)
+        inputs = 2 * expanded
+    for index, channels in enumerate([64, 128, 256, 384, 384, 512, 512]):
+        arrays[f"lin{index}.weight"] = rng.uniform(0, 1, (1, channels, 1, 1))
+    path = tmp_path_factory.mktemp("weights") / "squeeze.npz"
+    np.savez(path, **{name: array.astype(np.float32) for name, array in arrays.items()})
+    return path
+
+
+def test_lpips_is_a_symmetric_distance_of_clipped_images(random_squeeze):
+    image, target = (jnp.asarray(random_image(seed, (33, 40, 3)), jnp.float32) for seed in (0, 1))
+    distance = lpips(image, target, random_squeeze)
+    assert distance.dtype == jnp.float32 and distance > 0
+    assert lpips(image, image, random_squeeze) == 0
+    np.testing.assert_allclose(lpips(target, image, random_squeeze), distance, rtol=1e-5)
+    np.testing.assert_allclose(lpips(jnp.clip(image, 0, 1), target, random_squeeze), distance, rtol=1e-5)
+    weights = load_lpips(random_squeeze)
+    assert load_lpips(str(random_squeeze)) is weights
+    np.testing.assert_allclose(jax.jit(lambda a, b: lpips(a, b, weights))(image, target), distance, rtol=1e-4)
+
+
+def test_wrong_weights_are_named(tmp_path, random_squeeze):
+    with pytest.raises(FileNotFoundError, match=r"no LPIPS weights at .*absent\.npz"):
+        load_lpips(tmp_path / "absent.npz")
+    (tmp_path / "text.npz").write_text("not an archive")
+    with pytest.raises(ValueError, match=r"text\.npz is not an \.npz archive"):
+        load_lpips(tmp_path / "text.npz")
+    np.save(tmp_path / "one_array.npy", np.zeros(3))
+    with pytest.raises(ValueError, match="is not an .npz archive"):
+        load_lpips(tmp_path / "one_array.npy")
+    np.savez(tmp_path / "other.npz", means=np.zeros(3))
+    with pytest.raises(ValueError, match=r"other\.npz does not hold LPIPS weights"):
+        load_lpips(tmp_path / "other.npz")
+    arrays = dict(np.load(random_squeeze))
+    arrays["lin3.weight"] = arrays["lin3.weight"][:, :5]
+    np.savez(tmp_path / "mixed.npz", **arrays)
+    with pytest.raises(ValueError, match="do not fit the channels of squeeze"):
+        load_lpips(tmp_path / "mixed.npz")
+
+
+def test_lpips_refuses_tiny_images(random_squeeze):
+    with pytest.raises(ValueError, match="at least 32 pixels; got 40 by 31"):
+        lpips(jnp.zeros((31, 40, 3)), jnp.zeros((31, 40, 3)), random_squeeze)
+
+
+def test_bytes_are_counted_without_padding():
+    rng = np.random.default_rng(0)
+    gaussians = init_from_points(rng.normal(size=(100, 3)), rng.uniform(size=(100, 3)))
+    sizes = np.ones((100, 2), int)
+    sizes[:33] = (4, 2)
+    textures, layout = allocate_textures(sizes)
+    assert parameter_bytes(gaussians) == 23_200
+    assert parameter_bytes(gaussians, layout) == 23_200 + 16 * (67 + 33 * 8)
+    allocated = sum(bucket.nbytes for bucket in textures.buckets)
+    assert padding_bytes(textures, layout) == allocated - 16 * (67 + 33 * 8)

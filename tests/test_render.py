@@ -1,0 +1,129 @@
+"""Images of the renderer against the oracle, on random scenes with every kind of splat and texture size."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from oracle import DEFAULT_RULES, Rules, Scene
+from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene
+
+from a2tg_jax import RenderOutput, RenderSettings, render_image
+
+FIELDS = ("color", "alpha", "depth", "normal")
+OFFICIAL = Rules(uv="align-corners", outside="identity", rgb="unit")
+OPTIONS = {
+    "align-corners": Rules(uv="align-corners"),
+    "identity": Rules(outside="identity"),
+    "unit": Rules(rgb="unit"),
+    "official": OFFICIAL,
+    "degree 0": Rules(sh_degree=0),
+    "degree 1": Rules(sh_degree=1),
+    "degree 2": Rules(sh_degree=2),
+    "near 1": Rules(near=1.0),
+}
+
+
+def rendered(scene: Scene, dtype: str, settings: RenderSettings) -> RenderOutput:
+    """The package's image of a scene, rendered eagerly."""
+    textures, layout = as_textures(scene, dtype)
+    background = jnp.asarray(scene.background, dtype)
+    return render_image(
+        as_gaussians(scene, dtype), as_camera(scene, dtype), textures, layout, background=background, settings=settings
+    )
+
+
+def errors(output: RenderOutput, expected: oracle.Image, is_compared: np.ndarray) -> dict[str, np.ndarray]:
+    """Per field, the largest error over the channels at each compared pixel; depths relative where above 1."""
+    assert not output.overflow
+    found = {}
+    for name in FIELDS:
+        image = np.asarray(getattr(output, name))
+        wanted = getattr(expected, name)
+        assert image.shape == wanted.shape
+        error = abs(image - wanted) / (np.maximum(wanted, 1) if name == "depth" else 1)
+        found[name] = error.reshape(*wanted.shape[:2], -1).max(axis=-1)[is_compared]
+    return found
+
+
+def assert_equal_in_float64(scene: Scene, rules: Rules, settings: RenderSettings):
+    """All pixels agree to 1e-9; every scene here keeps its decisions farther than that from the thresholds."""
+    expected = oracle.render(scene, rules)
+    assert expected.margin.min() > 1e-9
+    output = rendered(scene, "float64", settings)
+    for name, error in errors(output, expected, np.full(expected.alpha.shape, True)).items():
+        assert output.color.dtype == jnp.float64
+        assert error.max() < 1e-9, name
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+@pytest.mark.parametrize("seed", [0, 3, 4, 9])
+def test_float64(seed, tile_size):
+    assert_equal_in_float64(draw_scene(seed), DEFAULT_RULES, as_settings(tile_size=tile_size))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("tile_batch", [0, 1])
+def test_float64_with_tiles_at_once_and_one_by_one(tile_batch):
+    assert_equal_in_float64(draw_scene(4), DEFAULT_RULES, as_settings(tile_batch=tile_batch))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("option", OPTIONS)
+def test_float64_options(option):
+    assert_equal_in_float64(draw_scene(9), OPTIONS[option], as_settings(OPTIONS[option]))
+
+
+@pytest.mark.usefixtures("x64")
+def test_official_preset_is_all_three_options():
+    assert_equal_in_float64(draw_scene(5), OFFICIAL, RenderSettings.official())
+
+
+@pytest.mark.usefixtures("x64")
+def test_float64_without_textures():
+    assert_equal_in_float64(draw_scene(9)._replace(textures=None), DEFAULT_RULES, RenderSettings())
+
+
+@pytest.mark.usefixtures("x64")
+def test_equal_depths_are_ordered_by_index():
+    scene = draw_scene(3)
+    pairs = np.arange(len(scene.means)) // 2 * 2
+    assert_equal_in_float64(scene._replace(means=scene.means[pairs]), DEFAULT_RULES, RenderSettings())
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(("width", "height"), [(5, 3), (1, 1), (16, 8), (33, 17)])
+def test_image_sizes(width, height):
+    assert_equal_in_float64(draw_scene(2, num=20, width=width, height=height), DEFAULT_RULES, as_settings(tile_size=8))
+
+
+@pytest.mark.parametrize("tile_size", [8, 16])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 6, 7])
+def test_float32(seed, tile_size):
+    """99% of the pixels to 1e-5 and 99.9% to 3e-4, leaving out those that decide within 1e-4 of a threshold."""
+    scene = draw_scene(seed)
+    expected = oracle.render(scene)
+    is_compared = expected.margin > 1e-4
+    assert is_compared.mean() > 0.95
+    output = rendered(scene, "float32", as_settings(tile_size=tile_size))
+    for name, error in errors(output, expected, is_compared).items():
+        assert output.color.dtype == jnp.float32
+        assert np.mean(error < 1e-5) >= 0.99, name
+        assert np.mean(error < 3e-4) >= 0.999, name
+
+
+def test_a_scene_wholly_behind_the_camera_is_background():
+    scene = draw_scene(0, num=10)
+    away = scene.viewmat.copy()
+    away[2] = [0, 0, 0, -1]
+    output = rendered(scene._replace(viewmat=away), "float32", RenderSettings())
+    np.testing.assert_array_equal(output.alpha, 0)
+    np.testing.assert_array_equal(output.color, np.broadcast_to(np.float32(scene.background), output.color.shape))
+
+
+def test_settings_are_a_frozen_value():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        RenderSettings().tile_size = 4
+    assert hash(RenderSettings()) == hash(RenderSettings())

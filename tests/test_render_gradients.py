@@ -1,0 +1,228 @@
+"""Gradients of the renderer against central differences of the oracle, and finite gradients on degenerate scenes."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from oracle import DEFAULT_RULES, Float, Rules, Scene
+from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, draw_smooth_scene
+
+from a2tg_jax import (
+    AtlasLayout,
+    Camera,
+    Gaussians,
+    RenderOutput,
+    RenderSettings,
+    Textures,
+    plan_render,
+    render_image,
+    texture_arrays,
+    textures_from_arrays,
+)
+
+EPSILON = 3e-6
+"""Step of the central differences: losses of about 50 round off to 50·1e-16/ε = 2e-9, and steps of 1e-6 and 1e-5 were
+seen to give the same quotients to 2e-6 of the largest."""
+CLEARANCE = 1e-3
+"""Relative distance of every decision and kink from its threshold: hundreds of steps, so that none is crossed."""
+SMOOTH_SEEDS = [53, 161]
+"""Scenes found to keep that clearance under the default rules and under the official ones."""
+OFFICIAL = Rules(uv="align-corners", outside="identity", rgb="unit")
+FIELDS = ("color", "alpha", "depth", "normal")
+LEAVES = ["means", "quats", "log_scales", "logit_opacities", "sh", "viewmat", "K", "background"]
+
+
+class Inputs(NamedTuple):
+    """Everything that the image can be differentiated by."""
+
+    gaussians: Gaussians
+    textures: Textures | None
+    viewmat: jax.Array
+    K: jax.Array
+    background: jax.Array
+
+
+def as_inputs(scene: Scene, dtype: str) -> tuple[Inputs, AtlasLayout | None]:
+    """The scene's differentiable inputs, and its texture layout."""
+    textures, layout = as_textures(scene, dtype)
+    camera = as_camera(scene, dtype)
+    background = jnp.asarray(scene.background, dtype)
+    return Inputs(as_gaussians(scene, dtype), textures, camera.viewmat, camera.K, background), layout
+
+
+def draw_weights(scene: Scene) -> dict[str, Float]:
+    """Fixed random weights of every channel of every output."""
+    rng = np.random.default_rng(0)
+    shape = (scene.height, scene.width)
+    channels = {"color": (3,), "alpha": (), "depth": (), "normal": (3,)}
+    return {name: rng.normal(size=(*shape, *channels[name])) for name in FIELDS}
+
+
+def package_loss(scene: Scene, layout: AtlasLayout | None, settings: RenderSettings) -> Callable[[Inputs], jax.Array]:
+    """The weighted sum of all outputs, as a function of the inputs."""
+    weights = draw_weights(scene)
+
+    def loss(inputs: Inputs) -> jax.Array:
+        camera = Camera(inputs.viewmat, inputs.K, scene.width, scene.height)
+        output: RenderOutput = render_image(
+            inputs.gaussians, camera, inputs.textures, layout, background=inputs.background, settings=settings
+        )
+        images = {name: getattr(output, name) for name in FIELDS}
+        return sum(jnp.sum(image * jnp.asarray(weights[name], image.dtype)) for name, image in images.items())
+
+    return loss
+
+
+def oracle_loss(scene: Scene, rules: Rules, texels: list[Float] | None = None) -> float:
+    """The same weighted sum of the oracle's outputs; `texels` replace the lookups where given."""
+    image = oracle.render(scene, rules, texels)
+    return sum(np.sum(getattr(image, name) * weight) for name, weight in draw_weights(scene).items())
+
+
+def differences(value: Float, loss: Callable[[Float], float]) -> Float:
+    """Central difference quotient of `loss` by every entry of `value`, one at a time."""
+    gradient = np.zeros_like(value)
+    for index in np.ndindex(value.shape):
+        ends = []
+        for step in (EPSILON, -EPSILON):
+            moved = value.copy()
+            moved[index] += step
+            ends.append(loss(moved))
+        gradient[index] = (ends[0] - ends[1]) / (2 * EPSILON)
+    return gradient
+
+
+def assert_gradients_close(gradient: Any, expected: Float, name: str):
+    """Agreement to 1e-5 of the leaf's largest entry."""
+    scale = abs(expected).max()
+    assert scale > 1e-3, f"{name} has no gradient to compare"
+    np.testing.assert_allclose(np.asarray(gradient) / scale, expected / scale, atol=1e-5, rtol=0, err_msg=name)
+
+
+def smooth_scene(seed: int, rules: Rules) -> Scene:
+    """A scene whose every pixel keeps clear of thresholds and kinks, and in which every splat shows."""
+    scene = draw_smooth_scene(seed)
+    image = oracle.render(scene, rules)
+    assert min(image.margin.min(), image.kink.min()) > CLEARANCE
+    rgb = np.concatenate([texture[..., :3].ravel() for texture in scene.textures])
+    assert min(abs(rgb).min(), abs(rgb - 1).min()) > 10 * EPSILON
+    assert (image.weights > 0).any(axis=(1, 2)).all()
+    return scene
+
+
+def leaf_of(gradient: Inputs, name: str) -> jax.Array:
+    """The gradient of one leaf by its name in the oracle's scene."""
+    return getattr(gradient, name) if hasattr(gradient, name) else getattr(gradient.gaussians, name)
+
+
+def assert_matches_oracle(scene: Scene, rules: Rules, settings: RenderSettings, texels: list[Float] | None = None):
+    """Every leaf but the textures by differences with the given lookups, the textures by differences with their own."""
+    inputs, layout = as_inputs(scene, "float64")
+    gradient = jax.grad(package_loss(scene, layout, settings))(inputs)
+    for name in LEAVES:
+        expected = differences(
+            getattr(scene, name), lambda x, name=name: oracle_loss(scene._replace(**{name: x}), rules, texels)
+        )
+        assert_gradients_close(leaf_of(gradient, name), expected, name)
+    for i, found in enumerate(texture_arrays(gradient.textures, layout)):
+
+        def loss(texture: Float, i: int = i) -> float:
+            return oracle_loss(scene._replace(textures=[*scene.textures[:i], texture, *scene.textures[i + 1 :]]), rules)
+
+        assert_gradients_close(found, differences(scene.textures[i], loss), f"texture {i}")
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("seed", SMOOTH_SEEDS)
+def test_every_leaf_against_differences(seed):
+    assert_matches_oracle(smooth_scene(seed, DEFAULT_RULES), DEFAULT_RULES, as_settings(tile_size=8))
+
+
+@pytest.mark.usefixtures("x64")
+def test_official_gradients_stop_at_the_lookup():
+    """The official preset is the gradient with what the lookups gave held fixed."""
+    scene = smooth_scene(SMOOTH_SEEDS[0], OFFICIAL)
+    texels = [layer.texel for layer in oracle.splat_layers(scene, OFFICIAL)]
+    assert_matches_oracle(scene, OFFICIAL, dataclasses.replace(RenderSettings.official(), tile_size=8), texels)
+
+
+@pytest.mark.usefixtures("x64")
+def test_textures_off_against_differences():
+    scene = smooth_scene(SMOOTH_SEEDS[0], DEFAULT_RULES)._replace(textures=None)
+    gradient = jax.grad(package_loss(scene, None, as_settings(tile_size=8)))(as_inputs(scene, "float64")[0])
+    for name in LEAVES:
+        expected = differences(
+            getattr(scene, name), lambda x, name=name: oracle_loss(scene._replace(**{name: x}), DEFAULT_RULES)
+        )
+        assert_gradients_close(leaf_of(gradient, name), expected, name)
+
+
+@pytest.mark.usefixtures("x64")
+def test_last_row_of_the_viewmat_and_padding_have_no_gradient():
+    scene = draw_scene(0, num=20)
+    inputs, layout = as_inputs(scene, "float64")
+    gradient = jax.grad(package_loss(scene, layout, RenderSettings()))(inputs)
+    np.testing.assert_array_equal(gradient.viewmat[3], 0)
+    repacked, _ = textures_from_arrays(texture_arrays(gradient.textures, layout))
+    for bucket, without_padding in zip(gradient.textures.buckets, repacked.buckets, strict=True):
+        np.testing.assert_array_equal(np.sum(abs(bucket)), np.sum(abs(without_padding)))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("tile_batch", [0, 1])
+def test_gradients_do_not_depend_on_tiles_or_jit(tile_batch):
+    scene = draw_scene(3)
+    inputs, layout = as_inputs(scene, "float64")
+    expected = jax.grad(package_loss(scene, layout, as_settings(tile_size=32)))(inputs)
+    camera = as_camera(scene, "float64")
+    settings = as_settings(tile_size=8, tile_batch=tile_batch)
+    planned = plan_render(inputs.gaussians, [camera], inputs.textures, layout, settings=settings)
+    jitted = jax.jit(jax.grad(package_loss(scene, layout, planned)))(inputs)
+    for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(jitted), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
+
+
+@pytest.mark.usefixtures("x64")
+def test_float32_gradients_are_those_of_float64():
+    """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and an edge-on division."""
+    scene = draw_smooth_scene(SMOOTH_SEEDS[1])
+    gradients = []
+    for dtype in ("float64", "float32"):
+        inputs, layout = as_inputs(scene, dtype)
+        gradients.append(jax.grad(package_loss(scene, layout, RenderSettings()))(inputs))
+    for exact, rounded in zip(*map(jax.tree.leaves, gradients), strict=True):
+        assert rounded.dtype == jnp.float32
+        np.testing.assert_allclose(rounded, exact, rtol=0, atol=1e-3 * abs(np.asarray(exact)).max())
+
+
+def degenerate_scene() -> Scene:
+    """A random scene some of whose splats have no rotation, no extent, no or full opacity, or sit on the camera."""
+    scene = draw_scene(11)
+    camera_center = -scene.viewmat[:3, :3].T @ scene.viewmat[:3, 3]
+    scene.quats[0] = 0
+    scene.means[1] = camera_center
+    scene.means[2] = camera_center + scene.viewmat[0, :3]
+    scene.means[3] = camera_center + 0.2 * scene.viewmat[2, :3]
+    scene.log_scales[4] = [-30, -30]
+    scene.log_scales[5] = [15, 15]
+    scene.log_scales[6] = [10, -20]
+    scene.logit_opacities[7:11] = [-100, -30, 30, 100]
+    scene.means[12] = camera_center + 1e6 * scene.viewmat[2, :3]
+    scene.textures[13][...] = 0
+    return scene
+
+
+@pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings.official()], ids=["default", "official"])
+@pytest.mark.parametrize("draw", [lambda: draw_scene(8), degenerate_scene], ids=["random", "degenerate"])
+def test_values_and_gradients_are_finite(draw, settings):
+    scene = draw()
+    inputs, layout = as_inputs(scene, "float32")
+    value, gradient = jax.value_and_grad(package_loss(scene, layout, settings))(inputs)
+    assert np.isfinite(value)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
