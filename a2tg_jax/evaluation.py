@@ -15,7 +15,7 @@ from a2tg_jax.cameras import Camera
 from a2tg_jax.data import View, view_image
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.metrics import load_lpips, lpips, psnr, ssim
-from a2tg_jax.render import RenderSettings, appearance_of, plan_render, render_color
+from a2tg_jax.render import RenderSettings, appearance_of, plan_render, render_traced
 from a2tg_jax.texture import AtlasLayout, Textures
 
 Color = tuple[float, float, float]
@@ -144,7 +144,9 @@ def _jitted_renderer(settings: RenderSettings, background: Color) -> Callable[..
 
     def draw(camera, gaussians, textures, layout):
         rule = appearance_of(gaussians, textures, layout, settings)
-        return render_color(gaussians, camera, rule, jnp.asarray(background, gaussians.means.dtype), settings)
+        color = jnp.asarray(background, gaussians.means.dtype)
+        output, _ = render_traced(gaussians, camera, rule, color, settings, has_geometry=False)
+        return output.color, output.overflow
 
     return jax.jit(draw)
 

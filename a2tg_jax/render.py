@@ -68,14 +68,6 @@ class RenderOutput(NamedTuple):
     """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
 
 
-class Projection(NamedTuple):
-    """What every rendering of one view starts from."""
-
-    splats: Splats
-    bounds: ScreenBounds
-    depths: Array
-
-
 def render_image(
     gaussians: Gaussians,
     camera: Camera,
@@ -114,41 +106,63 @@ def render_appearance(
     if settings.capacity is None:
         settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings))
     background = jnp.asarray(background, gaussians.means.dtype)
-    rendered = _render_channels(gaussians, camera, rule, settings, has_geometry=True)
-    channels, transmittance, overflow = rendered
-    weight, depth, squared = 1 - transmittance, channels[3], channels[4]
-    return RenderOutput(
-        color=_over_background(channels, transmittance, background),
-        alpha=weight,
-        depth=depth,
-        normal=jnp.moveaxis(channels[5:8], 0, -1),
-        overflow=overflow,
-        distortion=weight * squared - depth * depth,
-    )
+    output, _ = _jitted_render()(gaussians, camera, rule, background, settings)
+    return output
 
 
-def render_color(
+@functools.cache
+def _jitted_render():
+    return jax.jit(render_traced, static_argnums=(4,))
+
+
+def render_traced(
     gaussians: Gaussians,
     camera: Camera,
     rule: AppearanceRule,
     background: Array,
     settings: RenderSettings,
     *,
+    has_geometry: bool = True,
     sh_degree: Any = None,
     num_live: Any = None,
     tap: Array | None = None,
-) -> tuple[Array, Array]:
-    """The colour alone [H, W, 3], and the overflow flag: what training renders at every step.
+) -> tuple[RenderOutput, Array]:
+    """What training differentiates: the output, and how many pairs the view has, for `capacity_for`.
 
     Args:
+      background: [3].
+      settings: with a capacity.
+      has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
       sh_degree: overrides the settings' by a value that may be traced.
       num_live: only the first so many rows show; may be traced.
       tap: [N, 4] zeros, at which the gradient is the absolute positional gradient (`compositor.composite`).
     """
-    channels, transmittance, overflow = _render_channels(
-        gaussians, camera, rule, settings, has_geometry=False, sh_degree=sh_degree, num_live=num_live, tap=tap
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    degree = settings.sh_degree if sh_degree is None else sh_degree
+    splats, bounds = _project(gaussians, camera, rule, settings, degree, num_live)
+    lists = tile_lists(bounds, jax.lax.stop_gradient(splats.M[:, 2, 2]), grid, settings.capacity or 0)
+    how = Compositing(
+        grid=grid,
+        near_plane=settings.near_plane,
+        has_geometry=has_geometry,
+        has_statistic=tap is not None,
+        tile_batch=min(_tile_batch(settings) or grid.num, grid.num),
     )
-    return _over_background(channels, transmittance, background), overflow
+    jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
+    tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
+    channels, transmittance = composite(how, splats, rule, lists, jacobian, tap)
+    return _output(how, channels, transmittance, background, lists.overflow), lists.num_pairs
+
+
+def _output(how: Compositing, channels, transmittance, background, overflow) -> RenderOutput:
+    color = jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
+    alpha = 1 - transmittance
+    if not how.has_geometry:
+        nothing = jnp.zeros_like(alpha)
+        return RenderOutput(color, alpha, nothing, jnp.zeros_like(color), overflow, nothing)
+    depth, squared = channels[3], channels[4]
+    normal = jnp.moveaxis(channels[5:8], 0, -1)
+    return RenderOutput(color, alpha, depth, normal, overflow, distortion=alpha * squared - depth * depth)
 
 
 def plan_render(
@@ -191,21 +205,17 @@ def appearance_of(
 def pairs_of_view(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
     """(splat, tile) pairs of one view, before the outline test (host)."""
     try:
-        return int(_count_pairs(gaussians, camera, rule, settings.tile_size, settings.near_plane))
+        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _jitted_count():
-    return jax.jit(_count_pairs_of, static_argnums=(3, 4))
+    return jax.jit(_count_pairs, static_argnums=(3, 4))
 
 
 def _count_pairs(gaussians, camera, rule, tile_size, near_plane):
-    return _jitted_count()(gaussians, camera, rule, tile_size, near_plane)
-
-
-def _count_pairs_of(gaussians, camera, rule, tile_size, near_plane):
     M, _ = homographies(gaussians, camera)
     bounds = screen_bounds(M, rule.cutoff(rule.params, gaussians.opacities), near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
@@ -240,41 +250,15 @@ def _tile_batch(settings: RenderSettings) -> int:
     return settings.tile_batch
 
 
-def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> Projection:
+def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, ScreenBounds]:
     M, normals = homographies(gaussians, camera)
     opacities = gaussians.opacities
     cutoff = rule.cutoff(rule.params, opacities)
     if num_live is not None:
         cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
-    frozen = jax.lax.stop_gradient(M)
-    bounds = screen_bounds(frozen, jax.lax.stop_gradient(cutoff), settings.near_plane)
+    bounds = screen_bounds(*jax.lax.stop_gradient((M, cutoff)), settings.near_plane)
     # Rows that are drawn nowhere may hold anything; a finite stand-in keeps 0 · inf out of the gradients.
-    is_drawn = (frozen[:, 2, 2] >= settings.near_plane)[:, None, None]
+    is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)[:, None, None]
     M = jnp.where(is_drawn, M, jnp.eye(3, dtype=M.dtype)[None])
     colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
-    return Projection(Splats(M, colors, opacities, normals), bounds, frozen[:, 2, 2])
-
-
-def _render_channels(
-    gaussians, camera, rule, settings, *, has_geometry, sh_degree=None, num_live=None, tap=None
-) -> tuple[Array, Array, Array]:
-    """Channels [D, H, W], final transmittance [H, W] and the overflow flag."""
-    grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    degree = settings.sh_degree if sh_degree is None else sh_degree
-    view = _project(gaussians, camera, rule, settings, degree, num_live)
-    lists = tile_lists(view.bounds, view.depths, grid, settings.capacity)
-    how = Compositing(
-        grid=grid,
-        near_plane=settings.near_plane,
-        has_geometry=has_geometry,
-        has_statistic=tap is not None,
-        tile_batch=min(_tile_batch(settings) or grid.num, grid.num),
-    )
-    jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
-    tap = jnp.zeros((gaussians.num, 4), view.splats.M.dtype) if tap is None else tap
-    channels, transmittance = composite(how, view.splats, rule, lists, jacobian, tap)
-    return channels, transmittance, lists.overflow
-
-
-def _over_background(channels: Array, transmittance: Array, background: Array) -> Array:
-    return jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
+    return Splats(M, colors, opacities, normals), bounds

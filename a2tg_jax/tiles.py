@@ -40,8 +40,10 @@ class TileLists(NamedTuple):
     """[capacity] splat indices, tile after tile."""
     starts: Array
     """[tiles + 1] where the list of each tile begins in `ids`."""
+    num_pairs: Array
+    """Float: pairs before the outline test, which the capacity must hold."""
     overflow: Array
-    """Boolean: the pairs did not fit; the lists are then incomplete and must not be used."""
+    """Boolean: the pairs did not fit; the lists are then empty."""
 
 
 class _Rectangles(NamedTuple):
@@ -122,7 +124,7 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     is_kept = (position < ends[-1]) & _outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)
-    return TileLists(ids, starts, overflow)
+    return TileLists(ids, starts, total, overflow)
 
 
 def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:

@@ -4,14 +4,28 @@ All numbers are drawn in float32, so that both precisions start from the very sa
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from oracle import DEFAULT_RULES, Float, Rules, Scene
 
-from a2tg_jax import AtlasLayout, Camera, Gaussians, RenderSettings, Textures, textures_from_arrays
+from a2tg_jax import (
+    AtlasLayout,
+    Camera,
+    Gaussians,
+    RenderOutput,
+    RenderSettings,
+    Textures,
+    render_image,
+    textures_from_arrays,
+)
+
+CAPACITY = 8192
+"""Room for the pairs of any scene here; one number for all, so that few renderers are compiled."""
 
 TEXTURE_SIZES = [(1, 1), (1, 4), (4, 1), (2, 2), (4, 4), (8, 8), (16, 16), (2, 1), (16, 2), (3, 5)]
 """(Tv, Tu) of the textures, in turn; the same multiset in every scene, so that their shapes compile once."""
@@ -228,3 +242,22 @@ def as_settings(rules: Rules = DEFAULT_RULES, **changes: Any) -> RenderSettings:
     plain = RenderSettings()
     texture = dataclasses.replace(plain.texture, uv=rules.uv, outside=rules.outside, rgb=rules.rgb)
     return dataclasses.replace(plain, near_plane=rules.near, sh_degree=rules.sh_degree, texture=texture, **changes)
+
+
+@functools.cache
+def jitted_renderer(settings: RenderSettings) -> Callable[..., RenderOutput]:
+    """`render_image` of (gaussians, camera, textures, layout, background), compiled once for all tests."""
+
+    def draw(gaussians, camera, textures, layout, background):
+        return render_image(gaussians, camera, textures, layout, background=background, settings=settings)
+
+    return jax.jit(draw)
+
+
+def render_scene(scene: Scene, dtype: str, settings: RenderSettings | None = None) -> RenderOutput:
+    """The package's image of a scene, checked to be whole."""
+    renderer = jitted_renderer(dataclasses.replace(settings or RenderSettings(), capacity=CAPACITY))
+    gaussians, camera, background = as_gaussians(scene, dtype), as_camera(scene, dtype), scene.background
+    output = renderer(gaussians, camera, *as_textures(scene, dtype), jnp.asarray(background, dtype))
+    assert not output.overflow
+    return output

@@ -82,9 +82,7 @@ def test_used_folder_is_refused(capsys, tmp_path):
 
 
 def test_resume_and_overwrite_exclude_each_other(capsys, tmp_path):
-    assert "give one of them" in fails(
-        capsys, "train", "synthetic", "--out", tmp_path, "--resume", "--overwrite"
-    )
+    assert "give one of them" in fails(capsys, "train", "synthetic", "--out", tmp_path, "--resume", "--overwrite")
 
 
 def test_no_photographs(capsys, tmp_path):
@@ -168,9 +166,7 @@ def test_run_folder_is_complete(tiny_run):
     stage2 = metrics["phases"]["stage2"]
     assert stage2["num_gaussians"] == 80 and stage2["num_texels"] > 80
     assert stage2["megabytes"] == pytest.approx((232 * 80 + 16 * stage2["num_texels"]) / 1e6)
-    assert metrics["gain_db"] == pytest.approx(
-        stage2["test"]["psnr"] - metrics["phases"]["baseline"]["test"]["psnr"]
-    )
+    assert metrics["gain_db"] == pytest.approx(stage2["test"]["psnr"] - metrics["phases"]["baseline"]["test"]["psnr"])
     for name in ("curves", "sizes", "resolutions"):
         assert (run.figures / f"{name}.png").is_file()
     assert len(list(run.test.glob("*.png"))) == stage2["test"]["views"]

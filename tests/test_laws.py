@@ -1,6 +1,7 @@
 """Laws that any image obeys, and the contract of capacity, tracing and batching."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,17 @@ import numpy as np
 import oracle
 import pytest
 from oracle import Float, Scene
-from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, quaternion, to_world
+from scenes_random import (
+    as_camera,
+    as_gaussians,
+    as_settings,
+    as_textures,
+    draw_scene,
+    jitted_renderer,
+    quaternion,
+    render_scene,
+    to_world,
+)
 
 from a2tg_jax import (
     Camera,
@@ -17,22 +28,11 @@ from a2tg_jax import (
     allocate_textures,
     plan_render,
     render_image,
+    texture_arrays,
 )
 
 FIELDS = ("color", "alpha", "depth", "normal")
-
-
-def rendered(scene: Scene, settings: RenderSettings | None = None, dtype: str = "float64") -> RenderOutput:
-    """The package's image of a scene, rendered eagerly."""
-    textures, layout = as_textures(scene, dtype)
-    return render_image(
-        as_gaussians(scene, dtype),
-        as_camera(scene, dtype),
-        textures,
-        layout,
-        background=jnp.asarray(scene.background, dtype),
-        settings=settings or RenderSettings(),
-    )
+rendered = functools.partial(render_scene, dtype="float64")
 
 
 def assert_same(one: RenderOutput, other: RenderOutput, tolerance: float = 1e-12):
@@ -61,11 +61,8 @@ def rotate_sh(sh: Float, rotation: Float) -> Float:
 def test_initial_textures_are_no_textures():
     scene = draw_scene(1)
     textures, layout = allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
-    textures = jax.tree.map(lambda x: x.astype(jnp.float64), textures)
-    background = jnp.asarray(scene.background)
-    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
-    textured = render_image(gaussians, camera, textures, layout, background=background)
-    assert_same(textured, rendered(scene._replace(textures=None)))
+    neutral = [np.asarray(texture) for texture in texture_arrays(textures, layout)]
+    assert_same(rendered(scene._replace(textures=neutral)), rendered(scene._replace(textures=None)))
 
 
 @pytest.mark.usefixtures("x64")
@@ -104,7 +101,7 @@ def test_moving_world_and_camera_together(seed):
             viewmat=scene.viewmat @ inverse_motion,
         )
     )
-    assert_same(dataclasses.replace(there, normal=there.normal @ jnp.asarray(rotation)), rendered(scene), 1e-8)
+    assert_same(there._replace(normal=there.normal @ jnp.asarray(rotation)), rendered(scene), 1e-8)
 
 
 @pytest.mark.usefixtures("x64")
@@ -126,8 +123,8 @@ def test_color_is_affine_in_rgb_texels():
 @pytest.mark.parametrize("seed", [0, 4])
 def test_tile_size_does_not_show(seed):
     """In float32 as well: a screen bound that is a fraction of a pixel short would show as a step of 1/255."""
-    scene = draw_scene(seed, width=61, height=47)
-    images = [rendered(scene, as_settings(tile_size=size), "float32") for size in (4, 8, 16, 64)]
+    scene = draw_scene(seed)
+    images = [render_scene(scene, "float32", as_settings(tile_size=size)) for size in (8, 16, 64)]
     for image in images[1:]:
         assert_same(image, images[0], 2e-5)
 
@@ -144,10 +141,10 @@ def test_colors_mix_over_the_background():
 
 
 def test_the_same_shapes_are_traced_once():
+    """Other values are not traced again, nor are textures of the same sizes in another order: the buckets are alike."""
     scene = draw_scene(0)
-    textures, layout = as_textures(scene, "float32")
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    settings = plan_render(gaussians, [camera], textures, layout)
+    settings = plan_render(gaussians, [camera], *as_textures(scene, "float32"))
     num_traces = 0
 
     @jax.jit
@@ -156,83 +153,72 @@ def test_the_same_shapes_are_traced_once():
         num_traces += 1
         return render_image(gaussians, camera, textures, layout, settings=settings)
 
-    for shift in (0.0, 0.01, 0.02):
+    for shift, textures in [(0.0, scene.textures), (0.01, scene.textures), (0.02, scene.textures[::-1])]:
         moved = dataclasses.replace(gaussians, means=gaussians.means + shift)
-        draw(moved, camera, textures, layout)
+        draw(moved, camera, *as_textures(scene._replace(textures=textures), "float32"))
     assert num_traces == 1
 
 
-def test_one_layout_of_other_textures_is_not_traced_again():
-    """Textures of the same sizes in another order have the same buckets: only values change."""
+@pytest.mark.parametrize("transform", [jax.jit, lambda draw: lambda x: jax.vmap(draw)(x[None])], ids=["jit", "vmap"])
+def test_a_missing_capacity_says_what_to_do(transform):
     scene = draw_scene(0)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    num_traces = 0
+    camera = as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
 
-    @jax.jit
-    def draw(textures, layout):
-        nonlocal num_traces
-        num_traces += 1
-        return render_image(gaussians, camera, textures, layout, settings=settings)
+    def draw(means):
+        return render_image(dataclasses.replace(gaussians, means=means), camera).color
 
-    settings = plan_render(gaussians, [camera], *as_textures(scene, "float32"))
-    for textures in (scene.textures, scene.textures[::-1]):
-        draw(*as_textures(scene._replace(textures=textures), "float32"))
-    assert num_traces == 1
-
-
-def test_a_missing_capacity_under_jit_says_what_to_do():
-    scene = draw_scene(0)._replace(textures=None)
     with pytest.raises(ValueError, match="plan_render"):
-        jax.jit(lambda gaussians: render_image(gaussians, as_camera(scene, "float32")).color)(
-            as_gaussians(scene, "float32")
-        )
+        transform(draw)(gaussians.means)
 
 
-@pytest.mark.parametrize("factor", [0.02, 0.3, 0.6, 1.0])
-def test_too_small_a_capacity_is_flagged(factor):
-    scene = draw_scene(0)
-    textures, layout = as_textures(scene, "float32")
+def draw_with(settings: RenderSettings, scene: Scene) -> RenderOutput:
+    """The float32 image under given settings, capacity included, under jit."""
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    planned = plan_render(gaussians, [camera], textures, layout)
-    settings = dataclasses.replace(planned, capacity=max(1, int(planned.capacity * factor)))
-    output = jax.jit(lambda g: render_image(g, camera, textures, layout, settings=settings))(gaussians)
-    if factor == 1.0:
-        assert not output.overflow
-    if factor == 0.02:
-        assert output.overflow
+    background = jnp.asarray(scene.background, jnp.float32)
+    return jitted_renderer(settings)(gaussians, camera, *as_textures(scene, "float32"), background)
+
+
+@pytest.mark.parametrize("capacity", [10, 200, 600])
+def test_too_small_a_capacity_is_flagged(capacity):
+    """Either the flag is up or the image is whole."""
+    scene = draw_scene(0)
+    output = draw_with(as_settings(capacity=capacity), scene)
+    assert capacity > 10 or output.overflow
     if not output.overflow:
-        assert_same(output, render_image(gaussians, camera, textures, layout), 1e-5)
+        assert_same(output, render_scene(scene, "float32"), 1e-6)
 
 
 def test_a_plan_holds_for_all_its_cameras():
-    scenes = [draw_scene(seed)._replace(textures=None) for seed in range(3)]
-    gaussians = as_gaussians(scenes[0], "float32")
-    cameras = [as_camera(scene, "float32") for scene in scenes]
-    settings = plan_render(gaussians, cameras)
-    draw = jax.jit(lambda camera: render_image(gaussians, camera, settings=settings))
-    for camera in cameras:
-        output = draw(camera)
-        assert not output.overflow
-        assert_same(output, render_image(gaussians, camera), 1e-5)
+    scene = draw_scene(0)
+    views = [scene._replace(viewmat=other.viewmat, K=other.K) for other in map(draw_scene, (0, 1, 2))]
+    gaussians, packed = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    settings = plan_render(gaussians, [as_camera(view, "float32") for view in views], *packed)
+    for view in views:
+        assert not draw_with(settings, view).overflow
 
 
 def test_cameras_can_be_batched():
     scene = draw_scene(2)
-    textures, layout = as_textures(scene, "float32")
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    shifts = [np.zeros(3), np.array([0.1, 0, 0]), np.array([0, -0.2, 0.3])]
-    viewmats = jnp.stack([camera.viewmat.at[:3, 3].add(jnp.asarray(shift, jnp.float32)) for shift in shifts])
-    cameras = [Camera(viewmat, camera.K, camera.width, camera.height) for viewmat in viewmats]
+    textures, layout = as_textures(scene, "float32")
+    offsets = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.2, 0.3]])
+    views = []
+    for offset in offsets:
+        viewmat = scene.viewmat.copy()
+        viewmat[:3, 3] += offset
+        views.append(scene._replace(viewmat=viewmat))
+    cameras = [as_camera(view, "float32") for view in views]
     settings = plan_render(gaussians, cameras, textures, layout)
+    background = jnp.asarray(scene.background, jnp.float32)
 
     def draw(viewmat):
         view = Camera(viewmat, camera.K, camera.width, camera.height)
-        return render_image(gaussians, view, textures, layout, settings=settings)
+        return render_image(gaussians, view, textures, layout, background=background, settings=settings)
 
-    batched = jax.vmap(draw)(viewmats)
-    for i, view in enumerate(cameras):
-        one = jax.tree.map(lambda x, i=i: x[i], batched)
-        assert_same(one, render_image(gaussians, view, textures, layout), 1e-5)
+    batched = jax.jit(jax.vmap(draw))(jnp.stack([view.viewmat for view in cameras]))
+    for i, view in enumerate(views):
+        assert_same(jax.tree.map(lambda x, i=i: x[i], batched), render_scene(view, "float32"), 2e-5)
 
 
 def test_quaternion_of_a_rotation():

@@ -64,11 +64,9 @@ def random_squeeze(tmp_path_factory):
 
     add("features.0", 64, 3, 3)
     inputs = 64
-    for index, squeezed, expanded in [(3, 16, 64), (4, 16, 64), (6, 32, 128), (7, 32, 128), (9, 48, 192)] + [
-        (10, 48, 192),
-        (11, 64, 256),
-        (12, 64, 256),
-    ]:
+    widths = {3: 16, 4: 16, 6: 32, 7: 32, 9: 48, 10: 48, 11: 64, 12: 64}
+    for index, squeezed in widths.items():
+        expanded = 4 * squeezed
         add(f"features.{index}.squeeze", squeezed, inputs, 1)
         add(f"features.{index}.expand1x1", expanded, squeezed, 1)
         add(f"features.{index}.expand3x3", expanded, squeezed, 3)
@@ -99,7 +97,7 @@ def test_wrong_weights_are_named(tmp_path, random_squeeze):
     with pytest.raises(ValueError, match=r"text\.npz is not an \.npz archive"):
         load_lpips(tmp_path / "text.npz")
     np.save(tmp_path / "one_array.npy", np.zeros(3))
-    with pytest.raises(ValueError, match="is not an .npz archive"):
+    with pytest.raises(ValueError, match=r"is not an \.npz archive"):
         load_lpips(tmp_path / "one_array.npy")
     np.savez(tmp_path / "other.npz", means=np.zeros(3))
     with pytest.raises(ValueError, match=r"other\.npz does not hold LPIPS weights"):

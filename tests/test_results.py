@@ -11,6 +11,7 @@ import pytest
 
 from a2tg_jax import cli
 from a2tg_jax.cameras import Camera
+from a2tg_jax.checkpoint import History
 from a2tg_jax.config import DensifyConfig, TextureConfig, TrainConfig
 from a2tg_jax.evaluation import Evaluation, ViewMetrics
 from a2tg_jax.paths import smooth_path
@@ -21,7 +22,6 @@ from a2tg_jax.results.pictures import error_picture, largest_gain, resolution_co
 from a2tg_jax.results.record import RunRecord, SceneSource, changed_fields, read_record, write_record
 from a2tg_jax.results.report import SECTIONS, Comparison, write_report
 from a2tg_jax.results.summary import PhaseResult, RunResult, metrics_json, minutes, per_view_json, summary_text
-from a2tg_jax.training import History
 
 RECORD = RunRecord(SceneSource("scenes/a b", downscale=2), TrainConfig.quick(), baseline=True)
 

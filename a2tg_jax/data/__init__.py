@@ -4,4 +4,7 @@ from a2tg_jax.data.load import load_scene as load_scene
 from a2tg_jax.data.scene import Scene as Scene
 from a2tg_jax.data.scene import View as View
 from a2tg_jax.data.scene import view_image as view_image
+from a2tg_jax.data.sfm import SfmSummary as SfmSummary
+from a2tg_jax.data.sfm import run_sfm as run_sfm
+from a2tg_jax.data.synthetic import synthetic_scene as synthetic_scene
 from a2tg_jax.data.world import Similarity as Similarity

@@ -32,8 +32,8 @@ def load_colmap(path: Path, *, downscale: int, test_every: int) -> Scene:
     """Reads a COLMAP scene: every registered image as a pinhole view, and the sparse points.
 
     Args:
-      path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) is looked for there,
-        beside the model, and up to two folders above it.
+      path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be there, beside
+        the model, or up to two folders above it.
       downscale, test_every: as in `load_scene`.
 
     Raises:

@@ -34,7 +34,7 @@ def mix(first: Color, second: Color, weight: np.ndarray) -> np.ndarray:
     return np.float32(first) + weight[..., None].astype(np.float32) * (np.float32(second) - np.float32(first))
 
 
-def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 4) -> np.ndarray:
+def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 2) -> np.ndarray:
     """Smooth noise [rows, columns] with mean 0 and values in about ±1; `cells` lattice cells along the rows at first."""
     noise = np.zeros((rows, columns), np.float32)
     for octave in range(octaves):
@@ -98,6 +98,12 @@ def globe(rows: int, columns: int) -> np.ndarray:
     return np.where(is_line[..., None], np.float32(INK), color)
 
 
+def checks(rows: int, columns: int, first: Color, second: Color, *, texels: int) -> np.ndarray:
+    """A checked band of rows × columns squares, each `texels` wide."""
+    row, column = np.indices((rows * texels, columns * texels)) // texels
+    return mix(first, second, (row + column) % 2)
+
+
 def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
     """A column: oblique stripes whose frequency doubles upwards, between bands of keys."""
     u, v = coordinates(rows, columns)
@@ -110,11 +116,19 @@ def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray
     return color * (1 + 0.05 * fractal_noise(rng, rows, columns, 8)[..., None])
 
 
-def wood(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
-    """Grain along the columns."""
-    u, v = coordinates(rows, columns)
-    rings = np.sin(2 * np.pi * (7 * v + 0.9 * fractal_noise(rng, rows, columns, 2, octaves=3) + 0.4 * u))
-    return mix((0.42, 0.25, 0.13), (0.74, 0.52, 0.30), 0.5 + 0.5 * rings)
+def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.ndarray:
+    """A square floor of boards along the columns, `width` × `length` texels each, in two kinds of wood."""
+    row, column = np.indices((side, side))
+    board = row // width
+    shifted = column + (board * 577) % length
+    shade = rng.uniform(0, 1, (board.max() + 1, shifted.max() // length + 1)).astype(np.float32)[
+        board, shifted // length
+    ]
+    u, v = coordinates(side, side)
+    grain = np.sin(2 * np.pi * (90 * v + 3 * shade + 1.2 * fractal_noise(rng, side, side, 6) + u))
+    color = mix((0.36, 0.22, 0.13), (0.80, 0.60, 0.38), np.clip(shade + 0.12 * grain, 0, 1))
+    is_gap = (row % width < max(2, width // 9)) | (shifted % length < max(2, width // 9))
+    return np.where(is_gap[..., None], np.float32((0.16, 0.10, 0.07)), color)
 
 
 def lettering(text: str, rows: int, columns: int, height: float, ink: Color, paper: Color) -> np.ndarray:

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from a2tg_jax.checkpoint import History
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.results.folder import Phase
 from a2tg_jax.results.pictures import resolution_colors
-from a2tg_jax.training import History
 
 COLORS: dict[Phase, str] = {"stage1": "#4477aa", "stage2": "#cc3311", "baseline": "#777777"}
 LABELS: dict[Phase, str] = {"stage1": "stage 1", "stage2": "stage 2", "baseline": "stage 2 without textures"}

@@ -1,11 +1,13 @@
 """Training in a run folder: phase after phase, with checkpoints, and from where an earlier attempt stopped."""
 
+from a2tg_jax.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from a2tg_jax.config import TrainConfig
 from a2tg_jax.data import Scene
 from a2tg_jax.io.model import Model, load_model, save_model
 from a2tg_jax.results.folder import Phase, RunFolder
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import read_record
-from a2tg_jax.training import Checkpoint, FitResult, fit_stage1, fit_stage2, load_checkpoint, save_checkpoint
+from a2tg_jax.training import FitResult, fit_stage1, fit_stage2
 
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Iterations."""
@@ -32,7 +34,7 @@ def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
             save_model(run.model(phase), Model(result.gaussians, result.textures, result.layout))
 
 
-def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config, progress: bool) -> FitResult:
+def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config: TrainConfig, progress: bool) -> FitResult:
     """One phase from its newest checkpoint, or from its beginning."""
     newest = run.checkpoints(phase)[-1:]
     num_iterations = config.stage1_iterations if phase == "stage1" else config.stage2_iterations

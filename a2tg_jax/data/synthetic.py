@@ -1,0 +1,156 @@
+"""The built-in scene: a still life in a round brick room, ray-traced by numpy at exact cameras.
+
+Its patterns carry details of some 4 to 10 pixels: finer than a thousand or two Gaussians can show without textures.
+"""
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from a2tg_jax.data import patterns
+from a2tg_jax.data.lighting import light
+from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth
+from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
+
+TARGET = np.float64([0.0, 0.1, 0.45])
+"""The point all cameras look at."""
+DISTANCE = 2.4
+"""Of the cameras from the target."""
+FIELD_OF_VIEW = np.deg2rad(58.0)
+"""Across the longer side of the image."""
+SAMPLE_OFFSETS = np.float64([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
+"""Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
+
+
+def synthetic_scene(
+    seed: int = 0,
+    *,
+    num_views: int = 28,
+    width: int = 320,
+    height: int = 240,
+    num_points: int = 2500,
+    downscale: int = 1,
+    test_every: int = 8,
+) -> Scene:
+    """Makes the built-in scene: pinhole views on a closed curve over an arc, and points on the surfaces they see.
+
+    Args:
+      seed: of patterns, light and points; the arrangement is always the same.
+      num_views: at least 2.
+      width, height: size of the images in pixels, before `downscale`.
+      num_points: points sampled evenly over the images, in place of a sparse reconstruction; at least 2.
+      downscale: k >= 1: images of 1/k of the size, as if made from the full ones.
+      test_every: every k-th view is a test view; 0 keeps none.
+
+    Returns:
+      The scene in its normalised world. The default takes a few seconds on one core.
+
+    Raises:
+      ValueError: if an argument is out of its range.
+    """
+    if num_views < 2 or num_points < 2 or downscale < 1 or min(width, height) < downscale:
+        raise ValueError(
+            f"the synthetic scene needs at least 2 views, 2 points and images of a pixel; "
+            f"got num_views={num_views}, num_points={num_points}, {width}x{height}, downscale={downscale}"
+        )
+    rng = np.random.default_rng(seed)
+    surfaces = light(still_life(rng), rng)
+    size = round(width / downscale), round(height / downscale)
+    K = intrinsics(*size)
+    viewmats = [look_at(center) for center in camera_path(num_views)]
+    shots = [
+        Shot(f"view_{index:03d}.png", viewmat, K, render(surfaces, viewmat, K, *size))
+        for index, viewmat in enumerate(viewmats)
+    ]
+    cloud = sample_points(surfaces, shots, num_points, rng)
+    return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
+
+
+def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
+    """Shapes and their colours (`patterns`): a room, a round podium, and what stands on it. Lengths are about metres."""
+    wall = patterns.bricks(rng, 320, 2560, (14, 33))
+    motto = "A2TG - ADAPTIVE ANISOTROPIC TEXTURED GAUSSIANS -"
+    wall[152:200] = patterns.lettering(motto, 48, 2560, 34, patterns.CREAM, patterns.INK)
+    rim = patterns.checks(2, 120, patterns.INK, patterns.GOLD, texels=16)
+    letters, colors = "A2TGA", (patterns.CORAL, patterns.TEAL, patterns.LEAF, patterns.SKY, patterns.GOLD)
+    return [
+        (Tube((0, 0, 0), 3.0, 2.4, is_inward=True), wall),
+        (Disc((0, 0, 0), 3.0), patterns.planks(rng, 896, 26, 190)),
+        (Tube((0, 0.1, 0), 1.15, 0.12), rim),
+        (Disc((0, 0.1, 0.12), 1.15), patterns.mosaic(rng, 768, 25)),
+        (Block((-0.50, -0.25, 0.38), 0.26, 0.45), patterns.letter_block(letters, 160, colors)),
+        (Block((-0.47, -0.22, 0.82), 0.18, 0.05), patterns.letter_block(letters[::-1], 128, colors[::-1])),
+        (Ball((0.55, 0.05, 0.50), 0.38), patterns.globe(256, 512)),
+        (Ball((0.05, -0.60, 0.30), 0.18), patterns.marble(rng, 128, 256)),
+        (Tube((0.0, 0.70, 0.12), 0.20, 0.80), patterns.barber_pole(rng, 384, 384)),
+        (Ball((0.0, 0.70, 1.07), 0.24), patterns.globe(160, 320)),
+    ]
+
+
+def camera_path(num_views: int) -> np.ndarray:
+    """Camera centres [V, 3] evenly along a closed figure of eight in front of the target, above its height."""
+    phase = 2 * np.pi * np.arange(num_views) / num_views
+    azimuth = -0.5 * np.pi + np.deg2rad(55.0) * np.sin(phase)
+    elevation = np.deg2rad(26.0) + np.deg2rad(13.0) * np.sin(2 * phase + 0.6)
+    outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return TARGET + DISTANCE * np.stack(outward, axis=-1)
+
+
+def look_at(center: np.ndarray) -> np.ndarray:
+    """World-to-camera matrix [4, 4] of a camera at `center` that looks at the target, +z being up."""
+    forward = (TARGET - center) / np.linalg.norm(TARGET - center)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    return viewmat
+
+
+def intrinsics(width: int, height: int) -> np.ndarray:
+    """K [3, 3] of square pixels with the principal point in the middle."""
+    focal = max(width, height) / (2 * np.tan(FIELD_OF_VIEW / 2))
+    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+
+
+def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The image [height, width, 3] uint8 that a camera sees, the mean of a few rays a pixel (SAMPLE_OFFSETS)."""
+    center = _center(viewmat)
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
+    seen = nearest_hits([surface.shape for surface in surfaces], center, _directions(viewmat, K, x, y))[1]
+    seen_grid = seen.reshape(height, width)
+    is_inside = (maximum_filter(seen_grid, 3) == minimum_filter(seen_grid, 3)).ravel()
+    # Most pixels and their neighbours see one surface, the only one that their rays then need to be tested against.
+    groups = [(surfaces, ~is_inside)]
+    groups += [([surface], is_inside & (seen == number)) for number, surface in enumerate(surfaces)]
+    image = np.empty((width * height, 3), np.uint8)
+    for candidates, is_member in groups:
+        directions = _directions(viewmat, K, x[is_member], y[is_member])
+        shifts = _directions(viewmat, K, *(K[:2, 2:] + SAMPLE_OFFSETS)) - _directions(viewmat, K, *K[:2, 2:])
+        samples = [trace(candidates, center, directions + shift[:, None])[0] for shift in shifts.T]
+        image[is_member] = np.rint(np.sum(samples, axis=0, dtype=np.uint16) / len(samples))
+    return image.reshape(height, width, 3)
+
+
+def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: np.random.Generator) -> PointCloud:
+    """Surface points under `count` random pixels of the shots, with the colours of those pixels."""
+    shares = np.bincount(rng.integers(len(shots), size=count), minlength=len(shots))
+    points, colors = [], []
+    for shot, share in zip(shots, shares, strict=True):
+        height, width = shot.pixels.shape[:2]
+        column, row = rng.integers(width, size=share), rng.integers(height, size=share)
+        directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
+        points.append(trace(surfaces, _center(shot.viewmat), directions)[1].T)
+        colors.append(shot.pixels[row, column])
+    is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
+    return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
+
+
+def _center(viewmat: np.ndarray) -> np.ndarray:
+    """[3, 1] float32 position of a camera."""
+    return (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
+
+
+def _directions(viewmat: np.ndarray, K: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """World directions [3, P] float32 of the rays through image points (x, y), any shape with P entries."""
+    points = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float32)
+    return (viewmat[:3, :3].T @ np.linalg.inv(K)).astype(np.float32) @ points
