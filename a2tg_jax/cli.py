@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -199,7 +199,8 @@ class Sfm:
     """Scene folder to make: images and sparse model, ready for a2tg train."""
 
     def run(self) -> None:
-        run_sfm(self.photos, self.out)
+        found = run_sfm(self.photos, self.out)
+        print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
         print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
 
 
@@ -246,11 +247,12 @@ def _fail(message: str) -> int:
 
 def _parse(name: str, arguments: list[str]) -> Command:
     """The command that the arguments ask for. A preset is looked at first: it decides the numbers' defaults."""
-    kind, default = COMMANDS[name], {}
+    kind = COMMANDS[name]
+    options: dict[str, Any] = {"prog": f"a2tg {name}", "description": inspect.getdoc(kind), "args": arguments}
     if kind is Train:
         config = PRESETS.get(_value_of("--preset", arguments), TrainConfig.paper)()
-        default = {"default": Train(scene=tyro.MISSING, out=tyro.MISSING, config=config)}
-    return tyro.cli(kind, prog=f"a2tg {name}", description=inspect.getdoc(kind), args=arguments, **default)
+        options["default"] = Train(scene=tyro.MISSING, out=tyro.MISSING, config=config)
+    return tyro.cli(kind, **options)
 
 
 def _value_of(flag: str, arguments: list[str]) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, add_at
+from a2tg_jax.numerics import pixel_sum, spread
 from a2tg_jax.tiles import TileGrid, TileLists
 
 BLOCK = 8
@@ -110,7 +111,9 @@ def _composite_tiles_bwd(how, residuals, cotangents):
     splats, params, rule, lists, jacobian, tap, channels, transmittance = residuals
     g_channels, g_transmittance = cotangents
     behind = jnp.sum(g_channels * channels, axis=2) + g_transmittance * transmittance
-    totals = jax.tree.map(jnp.zeros_like, (splats, params, tap))
+    widths = [leaf.size // leaf.shape[0] for leaf in splats]
+    packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
+    totals = packed, *jax.tree.map(jnp.zeros_like, (params, tap))
     ids = _padded_ids(lists)
 
     def group(index, totals):
@@ -128,7 +131,9 @@ def _composite_tiles_bwd(how, residuals, cotangents):
         carry = (start, *_initial_light(how, splats.M.dtype), behind[index], totals)
         return jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)[-1]
 
-    d_splats, d_params, d_tap = jax.lax.fori_loop(0, how.num_groups, group, totals)
+    packed, d_params, d_tap = jax.lax.fori_loop(0, how.num_groups, group, totals)
+    pieces = jnp.split(packed, np.cumsum(widths)[:-1], axis=1)
+    d_splats = Splats(*(piece.reshape(leaf.shape) for piece, leaf in zip(pieces, splats, strict=True)))
     return d_splats, d_params, None, None, None, d_tap
 
 
@@ -206,11 +211,12 @@ def _gather(splats: Splats, params, rule, ids: Array):
 
 
 def _accumulate(rule, totals, ids: Array, d_rows):
-    """Adds the cotangents of one block a tile to the totals of all splats."""
+    """Adds the cotangents of one block a tile to the totals; those of the splats are packed in one row each."""
     flat = ids.reshape(-1)
     d_splats, d_appearance, d_tap = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), d_rows)
     splats, params, tap = totals
-    splats = jax.tree.map(lambda total, rows: add_at(total, flat, rows), splats, d_splats)
+    packed = jnp.concatenate([leaf.reshape(leaf.shape[0], -1) for leaf in d_splats], axis=1)
+    splats = add_at(splats, flat, packed)
     return splats, rule.add_rows(params, flat, d_appearance), tap if d_tap is None else add_at(tap, flat, d_tap)
 
 
@@ -233,16 +239,19 @@ def _intersect(axes, mean, pixels, near_plane: float) -> _Hit:
     With rows M₀, M₁, M₂ the point is (p₀, p₁)/p₂, p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1), and its depth det(M)/p₂.
 
     Args:
-      axes: three pairs, the first two columns of M's rows, each [B, 1], relative to the tile's centre.
-      mean: M's last column, three arrays [B, 1] or [B, P].
+      axes: three pairs, the first two columns of M's rows, each [B], relative to the tile's centre.
+      mean: M's last column, three arrays [B]; or [B, P], as if each pixel had a splat of its own.
       pixels: (x, y), each [1, P], relative to the tile's centre.
       near_plane: smaller depths are no hit.
     """
     x, y = pixels
+    per_pixel = functools.partial(_per_pixel, num=x.shape[1])
+    if mean[0].ndim == 2:
+        axes = tuple((row[0][:, None], row[1][:, None]) for row in axes)
     rows = [(*axes[i], mean[i]) for i in range(3)]
     planes = _cross(rows[1], rows[2]), _cross(rows[2], rows[0]), _cross(rows[0], rows[1])
-    p0, p1, p2 = (planes[0][i] * x + planes[1][i] * y + planes[2][i] for i in range(3))
-    determinant = rows[2][0] * planes[2][0] + rows[2][1] * planes[2][1] + rows[2][2] * planes[2][2]
+    p0, p1, p2 = (per_pixel(planes[0][i]) * x + per_pixel(planes[1][i]) * y + per_pixel(planes[2][i]) for i in range(3))
+    determinant = per_pixel(rows[2][0] * planes[2][0] + rows[2][1] * planes[2][1] + rows[2][2] * planes[2][2])
 
     # Far out on a nearly parallel plane u² would overflow: there the divisor is held, with a finite gradient.
     far = float(np.cbrt(np.finfo(p2.dtype).max))
@@ -255,18 +264,24 @@ def _intersect(axes, mean, pixels, near_plane: float) -> _Hit:
     is_hit = ~is_parallel & (depth >= near_plane)
     u, v = jnp.where(is_hit, p0 * inverse, 0.0), jnp.where(is_hit, p1 * inverse, 0.0)
 
-    dx, dy = x - mean[0] / mean[2], y - mean[1] / mean[2]
+    dx, dy = x - per_pixel(mean[0] / mean[2]), y - per_pixel(mean[1] / mean[2])
     rho_ray, rho_screen = u * u + v * v, 2 * (dx * dx + dy * dy)
     is_ray = is_hit & (rho_ray <= rho_screen)
-    return _Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, mean[2]))
+    return _Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, per_pixel(mean[2])))
+
+
+def _per_pixel(x: Array, num: int) -> Array:
+    """x [B] spread over the pixels; [B, P] as it is, and [B, 1] of what has no pixel's own value."""
+    if x.ndim == 1:
+        return spread(x, num)
+    return jnp.broadcast_to(x, (x.shape[0], num))
 
 
 def _relative_to_tile(M: Array, tile: _Tile):
-    """The entries of M [B, 3, 3] with pixels counted from the tile's centre: axes and mean, each entry [B, 1]."""
+    """The entries of M [B, 3, 3] with pixels counted from the tile's centre: axes and mean, each entry [B]."""
     last = M[:, 2]
     shifted = (M[:, 0] - tile.x * last, M[:, 1] - tile.y * last, last)
-    axes = tuple((row[:, 0:1], row[:, 1:2]) for row in shifted)
-    return axes, tuple(row[:, 2:3] for row in shifted)
+    return tuple((row[:, 0], row[:, 1]) for row in shifted), tuple(row[:, 2] for row in shifted)
 
 
 def _pixels_of_tile(size: int, dtype) -> tuple[Array, Array]:
@@ -291,15 +306,18 @@ def _block(how: Compositing, rule, rows, at, tile: _Tile, light, is_live, log_ta
     pixels = _pixels_of_tile(how.grid.tile_size, splats.M.dtype)
     hit = _intersect(*_relative_to_tile(splats.M, tile), pixels, how.near_plane)
     residual, factor = rule.sample(appearance, hit.u, hit.v)
-    a = splats.opacities[:, None] * rule.falloff(hit.rho)
+    per_pixel = functools.partial(spread, num=light.shape[0])
+    a = per_pixel(splats.opacities) * rule.falloff(hit.rho)
     a = a if factor is None else a * factor
     a = a if log_tap is None else a * jnp.exp(log_tap)
     in_list = (at + jnp.arange(BLOCK) < tile.end)[:, None]
     alpha = jnp.where((a >= MIN_ALPHA) & in_list, jnp.where(a < MAX_ALPHA, a, MAX_ALPHA), 0.0)
     weights, light, is_live = _weights(alpha, light, is_live)
-    channels = [splats.colors[:, k : k + 1] + (0.0 if residual is None else residual[k]) for k in range(3)]
+    channels = [per_pixel(splats.colors[:, k]) for k in range(3)]
+    if residual is not None:
+        channels = [base + extra for base, extra in zip(channels, residual, strict=True)]
     if how.has_geometry:
-        channels += [hit.depth, hit.depth * hit.depth, *(splats.normals[:, k : k + 1] for k in range(3))]
+        channels += [hit.depth, hit.depth * hit.depth, *(per_pixel(splats.normals[:, k]) for k in range(3))]
     added = jnp.stack([_sum_rows(channel * weights) for channel in channels])
     return added, light, is_live, weights
 
@@ -366,11 +384,11 @@ def _statistic(how: Compositing, jacobian, M, tile: _Tile, d_log: Array, weights
     d_log [B, P] is ∂L/∂(log of the Gaussian factor) = ∂L/∂(−ρ/2).
     """
     axes, mean = _relative_to_tile(M, tile)
-    mean = tuple(jnp.broadcast_to(entry, d_log.shape) for entry in mean)
+    mean = tuple(jnp.broadcast_to(entry[:, None], d_log.shape) for entry in mean)
     pixels = _pixels_of_tile(how.grid.tile_size, M.dtype)
     _, pull_back = jax.vjp(lambda mean: _intersect(axes, mean, pixels, how.near_plane).rho, mean)
     (d_mean,) = pull_back(-0.5 * d_log)
     shifted = (jacobian[0] - tile.x * jacobian[2], jacobian[1] - tile.y * jacobian[2], jacobian[2])
     per_pixel = [sum(d_mean[i] * shifted[i][axis] for i in range(3)) for axis in range(3)]
-    sums = [jnp.sum(jnp.abs(component), axis=1) for component in per_pixel]
-    return jnp.stack([*sums, jnp.sum((weights > 0).astype(M.dtype), axis=1)], axis=1)
+    sums = [pixel_sum(jnp.abs(component)) for component in per_pixel]
+    return jnp.stack([*sums, pixel_sum((weights > 0).astype(M.dtype))], axis=1)

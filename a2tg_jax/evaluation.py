@@ -97,7 +97,9 @@ def evaluate(
     cameras = [view.camera for view in views]
     draw = compiled_renderer(cameras, gaussians, textures, layout, settings=settings, background=background)
     psnr_and_ssim = jax.jit(lambda image, target: (psnr(image, target), ssim(image, target)))
-    per_view, seconds, renders = [], [], []
+    per_view: list[ViewMetrics] = []
+    seconds: list[float] = []
+    renders: list[np.ndarray] = []
     for view in views:
         image, target = draw(view.camera), jnp.asarray(view_image(view, background))
         seconds.append(_seconds_to_draw(draw, view.camera))

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import add_at, gaussian_cutoff
+from a2tg_jax.numerics import spread
 from a2tg_jax.texture import AtlasLayout, Textures
 
 EXTENT = 3.0
@@ -214,7 +215,7 @@ def _branches(texels: Array):
 
 def _single(_, texels: Array, size: Array, x: Array, y: Array) -> Array:
     """A 1×1 texture: one texel everywhere."""
-    return jnp.broadcast_to(texels[0, :, None], (4, x.shape[0]))
+    return spread(texels[0], x.shape[0])
 
 
 def _hats(area: int, texels: Array, size: Array, x: Array, y: Array) -> Array:
@@ -224,7 +225,23 @@ def _hats(area: int, texels: Array, size: Array, x: Array, y: Array) -> Array:
     column, row = (index % size[1]).astype(x.dtype), (index // size[1]).astype(x.dtype)
     row = jnp.where(is_own, row, -2.0)
     weights = _hat(x[None, :] - column[:, None]) * _hat(y[None, :] - row[:, None])
-    return jnp.stack([jnp.sum(texels[:area, channel, None] * weights, axis=0) for channel in range(4)])
+    return _weigh(texels[:area], weights)
+
+
+@jax.custom_vjp
+def _weigh(texels: Array, weights: Array) -> Array:
+    """Channels [4, P] = texelsᵀ [4, K]·weights [K, P], written as products with vectors, which CPUs vectorise."""
+    return jnp.stack([jnp.dot(texels[:, channel], weights) for channel in range(4)])
+
+
+def _weigh_bwd(residuals, cotangent):
+    texels, weights = residuals
+    d_texels = jnp.stack([jnp.dot(weights, cotangent[channel]) for channel in range(4)], axis=1)
+    d_weights = sum(texels[:, channel, None] * cotangent[channel][None, :] for channel in range(4))
+    return d_texels, d_weights
+
+
+_weigh.defvjp(lambda texels, weights: (_weigh(texels, weights), (texels, weights)), _weigh_bwd)
 
 
 def _hat(distance: Array) -> Array:

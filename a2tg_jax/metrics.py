@@ -128,7 +128,7 @@ def _load_lpips(path: pathlib.Path) -> LpipsWeights:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, AttributeError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not an .npz archive of LPIPS weights") from error
     network = "squeeze" if "features.3.squeeze.weight" in arrays else "alex"
     weights = LpipsWeights(network, arrays)

@@ -1,4 +1,9 @@
-"""Safe division, roots and norms: each with the value and the gradient it has where the plain formula has none."""
+"""Safe division, roots and norms: each with the value and the gradient it has where the plain formula has none.
+
+And the broadcast from splats to pixels, with a gradient that CPUs compute fast.
+"""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +33,16 @@ def normalize(x: Array, axis: int = -1) -> Array:
     return safe_divide(x, jnp.broadcast_to(safe_norm(x, axis, keepdims=True), x.shape))
 
 
-def stop_gradient_tree(tree):
-    """The same pytree, cut from differentiation."""
-    return jax.tree.map(jax.lax.stop_gradient, tree)
+def pixel_sum(x: Array) -> Array:
+    """[..., P] summed over the last axis. A product with ones is vectorised everywhere; a reduction on CPUs is not,
+    and would be fused with what it sums, which is then computed one pixel at a time."""
+    return jnp.dot(x, jnp.ones(x.shape[-1], x.dtype), precision=jax.lax.Precision.HIGHEST)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def spread(x: Array, num: int) -> Array:
+    """x [...] broadcast over a new last axis of `num` pixels; its gradient is a `pixel_sum`."""
+    return jnp.broadcast_to(x[..., None], (*x.shape, num))
+
+
+spread.defvjp(lambda x, num: (spread(x, num), None), lambda num, _, cotangent: (pixel_sum(cotangent),))

@@ -1,6 +1,7 @@
 """Gradients of the renderer against central differences of the oracle, and finite gradients on degenerate scenes."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,13 +11,20 @@ import numpy as np
 import oracle
 import pytest
 from oracle import DEFAULT_RULES, Float, Rules, Scene
-from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, draw_smooth_scene
+from scenes_random import (
+    CAPACITY,
+    as_camera,
+    as_gaussians,
+    as_settings,
+    as_textures,
+    draw_scene,
+    draw_smooth_scene,
+)
 
 from a2tg_jax import (
     AtlasLayout,
     Camera,
     Gaussians,
-    RenderOutput,
     RenderSettings,
     Textures,
     plan_render,
@@ -63,25 +71,52 @@ def draw_weights(scene: Scene) -> dict[str, Float]:
     return {name: rng.normal(size=(*shape, *channels[name])) for name in FIELDS}
 
 
-def package_loss(scene: Scene, layout: AtlasLayout | None, settings: RenderSettings) -> Callable[[Inputs], jax.Array]:
-    """The weighted sum of all outputs, as a function of the inputs."""
-    weights = draw_weights(scene)
+@functools.cache
+def jitted_gradient(settings: RenderSettings) -> Callable[..., Any]:
+    """The loss and its gradient as a function of (inputs, layout, weights) and the static image size."""
 
-    def loss(inputs: Inputs) -> jax.Array:
-        camera = Camera(inputs.viewmat, inputs.K, scene.width, scene.height)
-        output: RenderOutput = render_image(
-            inputs.gaussians, camera, inputs.textures, layout, background=inputs.background, settings=settings
-        )
-        images = {name: getattr(output, name) for name in FIELDS}
-        return sum(jnp.sum(image * jnp.asarray(weights[name], image.dtype)) for name, image in images.items())
+    def loss(inputs: Inputs, layout: AtlasLayout | None, weights: dict[str, jax.Array], size: tuple[int, int]):
+        camera = Camera(inputs.viewmat, inputs.K, *size)
+        return weighted_sum(inputs, camera, layout, weights, settings)
+
+    return jax.jit(jax.value_and_grad(loss), static_argnums=3)
+
+
+def weighted_sum(inputs: Inputs, camera: Camera, layout: AtlasLayout | None, weights, settings) -> jax.Array:
+    """The weighted sum of all outputs."""
+    output = render_image(
+        inputs.gaussians, camera, inputs.textures, layout, background=inputs.background, settings=settings
+    )
+    return sum(jnp.sum(getattr(output, name) * weight) for name, weight in weights.items())
+
+
+def package_gradient(scene: Scene, dtype: str, settings: RenderSettings) -> tuple[jax.Array, Inputs]:
+    """The loss and its gradient, under jit."""
+    inputs, layout = as_inputs(scene, dtype)
+    weights = {name: jnp.asarray(weight, dtype) for name, weight in draw_weights(scene).items()}
+    settings = dataclasses.replace(settings, capacity=CAPACITY)
+    return jitted_gradient(settings)(inputs, layout, weights, (scene.width, scene.height))
+
+
+def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | None = None) -> Callable[[Float], float]:
+    """The same weighted sum of the oracle's outputs, as a function of one field of the scene.
+
+    `texels` replace the lookups where given. Only the layers of splats whose own values changed are made anew.
+    """
+    weights, base = draw_weights(scene), getattr(scene, name)
+    layers = oracle.splat_layers(scene, rules, texels)
+
+    def loss(value: Float | list[Float]) -> float:
+        moved = scene._replace(**{name: value})
+        is_splatwise = name not in ("viewmat", "K", "background")
+        changed = [i for i in range(len(layers)) if not is_splatwise or np.any(value[i] != base[i])]
+        fresh = list(layers)
+        for i in changed:
+            fresh[i] = oracle.splat_layer(moved, i, rules, None if texels is None else texels[i])
+        image = oracle.composite(fresh, moved.background)
+        return sum(np.sum(getattr(image, field) * weight) for field, weight in weights.items())
 
     return loss
-
-
-def oracle_loss(scene: Scene, rules: Rules, texels: list[Float] | None = None) -> float:
-    """The same weighted sum of the oracle's outputs; `texels` replace the lookups where given."""
-    image = oracle.render(scene, rules, texels)
-    return sum(np.sum(getattr(image, name) * weight) for name, weight in draw_weights(scene).items())
 
 
 def differences(value: Float, loss: Callable[[Float], float]) -> Float:
@@ -120,84 +155,94 @@ def leaf_of(gradient: Inputs, name: str) -> jax.Array:
     return getattr(gradient, name) if hasattr(gradient, name) else getattr(gradient.gaussians, name)
 
 
-def assert_matches_oracle(scene: Scene, rules: Rules, settings: RenderSettings, texels: list[Float] | None = None):
-    """Every leaf but the textures by differences with the given lookups, the textures by differences with their own."""
-    inputs, layout = as_inputs(scene, "float64")
-    gradient = jax.grad(package_loss(scene, layout, settings))(inputs)
+def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: list[Float] | None = None):
+    """Every leaf but the textures, by differences with the given lookups or, without them, with lookups that move."""
     for name in LEAVES:
-        expected = differences(
-            getattr(scene, name), lambda x, name=name: oracle_loss(scene._replace(**{name: x}), rules, texels)
-        )
+        expected = differences(getattr(scene, name), oracle_loss(scene, rules, name, texels))
         assert_gradients_close(leaf_of(gradient, name), expected, name)
+
+
+def assert_textures_match(gradient: Inputs, scene: Scene, rules: Rules):
+    """Every texel of every texture, by differences."""
+    _, layout = as_textures(scene, "float64")
+    loss = oracle_loss(scene, rules, "textures")
     for i, found in enumerate(texture_arrays(gradient.textures, layout)):
 
-        def loss(texture: Float, i: int = i) -> float:
-            return oracle_loss(scene._replace(textures=[*scene.textures[:i], texture, *scene.textures[i + 1 :]]), rules)
+        def loss_of_one(texture: Float, i: int = i) -> float:
+            return loss([*scene.textures[:i], texture, *scene.textures[i + 1 :]])
 
-        assert_gradients_close(found, differences(scene.textures[i], loss), f"texture {i}")
+        assert_gradients_close(found, differences(scene.textures[i], loss_of_one), f"texture {i}")
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("seed", SMOOTH_SEEDS)
 def test_every_leaf_against_differences(seed):
-    assert_matches_oracle(smooth_scene(seed, DEFAULT_RULES), DEFAULT_RULES, as_settings(tile_size=8))
+    scene = smooth_scene(seed, DEFAULT_RULES)
+    _, gradient = package_gradient(scene, "float64", RenderSettings())
+    assert_leaves_match(gradient, scene, DEFAULT_RULES)
+    assert_textures_match(gradient, scene, DEFAULT_RULES)
 
 
 @pytest.mark.usefixtures("x64")
 def test_official_gradients_stop_at_the_lookup():
-    """The official preset is the gradient with what the lookups gave held fixed."""
+    """The official preset has the gradient with what the lookups gave held fixed."""
     scene = smooth_scene(SMOOTH_SEEDS[0], OFFICIAL)
     texels = [layer.texel for layer in oracle.splat_layers(scene, OFFICIAL)]
-    assert_matches_oracle(scene, OFFICIAL, dataclasses.replace(RenderSettings.official(), tile_size=8), texels)
+    _, gradient = package_gradient(scene, "float64", RenderSettings.official())
+    assert_leaves_match(gradient, scene, OFFICIAL, texels)
+    assert_textures_match(gradient, scene, OFFICIAL)
 
 
 @pytest.mark.usefixtures("x64")
-def test_textures_off_against_differences():
+def test_gradients_without_textures_against_differences():
     scene = smooth_scene(SMOOTH_SEEDS[0], DEFAULT_RULES)._replace(textures=None)
-    gradient = jax.grad(package_loss(scene, None, as_settings(tile_size=8)))(as_inputs(scene, "float64")[0])
-    for name in LEAVES:
-        expected = differences(
-            getattr(scene, name), lambda x, name=name: oracle_loss(scene._replace(**{name: x}), DEFAULT_RULES)
-        )
-        assert_gradients_close(leaf_of(gradient, name), expected, name)
+    _, gradient = package_gradient(scene, "float64", RenderSettings())
+    assert_leaves_match(gradient, scene, DEFAULT_RULES)
 
 
 @pytest.mark.usefixtures("x64")
-def test_last_row_of_the_viewmat_and_padding_have_no_gradient():
-    scene = draw_scene(0, num=20)
-    inputs, layout = as_inputs(scene, "float64")
-    gradient = jax.grad(package_loss(scene, layout, RenderSettings()))(inputs)
-    np.testing.assert_array_equal(gradient.viewmat[3], 0)
-    repacked, _ = textures_from_arrays(texture_arrays(gradient.textures, layout))
-    for bucket, without_padding in zip(gradient.textures.buckets, repacked.buckets, strict=True):
-        np.testing.assert_array_equal(np.sum(abs(bucket)), np.sum(abs(without_padding)))
-
-
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("tile_batch", [0, 1])
-def test_gradients_do_not_depend_on_tiles_or_jit(tile_batch):
+def test_gradients_do_not_depend_on_tiles():
+    """Nor on how many are composited at once; the last row of the viewmat and the buckets' padding have none."""
     scene = draw_scene(3)
+    _, expected = package_gradient(scene, "float64", as_settings(tile_size=32))
+    np.testing.assert_array_equal(expected.viewmat[3], 0)
+    for settings in (as_settings(), as_settings(tile_batch=0)):
+        _, gradient = package_gradient(scene, "float64", settings)
+        for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(gradient), strict=True):
+            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
+
+    _, layout = as_textures(scene, "float64")
+    repacked, _ = textures_from_arrays(texture_arrays(expected.textures, layout))
+    for bucket, without_padding in zip(expected.textures.buckets, repacked.buckets, strict=True):
+        np.testing.assert_allclose(np.sum(abs(bucket[..., :3])), np.sum(abs(without_padding[..., :3])))
+
+
+@pytest.mark.usefixtures("x64")
+def test_an_eager_gradient_is_the_planned_one():
+    scene = draw_smooth_scene(SMOOTH_SEEDS[0])
     inputs, layout = as_inputs(scene, "float64")
-    expected = jax.grad(package_loss(scene, layout, as_settings(tile_size=32)))(inputs)
+    weights = {name: jnp.asarray(weight) for name, weight in draw_weights(scene).items()}
+
+    def loss(inputs: Inputs) -> jax.Array:
+        camera = Camera(inputs.viewmat, inputs.K, scene.width, scene.height)
+        return weighted_sum(inputs, camera, layout, weights, RenderSettings())
+
+    eager = jax.grad(loss)(inputs)
     camera = as_camera(scene, "float64")
-    settings = as_settings(tile_size=8, tile_batch=tile_batch)
-    planned = plan_render(inputs.gaussians, [camera], inputs.textures, layout, settings=settings)
-    jitted = jax.jit(jax.grad(package_loss(scene, layout, planned)))(inputs)
-    for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(jitted), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
+    planned = plan_render(inputs.gaussians, [camera], inputs.textures, layout)
+    _, jitted = jitted_gradient(planned)(inputs, layout, weights, (scene.width, scene.height))
+    for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(jitted), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
 
 
 @pytest.mark.usefixtures("x64")
 def test_float32_gradients_are_those_of_float64():
-    """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and an edge-on division."""
-    scene = draw_smooth_scene(SMOOTH_SEEDS[1])
-    gradients = []
-    for dtype in ("float64", "float32"):
-        inputs, layout = as_inputs(scene, dtype)
-        gradients.append(jax.grad(package_loss(scene, layout, RenderSettings()))(inputs))
-    for exact, rounded in zip(*map(jax.tree.leaves, gradients), strict=True):
-        assert rounded.dtype == jnp.float32
-        np.testing.assert_allclose(rounded, exact, rtol=0, atol=1e-3 * abs(np.asarray(exact)).max())
+    """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and divisions."""
+    scene = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES)
+    (_, exact), (_, rounded) = (package_gradient(scene, dtype, RenderSettings()) for dtype in ("float64", "float32"))
+    for one, other in zip(jax.tree.leaves(exact), jax.tree.leaves(rounded), strict=True):
+        assert other.dtype == jnp.float32
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-3 * abs(np.asarray(one)).max())
 
 
 def degenerate_scene() -> Scene:
@@ -220,9 +265,7 @@ def degenerate_scene() -> Scene:
 @pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings.official()], ids=["default", "official"])
 @pytest.mark.parametrize("draw", [lambda: draw_scene(8), degenerate_scene], ids=["random", "degenerate"])
 def test_values_and_gradients_are_finite(draw, settings):
-    scene = draw()
-    inputs, layout = as_inputs(scene, "float32")
-    value, gradient = jax.value_and_grad(package_loss(scene, layout, settings))(inputs)
+    value, gradient = package_gradient(draw(), "float32", settings)
     assert np.isfinite(value)
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
         assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)

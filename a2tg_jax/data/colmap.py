@@ -14,8 +14,8 @@ from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, rea
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
 
-MODEL_FOLDERS = ("sparse/0", "sparse", ".")
-"""Where a scene folder keeps its model, in order of preference."""
+MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
+"""Where a scene folder, or the given part of one, keeps its model, in order of preference."""
 EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
 """A points3D file with no points in it."""
 
@@ -32,8 +32,8 @@ def load_colmap(path: Path, *, downscale: int, test_every: int) -> Scene:
     """Reads a COLMAP scene: every registered image as a pinhole view, and the sparse points.
 
     Args:
-      path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be there, beside
-        the model, or up to two folders above it.
+      path: the scene folder, or the folder of the model itself. Its folder `images` (or `images_k`) may be
+        there, beside the model, or up to two folders above that.
       downscale, test_every: as in `load_scene`.
 
     Raises:
@@ -54,7 +54,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int) -> Scene:
         return _shot(image, lenses[image.camera_id], images_folder, downscale)
 
     train, test = every_kth(map_in_threads(shoot, registered), test_every)
-    return assemble_scene(path.resolve().name, train, test, read_points(reconstruction), source=str(path))
+    return assemble_scene(images_folder.parent.name, train, test, read_points(reconstruction), source=str(path))
 
 
 def read_points(reconstruction: Any) -> PointCloud:

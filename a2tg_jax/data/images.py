@@ -61,10 +61,13 @@ def read_pixels(path: Path) -> np.ndarray:
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The image at another size, each new pixel the average over its area (weighted with alpha where there is one)."""
+    """The image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too).
+
+    Pillow's box filter would take whole pixels only and so shift details where the ratio is no whole number.
+    """
     if pixels.shape[:2] == (height, width):
         return pixels
-    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.HAMMING))
 
 
 def downscaled_size(width: int, height: int, downscale: int) -> tuple[int, int]:

@@ -44,12 +44,12 @@ class Lens:
         Raises:
           ValueError: if the model has no pinhole equivalent (panoramas).
         """
-        if self.is_pinhole:
-            return self.camera.calibration_matrix(), self.size
         try:
+            if self.is_pinhole:
+                return self.camera.calibration_matrix(), self.size
             pinhole = pycolmap().undistort_camera(pycolmap().UndistortCameraOptions(), self.camera)
-        except (ValueError, RuntimeError):
-            raise ValueError(f"{self.camera.model_name} cannot be undistorted to a pinhole camera") from None
+        except (ValueError, RuntimeError):  # COLMAP's own check that the model is perspective
+            raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera") from None
         return pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
 
     def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from scipy.ndimage import zoom
 
 from a2tg_jax.data.surfaces import Shape, Surface, nearest_hits
 
-LAMP = np.float32([[-1.7], [-1.9], [3.1]])
+LAMP = np.array([[-1.7], [-1.9], [3.1]], np.float32)
 """Middle of a spherical lamp."""
 LAMP_RADIUS = 0.35
 NUM_LAMP_RAYS, NUM_SKY_RAYS = 8, 16

@@ -9,17 +9,22 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import zoom
 
-Color = tuple[float, float, float]
-
-CREAM: Color = (0.93, 0.88, 0.76)
-INK: Color = (0.10, 0.13, 0.22)
-BRICK: Color = (0.66, 0.34, 0.25)
-MORTAR: Color = (0.86, 0.80, 0.70)
-TEAL: Color = (0.12, 0.47, 0.50)
-GOLD: Color = (0.93, 0.67, 0.20)
-CORAL: Color = (0.88, 0.36, 0.27)
-SKY: Color = (0.35, 0.62, 0.85)
-LEAF: Color = (0.42, 0.62, 0.28)
+CREAM = np.array((0.85, 0.81, 0.71), np.float32)
+INK = np.array((0.34, 0.38, 0.48), np.float32)
+BRICK = np.array((0.68, 0.45, 0.37), np.float32)
+MORTAR = np.array((0.80, 0.64, 0.55), np.float32)
+TEAL = np.array((0.28, 0.54, 0.56), np.float32)
+GOLD = np.array((0.87, 0.69, 0.38), np.float32)
+CORAL = np.array((0.82, 0.45, 0.38), np.float32)
+SKY = np.array((0.47, 0.64, 0.79), np.float32)
+LEAF = np.array((0.50, 0.62, 0.40), np.float32)
+BRICK_HUE = np.array((0.0, 0.02, 0.02), np.float32)
+GROUT = np.array((0.58, 0.55, 0.50), np.float32)
+VEIN = np.array((0.48, 0.58, 0.60), np.float32)
+STONE = np.array((0.86, 0.87, 0.84), np.float32)
+WALNUT = np.array((0.52, 0.38, 0.27), np.float32)
+OAK = np.array((0.68, 0.53, 0.38), np.float32)
+GAP = np.array((0.40, 0.29, 0.20), np.float32)
 
 
 def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -29,13 +34,13 @@ def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(u, (rows, columns)), np.broadcast_to(v[:, None], (rows, columns))
 
 
-def mix(first: Color, second: Color, weight: np.ndarray) -> np.ndarray:
+def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """(1 - weight)·first + weight·second, [rows, columns, 3]."""
-    return np.float32(first) + weight[..., None].astype(np.float32) * (np.float32(second) - np.float32(first))
+    return first + weight[..., None].astype(np.float32) * (second - first)
 
 
 def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 2) -> np.ndarray:
-    """Smooth noise [rows, columns] with mean 0 and values in about ±1; `cells` lattice cells along the rows at first."""
+    """Smooth noise [rows, columns] of mean 0 within about ±1.5; the first octave has `cells` lattice cells a column."""
     noise = np.zeros((rows, columns), np.float32)
     for octave in range(octaves):
         lattice = (cells << octave, max(1, round((cells << octave) * columns / rows)))
@@ -52,10 +57,10 @@ def bricks(rng: np.random.Generator, rows: int, columns: int, size: tuple[int, i
     shifted = column + (course % 2) * (size[1] // 2)
     shades = rng.uniform(-1, 1, (course.max() + 1, shifted.max() // size[1] + 1)).astype(np.float32)
     shade = shades[course, shifted // size[1]]
-    color = np.float32(BRICK) * (1 + 0.28 * shade[..., None]) + shade[..., None] * np.float32((0.0, 0.05, 0.06))
+    color = BRICK * (1 + 0.12 * shade[..., None]) + shade[..., None] * BRICK_HUE
     gap = max(2, size[0] // 6)
     is_mortar = (row % size[0] < gap) | (shifted % size[1] < gap)
-    color = np.where(is_mortar[..., None], np.float32(MORTAR), color)
+    color = np.where(is_mortar[..., None], MORTAR, color)
     return color * (1 + 0.06 * fractal_noise(rng, rows, columns, 24)[..., None])
 
 
@@ -67,17 +72,17 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
     sectors = 6 * np.maximum(index, 1)
     along = angle * sectors
     stone = np.minimum(along.astype(int), sectors - 1)
-    palette = np.float32([CREAM, INK, CORAL, TEAL, GOLD])
+    palette = np.stack([CREAM, INK, CORAL, TEAL, GOLD])
     kind = np.select(
         [index % 9 < 4, index % 9 == 4, index % 9 < 8],
         [np.where((stone + index) % 2 == 0, 0, 1), 4, np.where((stone + 2 * index) % 6 < 3, 2, 0)],
         3,
     )
-    shade = rng.uniform(0.82, 1.08, (index.max() + 1, sectors.max())).astype(np.float32)[index, stone]
+    shade = rng.uniform(0.92, 1.05, (index.max() + 1, sectors.max())).astype(np.float32)[index, stone]
     to_edge = np.minimum(radius - index, index + 1 - radius) * ring
     along_edge = np.minimum(along - stone, stone + 1 - along) * (2 * np.pi * radius * ring / sectors)
     grout = np.clip(np.minimum(to_edge, along_edge) - 0.6, 0, 1)[..., None]
-    return palette[kind] * shade[..., None] * grout + np.float32((0.45, 0.42, 0.38)) * (1 - grout)
+    return palette[kind] * shade[..., None] * grout + GROUT * (1 - grout)
 
 
 def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
@@ -85,20 +90,20 @@ def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
     u, v = coordinates(rows, columns)
     phase = 9 * u + 5 * v + 1.6 * fractal_noise(rng, rows, columns, 4, octaves=5)
     veins = np.abs(np.sin(np.pi * phase)) ** 0.6
-    return mix((0.16, 0.30, 0.33), (0.90, 0.92, 0.88), veins)
+    return mix(VEIN, STONE, veins)
 
 
 def globe(rows: int, columns: int) -> np.ndarray:
     """A ball in latitude and longitude: wedges of colour, checks of growing frequency, an inscribed equator."""
     u, v = coordinates(rows, columns)
-    wedges = np.float32([CORAL, CREAM, GOLD, CREAM, TEAL, CREAM])[(u * 24).astype(int) % 6]
+    wedges = np.stack([CORAL, CREAM, GOLD, CREAM, TEAL, CREAM])[(u * 24).astype(int) % 6]
     checks = ((u * 48).astype(int) + (v * 24).astype(int)) % 2
     color = np.where((np.abs(v - 0.5) < 0.17)[..., None], mix(CREAM, INK, checks), wedges)
     is_line = (np.abs(np.abs(v - 0.5) - 0.185) < 0.012) | (np.abs(np.abs(v - 0.5) - 0.40) < 0.012)
-    return np.where(is_line[..., None], np.float32(INK), color)
+    return np.where(is_line[..., None], INK, color)
 
 
-def checks(rows: int, columns: int, first: Color, second: Color, *, texels: int) -> np.ndarray:
+def checks(rows: int, columns: int, first: np.ndarray, second: np.ndarray, *, texels: int) -> np.ndarray:
     """A checked band of rows × columns squares, each `texels` wide."""
     row, column = np.indices((rows * texels, columns * texels)) // texels
     return mix(first, second, (row + column) % 2)
@@ -109,10 +114,10 @@ def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray
     u, v = coordinates(rows, columns)
     frequency = np.select([v < 0.34, v < 0.67], [16, 12], 8)
     stripe = ((u * frequency + v * 14) % 1.0) < 0.5
-    color = np.where(stripe[..., None], np.float32(TEAL), np.float32(CREAM))
+    color = np.where(stripe[..., None], TEAL, CREAM)
     near_band = np.minimum(np.abs(v - 0.34), np.abs(v - 0.67))
     keys = ((u * 40).astype(int) % 2 == 0) & (near_band < 0.018)
-    color = np.where((near_band < 0.03)[..., None], np.where(keys[..., None], np.float32(GOLD), np.float32(INK)), color)
+    color = np.where((near_band < 0.03)[..., None], np.where(keys[..., None], GOLD, INK), color)
     return color * (1 + 0.05 * fractal_noise(rng, rows, columns, 8)[..., None])
 
 
@@ -126,17 +131,17 @@ def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.n
     ]
     u, v = coordinates(side, side)
     grain = np.sin(2 * np.pi * (90 * v + 3 * shade + 1.2 * fractal_noise(rng, side, side, 6) + u))
-    color = mix((0.36, 0.22, 0.13), (0.80, 0.60, 0.38), np.clip(shade + 0.12 * grain, 0, 1))
+    color = mix(WALNUT, OAK, np.clip(shade + 0.12 * grain, 0, 1))
     is_gap = (row % width < max(2, width // 9)) | (shifted % length < max(2, width // 9))
-    return np.where(is_gap[..., None], np.float32((0.16, 0.10, 0.07)), color)
+    return np.where(is_gap[..., None], GAP, color)
 
 
-def lettering(text: str, rows: int, columns: int, height: float, ink: Color, paper: Color) -> np.ndarray:
+def lettering(text: str, rows: int, columns: int, height: float, ink: np.ndarray, paper: np.ndarray) -> np.ndarray:
     """Text `height` texels high, centred on plain paper; repeated along the columns if it is shorter than they are."""
     return mix(paper, ink, _text_mask(text, rows, columns, height, repeat=True))
 
 
-def letter_block(letters: Sequence[str], side: int, colors: Sequence[Color]) -> np.ndarray:
+def letter_block(letters: Sequence[str], side: int, colors: Sequence[np.ndarray]) -> np.ndarray:
     """The faces of toy blocks side by side: a framed letter each, the frame checked."""
     faces = []
     for letter, color in zip(letters, colors, strict=True):
@@ -145,7 +150,7 @@ def letter_block(letters: Sequence[str], side: int, colors: Sequence[Color]) -> 
         checks = ((u * 12).astype(int) + (v * 12).astype(int)) % 2
         face = mix(color, CREAM, np.where(edge < 1 / 12, checks, edge > 1.6 / 12))
         mask = _text_mask(letter, side, side, 0.62 * side, repeat=False)
-        faces.append(face + mask[..., None] * (np.float32(color) * 0.8 - face))
+        faces.append(face + mask[..., None] * (color * 0.8 - face))
     return np.concatenate(faces, axis=1)
 
 

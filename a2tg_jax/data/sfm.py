@@ -18,7 +18,6 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_EXHAUSTIVE = 200
 """With more photographs than this, only those near each other in the order of their names are matched."""
 MIN_REGISTERED = 3
-JPEG_QUALITY = 95
 
 
 class SfmSummary(NamedTuple):
@@ -95,15 +94,14 @@ def _match(photos: Path, names: list[str], database: Path, seed: int, camera_mod
     """Fills the database with features of the photographs and the matches between them."""
     colmap = pycolmap()
     colmap.set_random_seed(seed)
+    mode = colmap.CameraMode.SINGLE if _have_one_size(photos, names) else colmap.CameraMode.AUTO
+    reader = colmap.ImageReaderOptions(camera_model=camera_model)
     bar.set_description("features")
-    colmap.extract_features(
-        database,
-        photos,
-        image_names=names,
-        camera_mode=colmap.CameraMode.SINGLE if _have_one_size(photos, names) else colmap.CameraMode.AUTO,
-        reader_options=colmap.ImageReaderOptions(camera_model=camera_model),
-        device=colmap.Device.cpu,
-    )
+    # Listing the images first numbers them by name; otherwise the threads of the extraction do, by chance.
+    database.touch()
+    listing = {"image_names": names, "camera_mode": mode}
+    colmap.import_images(database, photos, options=reader, **listing)
+    colmap.extract_features(database, photos, reader_options=reader, device=colmap.Device.cpu, **listing)
     bar.set_description("matching")
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
@@ -147,7 +145,7 @@ def _write_scene(model: Any, photos: Path, work: Path, out: Path) -> None:
     chosen, undistorted = work / "chosen", work / "undistorted"
     chosen.mkdir()
     model.write(chosen)
-    pycolmap().undistort_images(undistorted, chosen, photos, jpeg_quality=JPEG_QUALITY)
+    pycolmap().undistort_images(undistorted, chosen, photos)
     (out / "sparse").mkdir()
     shutil.move(undistorted / "sparse", out / "sparse" / "0")
     shutil.move(undistorted / "images", out / "images")
@@ -167,9 +165,9 @@ def _have_one_size(photos: Path, names: list[str]) -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps COLMAP's log to warnings for a while."""
+    """Keeps COLMAP's log to errors for a while."""
     logging = pycolmap().logging
-    level, logging.minloglevel = logging.minloglevel, logging.WARNING.value
+    level, logging.minloglevel = logging.minloglevel, logging.ERROR.value
     try:
         yield
     finally:

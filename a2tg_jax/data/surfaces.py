@@ -124,7 +124,7 @@ class Block:
     def axes(self) -> np.ndarray:
         """[3, 3] rows are the cube's own axes in the world, divided by half its side."""
         cosine, sine = np.cos(self.turn), np.sin(self.turn)
-        return np.float32([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]) / np.float32(self.half_side)
+        return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]], np.float32) / np.float32(self.half_side)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         entry, leaving = np.float32(NEAR), np.float32(np.inf)
@@ -145,9 +145,9 @@ class Block:
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         face = np.minimum((u * 5).astype(int), 4)
         along, down = 2 * (u * 5 - face) - 1, 2 * v - 1
-        normals = np.float32([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1]])[face].T
-        rights = np.float32([[0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]])[face].T
-        downs = np.float32([*[[0, 0, -1]] * 4, [0, -1, 0]])[face].T
+        normals = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1]], np.float32)[face].T
+        rights = np.array([[0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]], np.float32)[face].T
+        downs = np.array([*[[0, 0, -1]] * 4, [0, -1, 0]], np.float32)[face].T
         to_world = self.axes.T * np.float32(self.half_side)
         points = to_world @ (normals + along * rights + down * downs) * self.half_side
         return points + column(self.center), to_world @ normals
@@ -204,7 +204,7 @@ def look_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def column(vector: Vector) -> np.ndarray:
     """[3, 1] float32."""
-    return np.float32(vector)[:, None]
+    return np.array(vector, np.float32)[:, None]
 
 
 def squares(*components: np.ndarray) -> np.ndarray:

@@ -11,13 +11,13 @@ from a2tg_jax.data.lighting import light
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth
 from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
 
-TARGET = np.float64([0.0, 0.1, 0.45])
+TARGET = np.array([0.0, 0.1, 0.45])
 """The point all cameras look at."""
 DISTANCE = 2.4
 """Of the cameras from the target."""
 FIELD_OF_VIEW = np.deg2rad(58.0)
 """Across the longer side of the image."""
-SAMPLE_OFFSETS = np.float64([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
+SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
 """Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
 
 
@@ -66,7 +66,7 @@ def synthetic_scene(
 
 
 def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
-    """Shapes and their colours (`patterns`): a room, a round podium, and what stands on it. Lengths are about metres."""
+    """Shapes and their colours: a room, a round podium, and what stands on it. Lengths are about metres."""
     wall = patterns.bricks(rng, 320, 2560, (14, 33))
     motto = "A2TG - ADAPTIVE ANISOTROPIC TEXTURED GAUSSIANS -"
     wall[152:200] = patterns.lettering(motto, 48, 2560, 34, patterns.CREAM, patterns.INK)
@@ -88,9 +88,9 @@ def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
 
 def camera_path(num_views: int) -> np.ndarray:
     """Camera centres [V, 3] evenly along a closed figure of eight in front of the target, above its height."""
-    phase = 2 * np.pi * np.arange(num_views) / num_views
-    azimuth = -0.5 * np.pi + np.deg2rad(55.0) * np.sin(phase)
-    elevation = np.deg2rad(26.0) + np.deg2rad(13.0) * np.sin(2 * phase + 0.6)
+    phase = 2 * np.pi * (np.arange(num_views) + 0.5) / num_views  # half a step beside the crossing
+    azimuth = -0.5 * np.pi + np.deg2rad(40.0) * np.sin(phase)
+    elevation = np.deg2rad(26.0) + np.deg2rad(11.0) * np.sin(2 * phase + 0.6)
     outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     return TARGET + DISTANCE * np.stack(outward, axis=-1)
 

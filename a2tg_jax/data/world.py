@@ -28,7 +28,7 @@ class Similarity:
     """[3], in units of the new world."""
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Positions [..., 3] of the old world in the new one; lengths grow by `scale`, directions turn by `rotation`."""
+        """Positions [..., 3] of the old world in the new one; `scale` multiplies lengths, `rotation` directions."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
     def apply_to_viewmat(self, viewmat: np.ndarray) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Training in a run folder: phase after phase, with checkpoints, and from where an earlier attempt stopped."""
 
+import functools
+
 from a2tg_jax.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from a2tg_jax.config import TrainConfig
 from a2tg_jax.data import Scene
@@ -43,12 +45,13 @@ def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config: TrainConfig
         save_checkpoint(run.checkpoint(phase, checkpoint.iteration), checkpoint)
         run.drop_old_checkpoints(phase)
 
-    options = {
-        "resume": load_checkpoint(newest[0]) if newest else None,
-        "on_checkpoint": keep,
-        "checkpoint_every": max(1, min(LONGEST_WITHOUT_CHECKPOINT, num_iterations // 10)),
-        "progress": progress,
-    }
     if phase == "stage1":
-        return fit_stage1(scene, config, **options)
-    return fit_stage2(scene, load_model(run.model("stage1")).gaussians, config, **options)
+        fit_phase = functools.partial(fit_stage1, scene, config)
+    else:
+        fit_phase = functools.partial(fit_stage2, scene, load_model(run.model("stage1")).gaussians, config)
+    return fit_phase(
+        resume=load_checkpoint(newest[0]) if newest else None,
+        on_checkpoint=keep,
+        checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, num_iterations // 10)),
+        progress=progress,
+    )

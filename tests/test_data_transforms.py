@@ -1,0 +1,313 @@
+"""transforms.json of nerfstudio and instant-ngp, and Blender's: intrinsics, splits, points, distortion, errors."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from a2tg_jax.data import load_scene
+from a2tg_jax.data.colmap_library import pycolmap
+
+TARGET = np.array([0.2, -0.1, 0.3])
+"""The images show it as a white dot, and it is the first of the points."""
+WIDTH, HEIGHT = 120, 90
+FOCAL = dict(fl_x=100.0, fl_y=104.0, cx=58.0, cy=47.0)
+SIZE = dict(w=WIDTH, h=HEIGHT)
+
+
+def camera_to_world(index, count):
+    """Pose [4, 4] as these files have it: x right, y up, z backward."""
+    angle = 2 * np.pi * index / count
+    center = TARGET + 3 * np.array([np.cos(angle), np.sin(angle), 0.4])
+    backward = center - TARGET - [0.1, 0.2, 0.1]
+    backward /= np.linalg.norm(backward)
+    right = np.cross([0, 0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(backward, right), backward, center], axis=1)
+    return pose
+
+
+def to_camera(pose, point):
+    """The point in OpenCV's camera frame (x right, y down, z forward)."""
+    return pose[:3, :3].T @ (point - pose[:3, 3]) * [1, -1, -1]
+
+
+def pinhole_place(pose, fl_x, fl_y, cx, cy):
+    """(x, y) at which a pinhole camera sees the target."""
+    x, y, z = to_camera(pose, TARGET)
+    return fl_x * x / z + cx, fl_y * y / z + cy
+
+
+def save_dot(file, place, size=(WIDTH, HEIGHT), alpha=False):
+    """A white dot on black around a place (x, y); pixel centres are at +0.5."""
+    y, x = np.indices(size[::-1]) + 0.5
+    dot = np.rint(255 * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 8)).astype(np.uint8)
+    channels = [np.full_like(dot, 255)] * 3 + [dot] if alpha else [dot] * 3
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.stack(channels, axis=-1)).save(file)
+
+
+def write_frames(folder, count=8, place=lambda pose: pinhole_place(pose, **FOCAL), alpha=False, split="images"):
+    """Images of the dot, and their frames without intrinsics."""
+    frames = []
+    for index in range(count):
+        pose = camera_to_world(index, count)
+        save_dot(folder / split / f"{index:02d}.png", place(pose), alpha=alpha)
+        frames.append({"file_path": f"{split}/{index:02d}.png", "transform_matrix": pose.tolist()})
+    return frames
+
+
+def write_ply(file, encoding="ascii", kinds=("float", "uint8")):
+    """Four points, the target first, as nerfstudio (ASCII) or a point-cloud program (binary) writes them."""
+    points = np.concatenate([TARGET[None], np.eye(3)])
+    header = [f"ply\nformat {encoding} 1.0\ncomment points\nelement vertex 4"]
+    header += [f"property {kinds[0]} {name}" for name in "xyz"]
+    header += [f"property {kinds[1]} {name}" for name in ("red", "green", "blue")]
+    body = "\n".join(" ".join(map(repr, map(float, point))) + " 255 0 51" for point in points).encode()
+    if encoding != "ascii":
+        kind = ("<" if "little" in encoding else ">") + {"float": "f4", "double": "f8"}[kinds[0]]
+        rows = np.zeros(4, [("x", kind), ("y", kind), ("z", kind), ("c", "3u1")])
+        for axis, name in enumerate("xyz"):
+            rows[name] = points[:, axis]
+        rows["c"] = 255, 0, 51
+        body = rows.tobytes()
+    file.write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
+
+
+def write_json(folder, frames, name="transforms.json", **values):
+    (folder / name).write_text(json.dumps({**values, "frames": frames}))
+
+
+def write_scene(folder, **values):
+    """A sound nerfstudio scene with sparse points."""
+    write_ply(folder / "sparse_pc.ply")
+    write_json(folder, write_frames(folder), ply_file_path="sparse_pc.ply", **{**FOCAL, **SIZE, **values})
+
+
+def dot_place(weights):
+    y, x = np.indices(weights.shape) + 0.5
+    return np.array([(weights * x).sum(), (weights * y).sum()]) / weights.sum()
+
+
+def check_dots(scene, tolerance=0.03):
+    """Every view shows the target where its camera, in the normalised world, says."""
+    target = scene.transform.apply(TARGET)
+    for view in (*scene.train, *scene.test):
+        viewmat, K = np.asarray(view.camera.viewmat, np.float64), np.asarray(view.camera.K, np.float64)
+        x, y, z = K @ (viewmat[:3, :3] @ target + viewmat[:3, 3])
+        weights = (view.image[..., 0] if view.alpha is None else view.alpha).astype(float)
+        assert weights.shape == (view.camera.height, view.camera.width)
+        np.testing.assert_allclose(dot_place(weights), [x / z, y / z], atol=tolerance)
+
+
+def test_global_intrinsics_and_points(tmp_path):
+    write_scene(tmp_path, applied_transform=[[1, 0, 0, 5], [0, 0, 1, 0], [0, -1, 0, 0]])
+    scene = load_scene(tmp_path)
+    check_dots(scene)
+    assert [view.name for view in scene.test] == ["images/00.png"]
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+    np.testing.assert_allclose(scene.colors[0], [1, 0, 0.2], atol=1e-6)
+
+
+def test_the_json_itself_may_be_given(tmp_path):
+    write_scene(tmp_path)
+    assert load_scene(tmp_path / "transforms.json").name == tmp_path.name
+
+
+@pytest.mark.parametrize(
+    ("encoding", "kinds"),
+    [
+        ("ascii", ("float", "uchar")),
+        ("binary_little_endian", ("float", "uchar")),
+        ("binary_little_endian", ("double", "uint8")),
+        ("binary_big_endian", ("float", "uint8")),
+    ],
+)
+def test_point_files(tmp_path, encoding, kinds):
+    write_scene(tmp_path)
+    write_ply(tmp_path / "sparse_pc.ply", encoding, kinds)
+    scene = load_scene(tmp_path)
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+    np.testing.assert_allclose(scene.colors, np.tile(np.float32([1, 0, 0.2]), (4, 1)), atol=1e-6)
+
+
+def test_intrinsics_per_frame_and_missing_suffix(tmp_path):
+    frames = write_frames(tmp_path)
+    for frame in frames:
+        frame |= FOCAL | SIZE | {"file_path": frame["file_path"].removesuffix(".png")}
+    write_json(tmp_path, frames, fl_x=1.0)
+    with pytest.warns(UserWarning, match="no sparse points"):
+        check_dots(load_scene(tmp_path))
+
+
+def test_camera_angle_stands_for_the_focal_length(tmp_path):
+    """Without w and h, the images say how large they are; the principal point is the centre."""
+    angle = 2 * np.arctan(WIDTH / 2 / 100.0)
+    write_ply(tmp_path / "points.ply")
+    frames = write_frames(tmp_path, place=lambda pose: pinhole_place(pose, 100.0, 100.0, WIDTH / 2, HEIGHT / 2))
+    write_json(tmp_path, frames, camera_angle_x=angle, ply_file_path="points.ply")
+    check_dots(load_scene(tmp_path))
+
+
+@pytest.mark.parametrize("has_folder", [False, True])
+def test_downscale(tmp_path, has_folder):
+    write_scene(tmp_path)
+    if has_folder:
+        (tmp_path / "images_2").mkdir()
+        for file in (tmp_path / "images").iterdir():
+            Image.open(file).reduce(2).save(tmp_path / "images_2" / file.name)
+            file.write_bytes(b"not read")
+    scene = load_scene(tmp_path, downscale=2)
+    assert scene.train[0].image.shape == (45, 60, 3)
+    check_dots(scene)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model", "params"),
+    [
+        (dict(k1=-0.1, k2=0.02, p1=0.003, p2=-0.002), "OPENCV", [-0.1, 0.02, 0.003, -0.002]),
+        (dict(k1=-0.1, k2=0.02, k3=0.01), "FULL_OPENCV", [-0.1, 0.02, 0, 0, 0.01, 0, 0, 0]),
+        (dict(camera_model="OPENCV_FISHEYE", k1=0.03, k3=0.001), "OPENCV_FISHEYE", [0.03, 0, 0.001, 0]),
+        (dict(is_fisheye=True, k1=0.03), "OPENCV_FISHEYE", [0.03, 0, 0, 0]),
+    ],
+)
+def test_distortion_is_taken_out(tmp_path, distortion, model, params):
+    camera = pycolmap().Camera(model=model, width=WIDTH, height=HEIGHT, params=[*FOCAL.values(), *params])
+    write_ply(tmp_path / "points.ply")
+    frames = write_frames(tmp_path, place=lambda pose: camera.img_from_cam(to_camera(pose, TARGET)))
+    write_json(tmp_path, frames, ply_file_path="points.ply", **FOCAL, **SIZE, **distortion)
+    check_dots(load_scene(tmp_path), 0.05)
+
+
+def test_split_lists(tmp_path):
+    names = [f"images/{index:02d}.png" for index in range(8)]
+    write_scene(tmp_path, train_filenames=names[:5], val_filenames=names[5:7], test_filenames=[f"./{names[7]}"])
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.train] == names[:5]
+    assert [view.name for view in scene.test] == names[7:]
+
+
+def write_blender(folder, splits=("train", "test")):
+    angle = 2 * np.arctan(WIDTH / 2 / 100.0)
+    for count, split in zip((6, 3), splits, strict=False):
+        frames = write_frames(
+            folder,
+            count,
+            place=lambda pose: pinhole_place(pose, 100.0, 100.0, WIDTH / 2, HEIGHT / 2),
+            alpha=True,
+            split=split,
+        )
+        for frame in frames:
+            frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+        write_json(folder, frames, f"transforms_{split}.json", camera_angle_x=angle)
+
+
+def test_blender(tmp_path):
+    write_blender(tmp_path)
+    scene = load_scene(tmp_path)
+    assert (len(scene.train), len(scene.test)) == (6, 3)
+    assert scene.test[0].name == "test/00"
+    assert scene.train[0].alpha is not None and (scene.train[0].image == 255).all()
+    check_dots(scene)
+    original = scene.transform.inverse().apply(scene.points)
+    assert np.abs(original).max() == pytest.approx(1.3, abs=0.01)
+
+
+def test_blender_downscale_weights_with_alpha(tmp_path):
+    """White stays white beside transparent pixels."""
+    write_blender(tmp_path)
+    scene = load_scene(tmp_path, downscale=2)
+    for view in scene.train:
+        assert view.image[view.alpha > 0].min() == 255
+    check_dots(scene)
+
+
+def test_blender_without_a_test_file(tmp_path):
+    write_blender(tmp_path, splits=("train",))
+    scene = load_scene(tmp_path, test_every=3)
+    assert [view.name for view in scene.test] == ["train/00", "train/03"]
+
+
+def spoil_json(folder):
+    (folder / "transforms.json").write_text("{")
+
+
+def spoil_frames(folder):
+    write_json(folder, [])
+
+
+def spoil_image(folder):
+    (folder / "images" / "03.png").unlink()
+
+
+def spoil_points(folder):
+    (folder / "sparse_pc.ply").unlink()
+
+
+def spoil_ply(folder):
+    (folder / "sparse_pc.ply").write_bytes(b"solid")
+
+
+def spoil_focal(folder):
+    write_json(folder, write_frames(folder), **SIZE)
+
+
+def spoil_pose(folder):
+    frames = write_frames(folder)
+    frames[2]["transform_matrix"][0][0] = 5.0
+    write_json(folder, frames, **FOCAL)
+
+
+def spoil_nan(folder):
+    frames = write_frames(folder)
+    frames[2]["transform_matrix"][0][3] = float("nan")
+    write_json(folder, frames, **FOCAL)
+
+
+def spoil_shape(folder):
+    frames = write_frames(folder)
+    frames[2]["transform_matrix"] = [1, 2, 3]
+    write_json(folder, frames, **FOCAL)
+
+
+def spoil_model(folder):
+    write_json(folder, write_frames(folder), camera_model="EQUIRECTANGULAR", **FOCAL)
+
+
+def spoil_place(folder):
+    frames = write_frames(folder)
+    for frame in frames:
+        frame["transform_matrix"] = frames[0]["transform_matrix"]
+    write_json(folder, frames, **FOCAL)
+
+
+def spoil_names(folder):
+    frames = write_frames(folder)
+    write_json(folder, [*frames, frames[1]], **FOCAL)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (spoil_json, ValueError, "cannot be read as JSON"),
+        (spoil_frames, ValueError, "lists no frames"),
+        (spoil_image, FileNotFoundError, "03.png: no such image"),
+        (spoil_points, FileNotFoundError, "sparse_pc.ply: no such point file"),
+        (spoil_ply, ValueError, "sparse_pc.ply: is not a PLY file of points"),
+        (spoil_focal, ValueError, "images/00.png: has no focal length"),
+        (spoil_pose, ValueError, "images/02.png: its pose is not a rigid motion"),
+        (spoil_nan, ValueError, "images/02.png: its pose is not finite"),
+        (spoil_shape, ValueError, "images/02.png: its transform_matrix must be"),
+        (spoil_model, ValueError, "camera_model EQUIRECTANGULAR"),
+        (spoil_place, ValueError, "one place"),
+        (spoil_names, ValueError, "lists images/01.png twice"),
+    ],
+)
+def test_bad_input_is_named(tmp_path, spoil, error, message):
+    write_scene(tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(error, match=message) as caught:
+        load_scene(tmp_path)
+    assert "\n" not in str(caught.value)
