@@ -106,8 +106,8 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         leaves = [arrays[name] for name in names]
         state, layout, history = jax.tree.unflatten(jax.tree.structure(template), leaves)
         config = config_from_dict(TrainConfig, header["config"])
-        on_device = jax.tree.map(jnp.asarray, (state, layout))
-        return Checkpoint(config, header["stage"], *on_device, History(**history))
+        state, layout = jax.tree.map(jnp.asarray, (state, layout))
+        return Checkpoint(config, header["stage"], state, layout, History(**history))
     except KeyError as error:
         raise ValueError(f"{path}: the checkpoint lacks {error}; it is damaged or of another version") from error
 
@@ -121,18 +121,18 @@ def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:
 def _template(header: dict[str, Any]):
     """A tree of the structure that was saved; its values mean nothing."""
     num = header["num_rows"]
-    row = np.zeros(0)
-    gaussians, textures, layout = Gaussians(row, row, row, row, row), None, None  # type: ignore[arg-type]
+    row: Any = np.zeros(0)
+    gaussians, textures, layout = Gaussians(row, row, row, row, row), None, None
     if header["resolutions"] is not None:
-        textures = Textures(tuple(row for _ in header["capacities"]))  # type: ignore[arg-type]
-        layout = AtlasLayout(row, row, tuple((int(v), int(u)) for v, u in header["resolutions"]))  # type: ignore[arg-type]
+        textures = Textures(tuple(row for _ in header["capacities"]))
+        layout = AtlasLayout(row, row, tuple((int(v), int(u)) for v, u in header["resolutions"]))
     state = TrainState(
         gaussians=gaussians,
         moments=adam_init(gaussians),
         textures=textures,
         texture_moments=None if textures is None else adam_init(textures),
         statistics=GradientStatistics.init(num) if header["has_statistics"] else None,
-        num_live=np.zeros(0),  # type: ignore[arg-type]
-        iteration=np.zeros(0),  # type: ignore[arg-type]
+        num_live=row,
+        iteration=row,
     )
     return state, layout, {field.name: row for field in dataclasses.fields(History)}

@@ -304,7 +304,8 @@ def _block(how: Compositing, rule, rows, at, tile: _Tile, light, is_live, log_ta
     """
     splats, appearance = rows
     pixels = _pixels_of_tile(how.grid.tile_size, splats.M.dtype)
-    hit = _intersect(*_relative_to_tile(splats.M, tile), pixels, how.near_plane)
+    axes, mean = _relative_to_tile(splats.M, tile)
+    hit = _intersect(axes, mean, pixels, how.near_plane)
     residual, factor = rule.sample(appearance, hit.u, hit.v)
     per_pixel = functools.partial(spread, num=light.shape[0])
     a = per_pixel(splats.opacities) * rule.falloff(hit.rho)

@@ -71,7 +71,8 @@ class TextureConfig:
     cap: int = 4
     """Largest texture side in texels (at most 16)."""
     upscale_at: tuple[float, ...] | None = None
-    """Fractions of stage 2 at which textures grow; None: the paper's 1/60 and 1/30 (0.15 and 0.30 under 30,000 iterations)."""
+    """Fractions of stage 2 at which textures grow; None: the paper's 1/60 and 1/30, under 30,000 iterations 0.15 and
+    0.30."""
     official: bool = False
     """The authors' own texture conventions instead of the paper's (RenderSettings.official)."""
 

@@ -220,10 +220,11 @@ def _single(_, texels: Array, size: Array, x: Array, y: Array) -> Array:
 
 def _hats(area: int, texels: Array, size: Array, x: Array, y: Array) -> Array:
     """Σ_k hat(x − column_k)·hat(y − row_k)·texel_k with hat(d) = max(0, 1 − |d|): bilinear without a gather."""
-    index = jnp.arange(area)
-    is_own = index < size[0] * size[1]
-    column, row = (index % size[1]).astype(x.dtype), (index // size[1]).astype(x.dtype)
-    row = jnp.where(is_own, row, -2.0)
+    # In floats, where these small quotients are exact: integer division would cost more than all the rest.
+    index, columns = jnp.arange(area, dtype=x.dtype), size[1].astype(x.dtype)
+    row = jnp.floor((index + 0.5) / columns)
+    column = index - row * columns
+    row = jnp.where(row < size[0].astype(x.dtype), row, -2.0)
     weights = _hat(x[None, :] - column[:, None]) * _hat(y[None, :] - row[:, None])
     return _weigh(texels[:area], weights)
 

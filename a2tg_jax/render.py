@@ -38,7 +38,7 @@ class RenderSettings:
     """Splats and hits nearer than this do not show."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
-    texture: TextureOptions = TextureOptions()
+    texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
     """How textures are read."""
     capacity: int | None = None
     """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
@@ -52,7 +52,7 @@ class RenderSettings:
 
 
 class RenderOutput(NamedTuple):
-    """What a view shows. Depth and normal are weighted sums, not divided by alpha; the background has no part in them."""
+    """What a view shows. Depth and normal are weighted sums, not divided by alpha, without the background."""
 
     color: Array
     """[H, W, 3], background included, not clipped."""
@@ -75,7 +75,7 @@ def render_image(
     layout: AtlasLayout | None = None,
     *,
     background: Any = (0, 0, 0),
-    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    settings: RenderSettings = RenderSettings(),
 ) -> RenderOutput:
     """Renders a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
 
@@ -100,7 +100,7 @@ def render_appearance(
     rule: AppearanceRule,
     *,
     background: Any = (0, 0, 0),
-    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    settings: RenderSettings = RenderSettings(),
 ) -> RenderOutput:
     """As `render_image`, of splats that show what `rule` says."""
     if settings.capacity is None:
@@ -171,7 +171,7 @@ def plan_render(
     textures: Textures | None = None,
     layout: AtlasLayout | None = None,
     *,
-    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    settings: RenderSettings = RenderSettings(),
 ) -> RenderSettings:
     """The settings with a capacity that suffices for every one of the cameras, with head room (host).
 
@@ -222,13 +222,13 @@ def _count_pairs(gaussians, camera, rule, tile_size, near_plane):
 
 
 def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
-    values = jax.tree.map(_primal_value, (gaussians, camera, rule))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
+    gaussians, camera, rule = jax.tree.map(_primal_value, (gaussians, camera, rule))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
         )
-    return capacity_for(pairs_of_view(*values, settings))
+    return capacity_for(pairs_of_view(gaussians, camera, rule, settings))
 
 
 def _primal_value(x):

@@ -15,8 +15,8 @@ from a2tg_jax.adapt import GradientStatistics
 from a2tg_jax.cameras import Camera
 from a2tg_jax.config import TrainConfig
 from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 from a2tg_jax.lookup import TextureOptions
+from a2tg_jax.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 from a2tg_jax.mcmc import grow, perturb, relocate
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.optim import AdamState, adam_init, adam_update, exponential_decay
@@ -125,12 +125,11 @@ def train_step(
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), views.grads)
     is_overflow, is_finite = jnp.any(views.is_overflow), _all_finite((views.loss, grads))
 
-    rate = exponential_decay(
-        how.config.rates.means, how.config.rates.means_final_factor, state.iteration, how.num_iterations
-    )
-    new = _updated(how, state, grads, rate.astype(scene_scale.dtype) * scene_scale)
+    rates = how.config.rates
+    decayed = exponential_decay(rates.means, rates.means_final_factor, state.iteration, how.num_iterations)
+    rate = decayed.astype(scene_scale.dtype) * scene_scale
+    new = _updated(how, state, grads, rate)
     if how.stage == 1 or how.config.densify.noise_in_stage2:
-        rate = rate.astype(scene_scale.dtype) * scene_scale
         new = dataclasses.replace(new, gaussians=perturb(key_noise, new.gaussians, new.num_live, rate))
     has_hosts = jnp.asarray(True)
     if how.stage == 1 and how.config.densify.is_enabled:
@@ -140,9 +139,7 @@ def train_step(
             lambda s: (s, jnp.asarray(True)),
             new,
         )
-    if state.statistics is not None:
-        new = dataclasses.replace(new, statistics=_with_views(state.statistics, views.tap))
-    new = dataclasses.replace(new, iteration=iteration)
+    new = dataclasses.replace(new, statistics=_with_views(state.statistics, views.tap), iteration=iteration)
     is_good = is_finite & ~is_overflow & has_hosts
     chosen = jax.tree.map(lambda a, b: jnp.where(is_good, a, b), new, state)
     info = StepInfo(
@@ -237,13 +234,8 @@ def _updated(how: StepSettings, state: TrainState, grads, rate_of_means: Array) 
 
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:
     """Alpha factors clamped to [0, 1]; RGB too where it is unsigned."""
-    lowest = jnp.asarray([0.0 if options.rgb == "unit" else -jnp.inf] * 3 + [0.0])
-    highest = jnp.asarray([1.0 if options.rgb == "unit" else jnp.inf] * 3 + [1.0])
-
-    def project(texels: Array) -> Array:
-        return jnp.clip(texels, lowest.astype(texels.dtype)[None, None, None], highest.astype(texels.dtype)[None, None, None])
-
-    return jax.tree.map(project, textures)
+    is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
+    return jax.tree.map(lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures)
 
 
 def _densify(key_relocate: Array, key_grow: Array, state: TrainState, cap: int) -> tuple[TrainState, Array]:
@@ -257,8 +249,10 @@ def _densify(key_relocate: Array, key_grow: Array, state: TrainState, cap: int) 
     return state, moved.info.has_hosts
 
 
-def _with_views(statistics: GradientStatistics, taps: Array) -> GradientStatistics:
-    """The statistic after the views of a batch; taps [V, N, 4]."""
+def _with_views(statistics: GradientStatistics | None, taps: Array | None) -> GradientStatistics | None:
+    """The statistic, where one is kept, after the views of a batch; taps [V, N, 4]."""
+    if statistics is None or taps is None:
+        return None
     for tap in taps:
         statistics = statistics.accumulate(safe_norm(tap[:, :3]), tap[:, 3] > 0)
     return statistics

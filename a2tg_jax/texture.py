@@ -6,7 +6,6 @@ Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import jax

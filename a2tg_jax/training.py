@@ -205,7 +205,7 @@ class _Stage:
             )
             if not bool(info.is_overflow):
                 break
-            self.capacities[size] = capacity_for(int(info.num_pairs) * GROWTH_ROOM)
+            self.capacities[size] = capacity_for(int(float(info.num_pairs) * GROWTH_ROOM))
         names = ", ".join(self.views[index].name for index in indices)
         if not bool(info.is_finite):
             raise ValueError(
@@ -227,9 +227,9 @@ class _Stage:
 
     def upscale(self, event: int) -> None:
         """One upscaling event: choose, rebuild the buckets with their moments, restart the statistic."""
-        state, layout, chosen = self.state, self.layout, self.config.texture
-        assert layout is not None and state.textures is not None and state.texture_moments is not None
-        assert state.statistics is not None
+        state, layout, adam, chosen = self.state, self.layout, self.state.texture_moments, self.config.texture
+        if layout is None or state.textures is None or adam is None or state.statistics is None:
+            raise ValueError("the checkpoint has no textures, but its configuration asks for them")
         sizes = layout.sizes
         proposed = next_sizes(
             sizes,
@@ -240,11 +240,9 @@ class _Stage:
             anisotropic=chosen.anisotropic,
         )
         used = parameter_bytes(state.gaussians, layout)
-        mask = select(
-            np.asarray(state.statistics.average()), sizes, proposed, **_rule(self.config, used, event, len(self.events))
-        )
+        rule = _rule(self.config, used, event, len(self.events))
+        mask = select(np.asarray(state.statistics.average()), sizes, proposed, **rule)
         new_sizes = np.where(mask[:, None], proposed, sizes)
-        adam = state.texture_moments
         rebuilt = reallocate(state.textures, layout, new_sizes, (adam.mu, adam.nu))
         mu, nu = rebuilt.moments
         is_last = event == len(self.events)

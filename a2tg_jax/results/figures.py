@@ -17,8 +17,8 @@ from a2tg_jax.results.pictures import resolution_colors
 
 COLORS: dict[Phase, str] = {"stage1": "#4477aa", "stage2": "#cc3311", "baseline": "#777777"}
 LABELS: dict[Phase, str] = {"stage1": "stage 1", "stage2": "stage 2", "baseline": "stage 2 without textures"}
-RUNNING_MEANS = 25
-"""A running mean covers this share of a phase: 1/25."""
+RUNNING_MEANS = 10
+"""A running mean covers this share of a phase: a tenth."""
 CURVES = (
     ("loss", "Loss"),
     ("psnr", "Training PSNR (dB)"),

@@ -109,7 +109,7 @@ def _comparison(comparison: Comparison) -> str:
 def _textures(run: RunFolder) -> str:
     if not (run.figures / "sizes.png").is_file():
         return "<p>This run has no textures.</p>"
-    coloured = "The same view with every Gaussian in the colour of its texture's number of texels."
+    coloured = "The first view, every Gaussian in the colour of its texture's number of texels."
     return _figure(run.figures / "resolutions.png", coloured) + _figure(
         run.figures / "sizes.png", "How many Gaussians have a texture of each resolution."
     )
