@@ -82,6 +82,7 @@ class StepInfo(NamedTuple):
     """The most pairs among the views: what the capacity must hold."""
     is_overflow: Array
     is_finite: Array
+    """Whether loss, gradients and updated parameters are."""
     has_hosts: Array
     """False when every Gaussian is dead."""
 
@@ -123,7 +124,6 @@ def train_step(
     backgrounds = _backgrounds(key_background, how.config.background, batch.viewmats.shape[0])
     views = _gradients(how, state, batch, layout, backgrounds, iteration)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), views.grads)
-    is_overflow, is_finite = jnp.any(views.is_overflow), _all_finite((views.loss, grads))
 
     rates = how.config.rates
     decayed = exponential_decay(rates.means, rates.means_final_factor, state.iteration, how.num_iterations)
@@ -139,6 +139,8 @@ def train_step(
             lambda s: (s, jnp.asarray(True)),
             new,
         )
+    is_overflow = jnp.any(views.is_overflow)
+    is_finite = _all_finite((views.loss, grads, new.gaussians, new.textures))
     new = dataclasses.replace(new, statistics=_with_views(state.statistics, views.tap), iteration=iteration)
     is_good = is_finite & ~is_overflow & has_hosts
     chosen = jax.tree.map(lambda a, b: jnp.where(is_good, a, b), new, state)

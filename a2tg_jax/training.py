@@ -51,6 +51,8 @@ class FitResult:
     """The live Gaussians at the end of stage 1; None where training was resumed in stage 2."""
     seconds: float
     """Training time in all, compilation included."""
+    num_regrown: int
+    """How often the tile lists needed more room, each time at the price of a compilation."""
 
 
 OnCheckpoint = Callable[[Checkpoint], None]
@@ -84,8 +86,13 @@ def fit(
     first = fit_stage1(scene, config, resume=resume, **options)  # type: ignore[arg-type]
     second = fit_stage2(scene, first.gaussians, config, **options)  # type: ignore[arg-type]
     history = first.history.followed_by(second.history)
-    seconds = first.seconds + second.seconds
-    return dataclasses.replace(second, history=history, stage1=first.gaussians, seconds=seconds)
+    return dataclasses.replace(
+        second,
+        history=history,
+        stage1=first.gaussians,
+        seconds=first.seconds + second.seconds,
+        num_regrown=first.num_regrown + second.num_regrown,
+    )
 
 
 def fit_stage1(
@@ -102,8 +109,7 @@ def fit_stage1(
     gaussians, num_live = _allocate(scene, config)
     run = _Stage(scene, config, 1, initial_state(gaussians, num_live, None, False), None, resume)
     run.train(on_checkpoint, checkpoint_every, progress)
-    live = run.live_gaussians
-    return FitResult(live, None, None, run.history, config, live, run.seconds)
+    return run.result(stage1=run.live_gaussians)
 
 
 def fit_stage2(
@@ -131,8 +137,7 @@ def fit_stage2(
     state = initial_state(gaussians, gaussians.num, textures, has_events)
     run = _Stage(scene, config, 2, state, layout, resume)
     run.train(on_checkpoint, checkpoint_every, progress)
-    first = gaussians if resume is None else None
-    return FitResult(run.live_gaussians, run.state.textures, run.layout, run.history, config, first, run.seconds)
+    return run.result(stage1=gaussians if resume is None else None)
 
 
 def render_settings(config: TrainConfig) -> RenderSettings:
@@ -163,6 +168,20 @@ class _Stage:
         self.capacities: dict[tuple[int, int], int] = {}
         self.batch_of = functools.lru_cache(maxsize=2)(lambda indices: make_batch(self.views, indices))
         self.started = time.perf_counter()
+        self.num_regrown = 0
+
+    def result(self, stage1: Gaussians | None) -> FitResult:
+        """What the stage leaves."""
+        return FitResult(
+            gaussians=self.live_gaussians,
+            textures=self.state.textures,
+            layout=self.layout,
+            history=self.history,
+            config=self.config,
+            stage1=stage1,
+            seconds=self.seconds,
+            num_regrown=self.num_regrown,
+        )
 
     @property
     def seconds(self) -> float:
@@ -205,6 +224,7 @@ class _Stage:
             )
             if not bool(info.is_overflow):
                 break
+            self.num_regrown += 1
             self.capacities[size] = capacity_for(int(float(info.num_pairs) * GROWTH_ROOM))
         names = ", ".join(self.views[index].name for index in indices)
         if not bool(info.is_finite):

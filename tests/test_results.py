@@ -13,8 +13,12 @@ from a2tg_jax import cli
 from a2tg_jax.cameras import Camera
 from a2tg_jax.checkpoint import History
 from a2tg_jax.config import DensifyConfig, TextureConfig, TrainConfig
-from a2tg_jax.evaluation import Evaluation, ViewMetrics
+from a2tg_jax.data import View, view_image
+from a2tg_jax.evaluation import Evaluation, ViewMetrics, evaluate
+from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.metrics import psnr
 from a2tg_jax.paths import smooth_path
+from a2tg_jax.render import render_image
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, create_run, open_run
 from a2tg_jax.results.history import read_history, write_history
@@ -53,6 +57,27 @@ def circle(num: int) -> list[Camera]:
         K = jnp.asarray([[50, 0, 20], [0, 50, 15], [0, 0, 1]], jnp.float32)
         cameras.append(Camera(jnp.asarray(viewmat, jnp.float32), K, 40, 30))
     return cameras
+
+
+# Evaluation
+
+
+def test_evaluation_measures_the_render():
+    cameras, background = circle(3), (0.2, 0.4, 0.6)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
+    gaussians = init_from_points(points, points + 0.5)
+    images = [np.asarray(render_image(gaussians, camera, background=background).color) for camera in cameras]
+    views = [View(f"{i}.png", camera, to_uint8(1 - images[i])) for i, camera in enumerate(cameras)]
+    found = evaluate(views, gaussians, background=background, num_renders=2)
+    for i, measured in enumerate(found.per_view):
+        target = jnp.asarray(view_image(views[i]))
+        assert measured.psnr == pytest.approx(float(psnr(jnp.asarray(images[i]), target)), rel=1e-4)
+        assert measured.lpips is None
+    np.testing.assert_allclose(np.stack(found.renders), to_uint8(np.stack(images[:2])), atol=1)
+    assert found.psnr == pytest.approx(np.mean([view.psnr for view in found.per_view]))
+    assert found[1:].per_view == found.per_view[1:] and found.frames_per_second > 0
+    with pytest.raises(ValueError, match="no views"):
+        evaluate((), gaussians)
 
 
 # Folders

@@ -10,21 +10,22 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import zoom
 
 CREAM = np.array((0.85, 0.81, 0.71), np.float32)
-INK = np.array((0.34, 0.38, 0.48), np.float32)
+INK = np.array((0.27, 0.31, 0.42), np.float32)
 BRICK = np.array((0.68, 0.45, 0.37), np.float32)
-MORTAR = np.array((0.80, 0.64, 0.55), np.float32)
+MORTAR = np.array((0.73, 0.53, 0.45), np.float32)
 TEAL = np.array((0.28, 0.54, 0.56), np.float32)
 GOLD = np.array((0.87, 0.69, 0.38), np.float32)
 CORAL = np.array((0.82, 0.45, 0.38), np.float32)
+SLATE = np.array((0.47, 0.53, 0.60), np.float32)
 SKY = np.array((0.47, 0.64, 0.79), np.float32)
 LEAF = np.array((0.50, 0.62, 0.40), np.float32)
 BRICK_HUE = np.array((0.0, 0.02, 0.02), np.float32)
-GROUT = np.array((0.58, 0.55, 0.50), np.float32)
+GROUT = np.array((0.62, 0.58, 0.52), np.float32)
 VEIN = np.array((0.48, 0.58, 0.60), np.float32)
 STONE = np.array((0.86, 0.87, 0.84), np.float32)
 WALNUT = np.array((0.52, 0.38, 0.27), np.float32)
 OAK = np.array((0.68, 0.53, 0.38), np.float32)
-GAP = np.array((0.40, 0.29, 0.20), np.float32)
+GAP = np.array((0.48, 0.35, 0.25), np.float32)
 
 
 def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +58,7 @@ def bricks(rng: np.random.Generator, rows: int, columns: int, size: tuple[int, i
     shifted = column + (course % 2) * (size[1] // 2)
     shades = rng.uniform(-1, 1, (course.max() + 1, shifted.max() // size[1] + 1)).astype(np.float32)
     shade = shades[course, shifted // size[1]]
-    color = BRICK * (1 + 0.12 * shade[..., None]) + shade[..., None] * BRICK_HUE
+    color = BRICK * (1 + 0.08 * shade[..., None]) + shade[..., None] * BRICK_HUE
     gap = max(2, size[0] // 6)
     is_mortar = (row % size[0] < gap) | (shifted % size[1] < gap)
     color = np.where(is_mortar[..., None], MORTAR, color)
@@ -93,11 +94,11 @@ def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
     return mix(VEIN, STONE, veins)
 
 
-def globe(rows: int, columns: int) -> np.ndarray:
-    """A ball in latitude and longitude: wedges of colour, checks of growing frequency, an inscribed equator."""
+def globe(rows: int, columns: int, num_checks: int) -> np.ndarray:
+    """A ball in latitude and longitude: wedges of colour at the poles, `num_checks` checks around the equator."""
     u, v = coordinates(rows, columns)
-    wedges = np.stack([CORAL, CREAM, GOLD, CREAM, TEAL, CREAM])[(u * 24).astype(int) % 6]
-    checks = ((u * 48).astype(int) + (v * 24).astype(int)) % 2
+    wedges = np.stack([CORAL, CREAM, GOLD, CREAM, TEAL, CREAM])[(u * 18).astype(int) % 6]
+    checks = ((u * num_checks).astype(int) + (v * num_checks / 2).astype(int)) % 2
     color = np.where((np.abs(v - 0.5) < 0.17)[..., None], mix(CREAM, INK, checks), wedges)
     is_line = (np.abs(np.abs(v - 0.5) - 0.185) < 0.012) | (np.abs(np.abs(v - 0.5) - 0.40) < 0.012)
     return np.where(is_line[..., None], INK, color)
@@ -112,12 +113,12 @@ def checks(rows: int, columns: int, first: np.ndarray, second: np.ndarray, *, te
 def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
     """A column: oblique stripes whose frequency doubles upwards, between bands of keys."""
     u, v = coordinates(rows, columns)
-    frequency = np.select([v < 0.34, v < 0.67], [16, 12], 8)
-    stripe = ((u * frequency + v * 14) % 1.0) < 0.5
+    frequency = np.select([v < 0.34, v < 0.67], [12, 9], 6)
+    stripe = ((u * frequency + v * 9) % 1.0) < 0.5
     color = np.where(stripe[..., None], TEAL, CREAM)
     near_band = np.minimum(np.abs(v - 0.34), np.abs(v - 0.67))
-    keys = ((u * 40).astype(int) % 2 == 0) & (near_band < 0.018)
-    color = np.where((near_band < 0.03)[..., None], np.where(keys[..., None], GOLD, INK), color)
+    keys = ((u * 24).astype(int) % 2 == 0) & (near_band < 0.025)
+    color = np.where((near_band < 0.04)[..., None], np.where(keys[..., None], GOLD, INK), color)
     return color * (1 + 0.05 * fractal_noise(rng, rows, columns, 8)[..., None])
 
 
@@ -147,9 +148,9 @@ def letter_block(letters: Sequence[str], side: int, colors: Sequence[np.ndarray]
     for letter, color in zip(letters, colors, strict=True):
         u, v = coordinates(side, side)
         edge = np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v))
-        checks = ((u * 12).astype(int) + (v * 12).astype(int)) % 2
-        face = mix(color, CREAM, np.where(edge < 1 / 12, checks, edge > 1.6 / 12))
-        mask = _text_mask(letter, side, side, 0.62 * side, repeat=False)
+        checks = ((u * 8).astype(int) + (v * 8).astype(int)) % 2
+        face = mix(color, CREAM, np.where(edge < 1 / 8, checks, edge > 1.5 / 8))
+        mask = _text_mask(letter, side, side, 0.58 * side, repeat=False)
         faces.append(face + mask[..., None] * (color * 0.8 - face))
     return np.concatenate(faces, axis=1)
 

@@ -69,7 +69,7 @@ def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
     """Shapes and their colours: a room, a round podium, and what stands on it. Lengths are about metres."""
     wall = patterns.bricks(rng, 320, 2560, (14, 33))
     motto = "A2TG - ADAPTIVE ANISOTROPIC TEXTURED GAUSSIANS -"
-    wall[152:200] = patterns.lettering(motto, 48, 2560, 34, patterns.CREAM, patterns.INK)
+    wall[142:206] = patterns.lettering(motto, 64, 2560, 50, patterns.CREAM, patterns.SLATE)
     rim = patterns.checks(2, 120, patterns.INK, patterns.GOLD, texels=16)
     letters, colors = "A2TGA", (patterns.CORAL, patterns.TEAL, patterns.LEAF, patterns.SKY, patterns.GOLD)
     return [
@@ -79,10 +79,10 @@ def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
         (Disc((0, 0.1, 0.12), 1.15), patterns.mosaic(rng, 768, 25)),
         (Block((-0.50, -0.25, 0.38), 0.26, 0.45), patterns.letter_block(letters, 160, colors)),
         (Block((-0.47, -0.22, 0.82), 0.18, 0.05), patterns.letter_block(letters[::-1], 128, colors[::-1])),
-        (Ball((0.55, 0.05, 0.50), 0.38), patterns.globe(256, 512)),
+        (Ball((0.55, 0.05, 0.50), 0.38), patterns.globe(256, 512, 44)),
         (Ball((0.05, -0.60, 0.30), 0.18), patterns.marble(rng, 128, 256)),
         (Tube((0.0, 0.70, 0.12), 0.20, 0.80), patterns.barber_pole(rng, 384, 384)),
-        (Ball((0.0, 0.70, 1.07), 0.24), patterns.globe(160, 320)),
+        (Ball((0.0, 0.70, 1.07), 0.24), patterns.globe(160, 320, 24)),
     ]
 
 

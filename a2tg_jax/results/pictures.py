@@ -23,6 +23,8 @@ from a2tg_jax.texture import AtlasLayout, Textures
 
 ERROR_GAIN = 4
 MARGIN, CAPTION_HEIGHT = 6, 22
+LONGEST_SIDE = 1280
+"""Of a picture in the report, in pixels."""
 
 
 def to_uint8(image) -> np.ndarray:
@@ -88,9 +90,10 @@ def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> 
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
-    """An image as a data: URI, enlarged `zoom` times without smoothing."""
+    """An image as a data: URI, enlarged `zoom` times without smoothing, or reduced if it is very large."""
     picture = Image.fromarray(np.ascontiguousarray(image))
     picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
+    picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
     buffer = io.BytesIO()
     picture.save(buffer, format="JPEG", quality=quality, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
