@@ -1,6 +1,7 @@
 """Procedural colours for the synthetic scene: float32 images [rows, columns, 3] in [0, 1], made by numpy alone.
 
-Sizes are in texels. Details are a few texels wide on purpose: much finer than a Gaussian, coarse enough for a camera.
+Sizes are in texels. The palette is soft and the details are even on purpose: they are finer than a Gaussian but not
+finer than its texels, so that a short training shows what textures add.
 """
 
 from collections.abc import Sequence
@@ -111,7 +112,7 @@ def checks(rows: int, columns: int, first: np.ndarray, second: np.ndarray, *, te
 
 
 def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
-    """A column: oblique stripes whose frequency doubles upwards, between bands of keys."""
+    """A column: oblique stripes, wider and steeper in each of three drums, with bands of keys between them."""
     u, v = coordinates(rows, columns)
     frequency = np.select([v < 0.34, v < 0.67], [12, 9], 6)
     stripe = ((u * frequency + v * 9) % 1.0) < 0.5
@@ -127,9 +128,8 @@ def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.n
     row, column = np.indices((side, side))
     board = row // width
     shifted = column + (board * 577) % length
-    shade = rng.uniform(0, 1, (board.max() + 1, shifted.max() // length + 1)).astype(np.float32)[
-        board, shifted // length
-    ]
+    shades = rng.uniform(0, 1, (board.max() + 1, shifted.max() // length + 1)).astype(np.float32)
+    shade = shades[board, shifted // length]
     u, v = coordinates(side, side)
     grain = np.sin(2 * np.pi * (90 * v + 3 * shade + 1.2 * fractal_noise(rng, side, side, 6) + u))
     color = mix(WALNUT, OAK, np.clip(shade + 0.12 * grain, 0, 1))
