@@ -67,6 +67,10 @@ class PlainAppearance:
         return gaussian_cutoff(opacities)
 
 
+FEW = 16
+"""Up to so many rows are read and written one after the other, which is in place in a loop; more are gathered."""
+
+
 def gaussian_cutoff(peak: Array) -> Array:
     """r² = 2·ln(255·peak), where peak·exp(−r²/2) = 1/255; peaks that are not positive give a negative r²."""
     return 2 * jnp.log(jnp.maximum(255 * peak, 1e-6))
@@ -74,10 +78,10 @@ def gaussian_cutoff(peak: Array) -> Array:
 
 def add_at(total: Array, ids: Array, rows: Array) -> Array:
     """total [N, ...] with rows [R, ...] added at ids [R]; few rows one after the other, in place and in order."""
-    if ids.shape[0] > 16:
+    if ids.shape[0] > FEW:
         return total.at[ids].add(rows)
     for position in range(ids.shape[0]):
-        at = (ids[position],) + (0,) * (total.ndim - 1)
+        at = (ids[position],) + (jnp.zeros_like(ids[position]),) * (total.ndim - 1)
         old = jax.lax.dynamic_slice(total, at, (1, *total.shape[1:]))
         total = jax.lax.dynamic_update_slice(total, old + rows[position : position + 1], at)
     return total

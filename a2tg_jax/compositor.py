@@ -128,10 +128,10 @@ def _composite_tiles_bwd(how, residuals, cotangents):
             light, is_live, behind, d_rows = pull_back(rows, at, tiles, light, is_live, behind, g)
             return at + BLOCK, light, is_live, behind, _accumulate(rule, totals, block_ids, d_rows)
 
-        carry = (start, *_initial_light(how, splats.M.dtype), behind[index], totals)
+        carry = (start, *_initial_light(how, tiles), behind[index], totals)
         return jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)[-1]
 
-    packed, d_params, d_tap = jax.lax.fori_loop(0, how.num_groups, group, totals)
+    packed, d_params, d_tap = jax.lax.fori_loop(jnp.int32(0), jnp.int32(how.num_groups), group, totals)
     pieces = jnp.split(packed, np.cumsum(widths)[:-1], axis=1)
     d_splats = Splats(*(piece.reshape(leaf.shape) for piece, leaf in zip(pieces, splats, strict=True)))
     return d_splats, d_params, None, None, None, d_tap
@@ -156,16 +156,18 @@ def _forward(how: Compositing, splats: Splats, params, rule, lists: TileLists) -
             return at + BLOCK, light, is_live, channels + added
 
         pixels = how.grid.tile_size**2
-        carry = (start, *_initial_light(how, dtype), jnp.zeros((how.tile_batch, how.num_channels, pixels), dtype))
+        carry = (start, *_initial_light(how, tiles), jnp.zeros((how.tile_batch, how.num_channels, pixels), dtype))
         _, light, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)
         return channels, light
 
-    return jax.lax.map(group, jnp.arange(how.num_groups))
+    return jax.lax.map(group, jnp.arange(how.num_groups, dtype=jnp.int32))
 
 
-def _initial_light(how: Compositing, dtype) -> tuple[Array, Array]:
-    shape = (how.tile_batch, how.grid.tile_size**2)
-    return jnp.ones(shape, dtype), jnp.ones(shape, bool)
+def _initial_light(how: Compositing, tiles: _Tile) -> tuple[Array, Array]:
+    """Full transmittance [G, P], and which pixels are live: those of the border tiles outside the image never are."""
+    x, y = _pixels_of_tile(how.grid.tile_size, tiles.x.dtype)
+    is_inside = (tiles.x[:, None] + x < how.grid.width) & (tiles.y[:, None] + y < how.grid.height)
+    return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
 
 
 def _is_unfinished(ends: Array, carry) -> Array:
@@ -187,7 +189,7 @@ def _padded_ids(lists: TileLists) -> Array:
 
 
 def _tiles_of_group(how: Compositing, lists: TileLists, index: Array, dtype) -> tuple[_Tile, Array]:
-    tile = index * how.tile_batch + jnp.arange(how.tile_batch)
+    tile = index * how.tile_batch + jnp.arange(how.tile_batch, dtype=jnp.int32)
     size = how.grid.tile_size
     x = (tile % how.grid.columns).astype(dtype) * size + size / 2
     y = (tile // how.grid.columns).astype(dtype) * size + size / 2
@@ -201,7 +203,7 @@ def _block_ids(ids: Array, at: Array) -> Array:
     """[G, B] splats of the blocks that start at `at` [G]."""
     if at.shape[0] == 1:
         return jax.lax.dynamic_slice(ids, (at[0],), (BLOCK,))[None]
-    return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK)[None, :], ids.shape[0] - 1)]
+    return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK, dtype=jnp.int32)[None, :], ids.shape[0] - 1)]
 
 
 def _gather(splats: Splats, params, rule, ids: Array):
@@ -253,12 +255,14 @@ def _intersect(axes, mean, pixels, near_plane: float) -> _Hit:
     p0, p1, p2 = (per_pixel(planes[0][i]) * x + per_pixel(planes[1][i]) * y + per_pixel(planes[2][i]) for i in range(3))
     determinant = per_pixel(rows[2][0] * planes[2][0] + rows[2][1] * planes[2][1] + rows[2][2] * planes[2][2])
 
-    # Far out on a nearly parallel plane u² would overflow: there the divisor is held, with a finite gradient.
-    far = float(np.cbrt(np.finfo(p2.dtype).max))
+    # Far out on a nearly parallel plane u² would overflow, and 1/p₂² for the tiniest splats: there the divisor is
+    # held, with a finite gradient.
+    far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
     least = jnp.maximum(jnp.maximum(jnp.abs(p0), jnp.abs(p1)), jnp.abs(determinant)) / far
+    least = jnp.maximum(least, tiny)
     is_far = jnp.abs(p2) <= least
     is_parallel = p2 == 0
-    held = jax.lax.stop_gradient(jnp.where(p2 < 0, -1.0, 1.0) * jnp.where(least == 0, 1.0, least))
+    held = jax.lax.stop_gradient(jnp.where(p2 < 0, -1.0, 1.0) * least)
     inverse = 1 / jnp.where(is_far, held, p2)
     depth = determinant * inverse
     is_hit = ~is_parallel & (depth >= near_plane)
@@ -311,7 +315,7 @@ def _block(how: Compositing, rule, rows, at, tile: _Tile, light, is_live, log_ta
     a = per_pixel(splats.opacities) * rule.falloff(hit.rho)
     a = a if factor is None else a * factor
     a = a if log_tap is None else a * jnp.exp(log_tap)
-    in_list = (at + jnp.arange(BLOCK) < tile.end)[:, None]
+    in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     alpha = jnp.where((a >= MIN_ALPHA) & in_list, jnp.where(a < MAX_ALPHA, a, MAX_ALPHA), 0.0)
     weights, light, is_live = _weights(alpha, light, is_live)
     channels = [per_pixel(splats.colors[:, k]) for k in range(3)]

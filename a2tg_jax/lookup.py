@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import add_at, gaussian_cutoff
+from a2tg_jax.appearance import FEW, add_at, gaussian_cutoff
 from a2tg_jax.numerics import spread
 from a2tg_jax.texture import AtlasLayout, Textures
 
@@ -72,9 +72,11 @@ class TexturedAppearance:
 
     def rows(self, params: Array, ids: Array) -> TextureRows:
         offsets = self.offsets[ids]
-        windows = [jax.lax.dynamic_slice(params, (offset, 0), (self.window, 4)) for offset in offsets]
-        if len(windows) > 16:
-            return TextureRows(params[offsets[:, None] + jnp.arange(self.window)[None, :]], self.sizes[ids])
+        if ids.shape[0] > FEW:
+            places = offsets[:, None] + jnp.arange(self.window, dtype=jnp.int32)[None, :]
+            return TextureRows(params[places], self.sizes[ids])
+        starts = [(offset, jnp.zeros_like(offset)) for offset in offsets]
+        windows = [jax.lax.dynamic_slice(params, start, (self.window, 4)) for start in starts]
         return TextureRows(jnp.stack(windows), self.sizes[ids])
 
     def sample(self, rows: TextureRows, u: Array, v: Array):
@@ -98,11 +100,11 @@ class TexturedAppearance:
 
     def add_rows(self, total: Array, ids: Array, rows: TextureRows) -> Array:
         offsets = self.offsets[ids]
-        if ids.shape[0] > 16:
-            places = offsets[:, None] + jnp.arange(self.window)[None, :]
+        if ids.shape[0] > FEW:
+            places = offsets[:, None] + jnp.arange(self.window, dtype=jnp.int32)[None, :]
             return add_at(total, places.reshape(-1), rows.texels.reshape(-1, 4))
         for position in range(ids.shape[0]):
-            at = (offsets[position], 0)
+            at = (offsets[position], jnp.zeros_like(offsets[position]))
             old = jax.lax.dynamic_slice(total, at, (self.window, 4))
             total = jax.lax.dynamic_update_slice(total, old + rows.texels[position], at)
         return total

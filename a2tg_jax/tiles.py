@@ -56,7 +56,7 @@ class _Rectangles(NamedTuple):
 
 
 def _tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> _Rectangles:
-    limits = jnp.asarray([grid.width, grid.height])
+    limits = jnp.asarray([grid.width, grid.height], jnp.int32)
     as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
     first = jnp.clip(as_pixels(jnp.ceil(bounds.lower - 0.5)), 0, limits[None, :])
     last = jnp.minimum(as_pixels(jnp.floor(bounds.upper - 0.5)), limits[None, :] - 1)
