@@ -146,6 +146,7 @@ def test_world_and_camera_moved_together_show_the_same(x64, seed):
     rng = np.random.default_rng(seed)
     as_double = lambda x: jnp.asarray(x, jnp.float64)  # noqa: E731
     gaussians = jax.tree.map(as_double, some_gaussians(20, seed))
+    gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + 1.5)
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[2, 3] = Rotation.random(rng=rng).as_matrix(), 5
     camera = Camera(as_double(viewmat), as_double([[30, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
