@@ -14,7 +14,7 @@ WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 
 
 def configure_cpu(*, use_cache: bool = True) -> None:
-    """Makes JAX about twice as fast at this library's work on CPUs; call it once, before JAX computes anything.
+    """Makes JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
     Adds two flags to XLA_FLAGS, of which the user's own settings have precedence: while-loops are compiled whole
     (a tile's compositing is one), and vectors are 512 bits wide where the processor has AVX-512. A GPU is not affected.
