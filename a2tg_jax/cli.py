@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from a2tg_jax.config import DensifyConfig, TrainConfig
+from a2tg_jax.config import DensifyConfig, LearningRates, TextureConfig, TrainConfig
 from a2tg_jax.data import Scene, run_sfm
 from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import PHASES, Phase, RunFolder, check_free, create_run, open_run
@@ -27,7 +27,14 @@ from a2tg_jax.startup import configure_cpu
 
 PRESETS = {"paper": TrainConfig.paper, "quick": TrainConfig.quick}
 DEMO_SOURCE = SceneSource(SYNTHETIC)
-DEMO_CONFIG = TrainConfig(stage1_iterations=600, stage2_iterations=400, densify=DensifyConfig(cap=2_000))
+DEMO_CONFIG = TrainConfig(
+    stage1_iterations=400,
+    stage2_iterations=250,
+    densify=DensifyConfig(cap=1_500),
+    rates=LearningRates(texels=1e-2),
+    texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2)),
+)
+"""Few iterations, so textures grow early and learn fast."""
 
 OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 

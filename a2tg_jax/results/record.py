@@ -11,6 +11,8 @@ from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_co
 from a2tg_jax.results.folder import Phase, RunFolder, read_json, write_json
 
 SYNTHETIC = "synthetic"
+SYNTHETIC_SIZE = (208, 156)
+"""Small enough for two cores to train on in minutes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +33,8 @@ class SceneSource:
           FileNotFoundError, ValueError: as `load_scene` does.
         """
         if self.path == SYNTHETIC:
-            return synthetic_scene(downscale=self.downscale, test_every=self.test_every)
+            width, height = SYNTHETIC_SIZE
+            return synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=self.test_every)
         return load_scene(self.path, downscale=self.downscale, test_every=self.test_every)
 
 
