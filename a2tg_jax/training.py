@@ -73,7 +73,8 @@ def fit(
       scene: from `load_scene` or `synthetic_scene`.
       config: every number; `TrainConfig.paper()` and `TrainConfig.quick()` are presets.
       resume: a checkpoint of the same configuration to go on from.
-      on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage.
+      on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
+        iteration takes over the state's buffers, so save it there and then, or copy it.
       checkpoint_every: None: at the end of each stage only.
       progress: show a progress bar.
 
@@ -128,13 +129,13 @@ def fit_stage2(
     """
     _check(config)
     textures, layout = None, None
-    gaussians = jax.tree.map(jnp.array, gaussians)
     if config.texture.is_enabled:
         options = texture_options(config)
         textures, layout = allocate_textures(np.ones((gaussians.num, 2), np.int64), rgb=options.initial_rgb)
         _check_budget(config, gaussians.num)
     has_events = bool(upscale_iterations(config.texture, config.stage2_iterations))
-    state = initial_state(gaussians, gaussians.num, textures, has_events)
+    # Steps take over the buffers they are given: the caller keeps his own.
+    state = initial_state(jax.tree.map(jnp.array, gaussians), gaussians.num, textures, has_events)
     run = _Stage(scene, config, 2, state, layout, resume)
     run.train(on_checkpoint, checkpoint_every, progress)
     return run.result(stage1=gaussians if resume is None else None)
@@ -159,7 +160,8 @@ class _Stage:
         self.history, self.earlier_seconds = History.empty(), 0.0
         if resume is not None:
             _check_resume(resume, config, stage)
-            self.state, self.layout, self.history = resume.state, resume.layout, resume.history
+            self.state = jax.tree.map(jnp.array, resume.state)
+            self.layout, self.history = resume.layout, resume.history
             self.earlier_seconds = resume.history.last_seconds
         self.scene_scale = jnp.asarray(scene.scale, jnp.float32)
         self.key = jax.random.fold_in(jax.random.key(config.seed), stage)

@@ -75,6 +75,15 @@ def test_resumed_run_is_the_same(scene, trained, tmp_path, which):
     assert_same(resumed, result)
 
 
+def test_what_is_passed_in_stays_usable(scene, trained):
+    result, checkpoints, _ = trained
+    again = fit_stage2(scene, result.stage1, CONFIG, progress=False)
+    assert_same(again, result)
+    jax.tree.map(np.testing.assert_array_equal, again.stage1, result.stage1)
+    for _ in range(2):
+        assert_same(fit(scene, CONFIG, resume=checkpoints[-2], progress=False), result)
+
+
 def test_same_seed_same_result(scene, trained):
     assert_same(fit(scene, CONFIG, progress=False), trained[0])
 
