@@ -1,43 +1,53 @@
 """Appearance rules: what a splat shows at (u, v). The compositor is given one and knows nothing else about it.
 
-B splats of a block, P pixels of a tile; u and v are [B, P], in standard deviations of the splat. A rule holds its
-parameters, turns splat indices into the rows that a block needs, and samples those rows. It must be a pytree whose
-float leaves, `params`, are differentiable; what it knows besides (layouts, options) takes no part in differentiation.
+A rule has a table of parameters [T, C], and a few integers per splat, its row. At (u, v), in standard deviations, it
+says which entries of the table it reads (`lookup`), and what these make visible there (`shade`):
+
+    residual, factor = rule.shade(row, rule.params[rule.lookup(row, u, v)], u, v)
+
+`lookup`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They may use nothing of the
+rule but its static fields: everything else comes as an argument, and what is differentiated comes in `values`.
 """
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+Values = tuple[tuple[Array, ...], ...]
+"""For each index of a lookup the C numbers of that entry of the table."""
+
 
 class AppearanceRule(Protocol):
-    """What the compositor asks of a rule. `params` is any pytree of float arrays."""
+    """What the compositor asks of a rule, a pytree that is hashable but for its arrays."""
 
     @property
-    def params(self) -> Any:
-        """The differentiable parameters."""
+    def params(self) -> Array:
+        """[T, C] the differentiable parameters; T >= 1."""
         ...
 
-    def rows(self, params: Any, ids: Array) -> Any:
-        """What `sample` needs of the splats `ids` [B]: a pytree with leading axis B; floats are differentiated."""
+    @property
+    def rows(self) -> tuple[Array, ...]:
+        """[N] int32 each: what the rule keeps of every splat."""
         ...
 
-    def sample(self, rows: Any, u: Array, v: Array) -> tuple[tuple[Array, Array, Array] | None, Array | None]:
-        """Colour residuals (three [B, P]) and alpha factors [B, P] at (u, v); None stands for 0 and for 1."""
+    def lookup(self, row: tuple[Array, ...], u: Array, v: Array) -> tuple[Array, ...]:
+        """The entries of the table that are read at (u, v), int32; always equally many."""
+        ...
+
+    def shade(
+        self, row: tuple[Array, ...], values: Values, u: Array, v: Array
+    ) -> tuple[tuple[Array, Array, Array] | None, Array | None]:
+        """Colour residuals and the alpha factor at (u, v); None stands for 0 and for 1."""
         ...
 
     def falloff(self, rho: Array) -> Array:
-        """The kernel at squared distance rho [B, P]; exp(−rho/2) for a Gaussian."""
+        """The kernel at squared distance rho; exp(−rho/2) for a Gaussian."""
         ...
 
-    def add_rows(self, total: Any, ids: Array, rows: Any) -> Any:
-        """The transpose of `rows`: `total` (like `params`) with the cotangents of rows of `ids` [G·B] added."""
-        ...
-
-    def cutoff(self, params: Any, opacities: Array) -> Array:
+    def cutoff(self, opacities: Array) -> Array:
         """[N] squared distance rho beyond which the splat shows less than 1/255; not positive where it never does."""
         ...
 
@@ -48,40 +58,26 @@ class PlainAppearance:
     """Plain 2DGS: the splat's own colour, weighted by its Gaussian."""
 
     @property
-    def params(self) -> tuple[()]:
+    def params(self) -> Array:
+        return jnp.zeros((1, 0), jnp.float32)
+
+    @property
+    def rows(self) -> tuple[Array, ...]:
         return ()
 
-    def rows(self, params, ids):
+    def lookup(self, row, u, v):
         return ()
 
-    def sample(self, rows, u, v):
+    def shade(self, row, values, u, v):
         return None, None
 
     def falloff(self, rho: Array) -> Array:
         return jnp.exp(-0.5 * rho)
 
-    def add_rows(self, total, ids, rows):
-        return total
-
-    def cutoff(self, params, opacities: Array) -> Array:
+    def cutoff(self, opacities: Array) -> Array:
         return gaussian_cutoff(opacities)
-
-
-FEW = 16
-"""Up to so many rows are read and written one after the other, which is in place in a loop; more are gathered."""
 
 
 def gaussian_cutoff(peak: Array) -> Array:
     """r² = 2·ln(255·peak), where peak·exp(−r²/2) = 1/255; peaks that are not positive give a negative r²."""
     return 2 * jnp.log(jnp.maximum(255 * peak, 1e-6))
-
-
-def add_at(total: Array, ids: Array, rows: Array) -> Array:
-    """total [N, ...] with rows [R, ...] added at ids [R]; few rows one after the other, in place and in order."""
-    if ids.shape[0] > FEW:
-        return total.at[ids].add(rows)
-    for position in range(ids.shape[0]):
-        at = (ids[position],) + (jnp.zeros_like(ids[position]),) * (total.ndim - 1)
-        old = jax.lax.dynamic_slice(total, at, (1, *total.shape[1:]))
-        total = jax.lax.dynamic_update_slice(total, old + rows[position : position + 1], at)
-    return total

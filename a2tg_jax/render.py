@@ -7,7 +7,7 @@ settings, which `plan_render` fills in.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from a2tg_jax.cameras import Camera
 from a2tg_jax.compositor import Compositing, Splats, composite
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.geometry import ScreenBounds, homographies, screen_bounds
+from a2tg_jax.kernels import native
 from a2tg_jax.lookup import TextureOptions, textured_appearance
 from a2tg_jax.sh import sh_colors
 from a2tg_jax.texture import AtlasLayout, Textures
@@ -42,8 +43,10 @@ class RenderSettings:
     """How textures are read."""
     capacity: int | None = None
     """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
+    compositor: Literal["auto", "native", "xla"] = "auto"
+    """Native loops or XLA; "auto": native loops on CPUs where llvmlite is installed, XLA elsewhere."""
     tile_batch: int | None = None
-    """Tiles composited at once: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
+    """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
 
     @staticmethod
     def official() -> "RenderSettings":
@@ -141,12 +144,14 @@ def render_traced(
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, bounds = _project(gaussians, camera, rule, settings, degree, num_live)
     lists = tile_lists(bounds, jax.lax.stop_gradient(splats.M[:, 2, 2]), grid, settings.capacity or 0)
+    is_native = _is_native(settings)
     how = Compositing(
         grid=grid,
         near_plane=settings.near_plane,
         has_geometry=has_geometry,
         has_statistic=tap is not None,
-        tile_batch=min(_tile_batch(settings) or grid.num, grid.num),
+        tile_batch=1 if is_native else min(_tile_batch(settings) or grid.num, grid.num),
+        is_native=is_native,
     )
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
@@ -199,7 +204,7 @@ def appearance_of(
         return PlainAppearance()
     if layout.num != gaussians.num:
         raise ValueError(f"layout is of {layout.num} textures, but there are {gaussians.num} gaussians")
-    return textured_appearance(textures, layout, settings.texture, is_vectorised=_tile_batch(settings) != 1)
+    return textured_appearance(textures, layout, settings.texture)
 
 
 def pairs_of_view(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
@@ -217,7 +222,7 @@ def _jitted_count():
 
 def _count_pairs(gaussians, camera, rule, tile_size, near_plane):
     M, _ = homographies(gaussians, camera)
-    bounds = screen_bounds(M, rule.cutoff(rule.params, gaussians.opacities), near_plane)
+    bounds = screen_bounds(M, rule.cutoff(gaussians.opacities), near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 
 
@@ -244,6 +249,12 @@ def _primal_value(x):
     return x
 
 
+def _is_native(settings: RenderSettings) -> bool:
+    if settings.compositor == "native" and not native.is_available():
+        raise ValueError("compositor='native' needs JAX on the CPU and llvmlite: pip install llvmlite, or say 'auto'")
+    return settings.compositor != "xla" and native.is_available()
+
+
 def _tile_batch(settings: RenderSettings) -> int:
     if settings.tile_batch is None:
         return 1 if jax.default_backend() == "cpu" else BATCH_ON_ACCELERATOR
@@ -253,7 +264,7 @@ def _tile_batch(settings: RenderSettings) -> int:
 def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, ScreenBounds]:
     M, normals = homographies(gaussians, camera)
     opacities = gaussians.opacities
-    cutoff = rule.cutoff(rule.params, opacities)
+    cutoff = rule.cutoff(opacities)
     if num_live is not None:
         cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
     bounds = screen_bounds(*jax.lax.stop_gradient((M, cutoff)), settings.near_plane)

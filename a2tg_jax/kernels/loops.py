@@ -1,0 +1,508 @@
+"""Native loops over tiles, splats and pixels, around the functions of `pixel`.
+
+One call composites the tiles `first` to `last`. Every splat of a tile's list is prepared once (scalar code), then
+applied to the tile's pixels, L at a time (vector code). Where no pixel of the L can be reached, they are passed over.
+
+    forward(ids, starts, splats, rows, table, image; first, last, columns, width, height, entries)
+    backward(ids, starts, splats, rows, table, g, behind, jacobian, d_splats, d_table, d_tap; the same)
+
+Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), rows [N, I], table [entries, C],
+image [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], behind [tiles, P], jacobian [3, 3];
+d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to.
+"""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from llvmlite import ir
+
+from a2tg_jax import pixel
+from a2tg_jax.kernels import library
+from a2tg_jax.kernels.lanes import BOOL, INT, Lanes, scalar_type, trace
+
+LONG = ir.IntType(64)
+POINTER = ir.PointerType()
+INTEGERS = ("first", "last", "columns", "width", "height", "entries")
+FORWARD = ("ids", "starts", "splats", "rows", "table", "image")
+BACKWARD = ("ids", "starts", "splats", "rows", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap")
+CUTOFF_SLACK = 1e-3
+"""Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """What a pair of loops is made for; hashable."""
+
+    rule: Any
+    """The tree structure of an appearance rule: its class and static fields."""
+    num_rows: int
+    """Integers that the rule keeps of a splat."""
+    num_columns: int
+    """C, numbers in an entry of its table."""
+    dtype: Any
+    tile_size: int
+    near_plane: float
+    has_geometry: bool
+    has_statistic: bool
+
+    @property
+    def num_channels(self) -> int:
+        return 8 if self.has_geometry else 3
+
+    @property
+    def num_floats(self) -> int:
+        """S: the 9 entries of M, opacity, colour (, normal), and the squared distance beyond which nothing shows."""
+        return 17 if self.has_geometry else 14
+
+    @property
+    def lanes(self) -> int:
+        """L."""
+        return library.vector_bytes() // np.dtype(self.dtype).itemsize
+
+    @property
+    def num_vectors(self) -> int:
+        """Vectors of L pixels in a tile, the last one perhaps not full."""
+        return -(-(self.tile_size**2) // self.lanes)
+
+
+class _Functions:
+    """The jaxprs of one kind."""
+
+    def __init__(self, kind: Kind):
+        rule = jax.tree.unflatten(kind.rule, [None] * kind.rule.num_leaves)
+        number = jax.ShapeDtypeStruct((), kind.dtype)
+        integer, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), jnp.bool_)
+        triple, near_plane = (number,) * 3, kind.near_plane
+        splat = pixel.Splat((triple,) * 3, number, triple, triple if kind.has_geometry else None)
+        row = (integer,) * kind.num_rows
+
+        self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
+        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
+        self.num_planes = structure.num_leaves
+
+        def rho_and_entries(planes, row, x, y):
+            hit = pixel.intersect(planes, x, y, near_plane)
+            return hit.rho, rule.lookup(row, hit.u, hit.v)
+
+        self.reach, structure = trace(rho_and_entries, planes, row, number, number)
+        self.num_taps = structure.num_leaves - 1
+        values = ((number,) * kind.num_columns,) * self.num_taps
+
+        def show(planes, splat, row, values, x, y, log_tap=None):
+            return pixel.show(rule, splat, pixel.intersect(planes, x, y, near_plane), row, values, log_tap)
+
+        def forward(planes, splat, row, values, x, y, light, is_live, channels):
+            shown = show(planes, splat, row, values, x, y)
+            weight, light, is_live = pixel.absorb(shown.alpha, light, is_live)
+            added = tuple(total + weight * channel for total, channel in zip(channels, shown.channels, strict=True))
+            return light, is_live, added
+
+        def backward(planes, splat, row, values, x, y, tile_x, tile_y, light, is_live, behind, g, jacobian):
+            log_tap = jnp.zeros((), kind.dtype) if kind.has_statistic else None
+            floats = (planes, splat.opacity, splat.color, splat.normal, values, log_tap)
+
+            def of_floats(planes, opacity, color, normal, values, log_tap):
+                return show(planes, pixel.Splat(splat.M, opacity, color, normal), row, values, x, y, log_tap)
+
+            shown, pull_back = jax.vjp(of_floats, *floats)
+            seen = sum(g[k] * channel for k, channel in enumerate(shown.channels))
+            weight, light, is_live, behind, d_alpha = pixel.absorb_vjp(shown.alpha, light, is_live, behind, seen)
+            *d_floats, d_values, d_log = pull_back(pixel.Shown(d_alpha, tuple(weight * g_k for g_k in g)))
+            tap = ()
+            if kind.has_statistic:
+                tap = pixel.absolute_gradient(splat.M, x, y, tile_x, tile_y, d_log, jacobian, near_plane)
+            return (light, is_live, behind), weight > 0, d_values, (*d_floats, tap)
+
+        def prepare_vjp(M, x, y, d_planes):
+            return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+
+        channels = (number,) * kind.num_channels
+        self.forward, _ = trace(forward, planes, splat, row, values, number, number, number, flag, channels)
+        at_pixel = planes, splat, row, values, number, number, number, number, number, flag, number, channels
+        self.backward, _ = trace(backward, *at_pixel, (triple,) * 3)
+        self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
+
+
+class _Emitter:
+    """Writes one function of a module."""
+
+    def __init__(self, kind: Kind, functions: _Functions, module: ir.Module, name: str, buffers: Sequence[str]):
+        self.kind, self.functions = kind, functions
+        types = [POINTER] * len(buffers) + [INT] * len(INTEGERS)
+        function = ir.Function(module, ir.FunctionType(ir.VoidType(), types), name)
+        for argument in function.args[: len(buffers)]:
+            argument.add_attribute("noalias")
+        self.arguments = dict(zip((*buffers, *INTEGERS), function.args, strict=True))
+        self.b = ir.IRBuilder(function.append_basic_block("entry"))
+        self.lanes, self.scalars = Lanes(self.b, kind.lanes), Lanes(self.b, 1)
+        self.real = scalar_type(kind.dtype)
+        self.reals = self.lanes.vector(self.real)
+        self.integers = self.lanes.vector(INT)
+        pixels = np.zeros((2, kind.num_vectors * kind.lanes))
+        pixels[:, : kind.tile_size**2] = np.mgrid[: kind.tile_size, : kind.tile_size].reshape(2, -1)
+        pixels[:, : kind.tile_size**2] -= (kind.tile_size - 1) / 2
+        # Lanes past the last pixel lie outside of every image.
+        pixels[:, kind.tile_size**2 :] = 1e9
+        self.pixel_y, self.pixel_x = (self._table(f"{name}.{k}", row) for k, row in zip("yx", pixels, strict=True))
+
+    def _table(self, name: str, numbers) -> ir.Value:
+        array = ir.Constant(ir.ArrayType(self.real, len(numbers)), [float(number) for number in numbers])
+        table = ir.GlobalVariable(self.b.module, array.type, name)
+        table.initializer, table.global_constant, table.align = array, True, library.vector_bytes()
+        table.type = POINTER
+        return table
+
+    # Memory.
+
+    def variable(self, type_: ir.Type, count: int = 1) -> ir.Value:
+        """Room for `count` values on the stack."""
+        with self.b.goto_entry_block():
+            room = self.b.alloca(type_, count)
+            room.align, room.type = library.vector_bytes(), POINTER
+        return room
+
+    def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:
+        """The address of entry `index` of an array."""
+        return self.b.gep(base, [index], source_etype=type_)
+
+    def load(self, base: ir.Value, index, type_: ir.Type) -> ir.Value:
+        """Entry `index` of an array, of any alignment."""
+        index = LONG(index) if isinstance(index, int) else index
+        alignment = 4 if type_ == INT else np.dtype(self.kind.dtype).itemsize
+        return self.b.load(self.at(base, index, type_), align=alignment, typ=type_)
+
+    def store(self, value: ir.Value, base: ir.Value, index) -> None:
+        index = LONG(index) if isinstance(index, int) else index
+        self.b.store(value, self.at(base, index, value.type), align=np.dtype(self.kind.dtype).itemsize)
+
+    def long(self, value: ir.Value) -> ir.Value:
+        return self.b.sext(value, LONG)
+
+    def times(self, value: ir.Value, factor: int) -> ir.Value:
+        return self.b.mul(value, LONG(factor))
+
+    @contextlib.contextmanager
+    def loop(self, first: ir.Value, last: ir.Value) -> Iterator[tuple[ir.Value, ir.Block]]:
+        """for index in range(first, last), 64-bit; yields the index and the block that `break` branches to."""
+        counter = self.variable(LONG)
+        self.b.store(first, counter)
+        test, body = self.b.append_basic_block("test"), self.b.append_basic_block("body")
+        after = self.b.append_basic_block("after")
+        self.b.branch(test)
+        self.b.position_at_end(test)
+        index = self.b.load(counter, typ=LONG)
+        self.b.cbranch(self.b.icmp_signed("<", index, last), body, after)
+        self.b.position_at_end(body)
+        yield index, after
+        self.b.store(self.b.add(index, LONG(1)), counter)
+        self.b.branch(test)
+        self.b.position_at_end(after)
+
+    # What both passes share.
+
+    def all_tiles(self, composite_tile) -> None:
+        """Calls composite_tile(tile, tile_x, tile_y) in a loop, and ends the function."""
+        kind, b, given = self.kind, self.b, self.arguments
+        with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
+            columns = self.long(given["columns"])
+            place = b.srem(tile, columns), b.sdiv(tile, columns)
+            center = [
+                b.fadd(b.fmul(b.sitofp(index, self.real), self.real(kind.tile_size)), self.real(kind.tile_size / 2))
+                for index in place
+            ]
+            composite_tile(tile, *center)
+        b.ret_void()
+
+    def all_splats(self, tile: ir.Value, each_splat) -> None:
+        """Calls each_splat(id) for the tile's list, front to back, until it returns that no pixel is live."""
+        starts, b = self.arguments["starts"], self.b
+        first, last = (self.long(self.load(starts, b.add(tile, LONG(k)), INT)) for k in (0, 1))
+        with self.loop(first, last) as (position, done):
+            is_live = each_splat(self.long(self.load(self.arguments["ids"], position, INT)))
+            going_on = b.append_basic_block("on")
+            b.cbranch(is_live, going_on, done)
+            b.position_at_end(going_on)
+
+    def all_vectors(self):
+        return self.loop(LONG(0), LONG(self.kind.num_vectors))
+
+    def live_at_first(self, index: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> ir.Value:
+        """Which pixels of a vector lie inside the image, as 0 and 1."""
+        b, inside = self.b, []
+        for table, center, size in ((self.pixel_x, tile_x, "width"), (self.pixel_y, tile_y, "height")):
+            at = b.fadd(self.load(table, index, self.reals), self.lanes.splat(center))
+            limit = self.lanes.splat(b.sitofp(self.arguments[size], self.real))
+            inside.append(b.fcmp_ordered("<", at, limit))
+        return b.zext(b.and_(*inside), self.integers)
+
+    def splat_numbers(self, id_: ir.Value) -> list[ir.Value]:
+        base = self.at(self.arguments["splats"], self.times(id_, self.kind.num_floats), self.real)
+        return [self.load(base, k, self.real) for k in range(self.kind.num_floats)]
+
+    def row_numbers(self, id_: ir.Value) -> list[ir.Value]:
+        base = self.at(self.arguments["rows"], self.times(id_, self.kind.num_rows), INT)
+        return [self.load(base, k, INT) for k in range(self.kind.num_rows)]
+
+    def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
+        return [self.lanes.splat(number) for number in numbers]
+
+    def entry_bases(self, taps: Sequence[ir.Value]) -> list[list[ir.Value]]:
+        """For every tap and lane the address of the table's entry, kept inside the table whatever the lane holds."""
+        b, lanes = self.b, self.lanes
+        most = lanes.splat(b.sub(self.arguments["entries"], INT(1)))
+        bases = []
+        for tap in taps:
+            tap = lanes._most(lanes._least(tap, most), lanes.constant(0, INT))
+            ids = [self.long(b.extract_element(tap, INT(k))) for k in range(lanes.width)]
+            bases.append([self.times(id_, self.kind.num_columns) for id_ in ids])
+        return bases
+
+    def gather(self, bases: Sequence[Sequence[ir.Value]]) -> list[ir.Value]:
+        """C vectors for every tap."""
+        entry = ir.VectorType(self.real, self.kind.num_columns)
+        gathered: list[ir.Value] = []
+        for lanes in bases:
+            entries = [self.load(self.at(self.arguments["table"], base, self.real), 0, entry) for base in lanes]
+            gathered += self.transpose(entries)
+        return gathered
+
+    def transpose(self, entries: Sequence[ir.Value]) -> list[ir.Value]:
+        """L vectors of C as C vectors of L."""
+        b, width = self.b, self.lanes.width
+        if self.kind.num_columns != 4 or width % 4:
+            columns = []
+            for k in range(self.kind.num_columns):
+                column = ir.Constant(self.reals, ir.Undefined)
+                for lane, entry in enumerate(entries):
+                    column = b.insert_element(column, b.extract_element(entry, INT(k)), INT(lane))
+                columns.append(column)
+            return columns
+        quarters = [self.concatenate(entries[k::4]) for k in range(4)]
+        low01, low23 = (self.shuffle(quarters[k], quarters[k + 1], (0, "0", 1, "1")) for k in (0, 2))
+        high01, high23 = (self.shuffle(quarters[k], quarters[k + 1], (2, "2", 3, "3")) for k in (0, 2))
+        first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
+        return [
+            self.shuffle(low01, low23, first),
+            self.shuffle(low01, low23, second),
+            self.shuffle(high01, high23, first),
+            self.shuffle(high01, high23, second),
+        ]
+
+    def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
+        """The pattern in every four lanes; numbers are lanes of x, strings of y."""
+        width = self.lanes.width
+        mask = [
+            quarter + (width + int(lane) if isinstance(lane, str) else lane)
+            for quarter in range(0, width, 4)
+            for lane in pattern
+        ]
+        return self.b.shuffle_vector(x, y, ir.Constant(ir.VectorType(INT, width), mask))
+
+    def concatenate(self, pieces: Sequence[ir.Value]) -> ir.Value:
+        pieces = list(pieces)
+        while len(pieces) > 1:
+            count = pieces[0].type.count * 2
+            mask = ir.Constant(ir.VectorType(INT, count), list(range(count)))
+            pieces = [self.b.shuffle_vector(*pieces[k : k + 2], mask) for k in range(0, len(pieces), 2)]
+        return pieces[0]
+
+
+class _Forward(_Emitter):
+    """Channels and transmittance of the tiles."""
+
+    def write(self) -> None:
+        kind, b = self.kind, self.b
+        light = self.variable(self.reals, kind.num_vectors)
+        live = self.variable(self.integers, kind.num_vectors)
+        channels = [self.variable(self.reals, kind.num_vectors) for _ in range(kind.num_channels)]
+
+        def tile(tile, tile_x, tile_y):
+            with self.all_vectors() as (k, _):
+                self.store(self.lanes.constant(1.0, self.real), light, k)
+                self.store(self.live_at_first(k, tile_x, tile_y), live, k)
+                for channel in channels:
+                    self.store(self.lanes.constant(0.0, self.real), channel, k)
+            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, light, live, channels))
+            self.write_tile(tile, [*channels, light])
+
+        self.all_tiles(tile)
+
+    def splat(self, tile_x, tile_y, light, live, channels, id_) -> ir.Value:
+        """Adds one splat to a tile; returns whether a pixel is still live."""
+        b, lanes, functions = self.b, self.lanes, self.functions
+        *numbers, cutoff = self.splat_numbers(id_)
+        planes = self.spread(self.scalars.emit(functions.prepare, [*numbers[:9], tile_x, tile_y]))
+        splat, row = self.spread(numbers), self.spread(self.row_numbers(id_))
+        limit = lanes.splat(b.fadd(cutoff, self.real(CUTOFF_SLACK)))
+        any_live = self.variable(self.integers)
+        b.store(lanes.constant(0, INT), any_live)
+        with self.all_vectors() as (k, _):
+            x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
+            rho, *taps = lanes.emit(functions.reach, [*planes, *row, x, y])
+            state = self.load(live, k, self.integers)
+            is_live = b.icmp_signed("!=", state, lanes.constant(0, INT))
+            is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, limit))
+            with b.if_then(lanes.any(is_reached)):
+                values = self.gather(self.entry_bases(taps))
+                before = [self.load(light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
+                after, still_live, *totals = lanes.emit(functions.forward, [*planes, *splat, *row, *values, x, y, *before])
+                self.store(after, light, k)
+                self.store(b.zext(still_live, self.integers), live, k)
+                for total, channel in zip(totals, channels, strict=True):
+                    self.store(total, channel, k)
+            now = self.load(live, k, self.integers)
+            b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
+        return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), lanes.constant(0, INT)))
+
+    def write_tile(self, tile: ir.Value, arrays: Sequence[ir.Value]) -> None:
+        num_pixels = self.kind.tile_size**2
+        base = self.at(self.arguments["image"], self.times(tile, num_pixels * len(arrays)), self.real)
+        for index, array in enumerate(arrays):
+            with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
+                self.store(self.load(array, k, self.real), base, self.b.add(k, LONG(index * num_pixels)))
+
+
+class _Backward(_Emitter):
+    """Cotangents of the splats, of the table, and the absolute gradient."""
+
+    def write(self) -> None:
+        kind = self.kind
+        light, behind = (self.variable(self.reals, kind.num_vectors) for _ in range(2))
+        live = self.variable(self.integers, kind.num_vectors)
+        g = [self.variable(self.reals, kind.num_vectors) for _ in range(kind.num_channels)]
+
+        def tile(tile, tile_x, tile_y):
+            with self.all_vectors() as (k, _):
+                self.store(self.lanes.constant(1.0, self.real), light, k)
+                self.store(self.live_at_first(k, tile_x, tile_y), live, k)
+            self.read_tile(tile, [behind], self.arguments["behind"])
+            self.read_tile(tile, g, self.arguments["g"])
+            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, light, live, behind, g))
+
+        self.all_tiles(tile)
+
+    def read_tile(self, tile: ir.Value, arrays: Sequence[ir.Value], source: ir.Value) -> None:
+        num_pixels = self.kind.tile_size**2
+        base = self.at(source, self.times(tile, num_pixels * len(arrays)), self.real)
+        for index, array in enumerate(arrays):
+            with self.loop(LONG(num_pixels), LONG(self.kind.num_vectors * self.kind.lanes)) as (k, _):
+                self.store(self.real(0.0), array, k)
+            with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
+                self.store(self.load(base, self.b.add(k, LONG(index * num_pixels)), self.real), array, k)
+
+    def splat(self, tile_x, tile_y, light, live, behind, g, id_) -> ir.Value:
+        """Adds the cotangents of one splat in a tile; returns whether a pixel is still live."""
+        b, lanes, functions, kind = self.b, self.lanes, self.functions, self.kind
+        *numbers, cutoff = self.splat_numbers(id_)
+        planes = self.spread(self.scalars.emit(functions.prepare, [*numbers[:9], tile_x, tile_y]))
+        splat, row = self.spread(numbers), self.spread(self.row_numbers(id_))
+        tile_center = self.spread([tile_x, tile_y])
+        jacobian = self.spread([self.load(self.arguments["jacobian"], k, self.real) for k in range(9)])
+        limit = lanes.splat(b.fadd(cutoff, self.real(CUTOFF_SLACK)))
+        any_live, any_reached = self.variable(self.integers), self.variable(BOOL)
+        b.store(lanes.constant(0, INT), any_live)
+        b.store(BOOL(0), any_reached)
+        num_sums = functions.num_planes + (len(numbers) - 9) + (4 if kind.has_statistic else 0)
+        totals = [self.variable(self.reals) for _ in range(num_sums)]
+        zero = lanes.constant(0.0, self.real)
+        for total in totals:
+            b.store(zero, total)
+        with self.all_vectors() as (k, _):
+            x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
+            rho, *taps = lanes.emit(functions.reach, [*planes, *row, x, y])
+            is_live = b.icmp_signed("!=", self.load(live, k, self.integers), lanes.constant(0, INT))
+            is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, limit))
+            with b.if_then(lanes.any(is_reached)):
+                bases = self.entry_bases(taps)
+                values = self.gather(bases)
+                before = [self.load(light, k, self.reals), is_live, self.load(behind, k, self.reals)]
+                cotangents = [self.load(channel, k, self.reals) for channel in g]
+                at_pixel = [*planes, *splat, *row, *values, x, y, *tile_center, *before, *cotangents, *jacobian]
+                after, still_live, left, contributes, *rest = lanes.emit(functions.backward, at_pixel)
+                self.store(after, light, k)
+                self.store(b.zext(still_live, self.integers), live, k)
+                self.store(left, behind, k)
+                d_values, sums = rest[: len(values)], rest[len(values) :]
+                if kind.has_statistic:
+                    sums.append(lanes.constant(1.0, self.real))
+                with b.if_then(lanes.any(contributes)):
+                    b.store(BOOL(1), any_reached)
+                    for total, value in zip(totals, sums, strict=True):
+                        # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
+                        value = b.select(contributes, value, zero)
+                        b.store(b.fadd(b.load(total, typ=self.reals), value), total)
+                    self.scatter(contributes, bases, d_values)
+            now = self.load(live, k, self.integers)
+            b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
+        with b.if_then(b.load(any_reached, typ=BOOL)):
+            self.add_totals(id_, numbers, tile_x, tile_y, totals)
+        return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), lanes.constant(0, INT)))
+
+    def add_totals(self, id_, numbers, tile_x, tile_y, totals) -> None:
+        """Sums over lanes, carried from the planes to the homography, added to the splat's rows of the results."""
+        kind, functions = self.kind, self.functions
+        sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
+        d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
+        d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], tile_x, tile_y, *d_planes])
+        num_others = len(numbers) - 9
+        self.add("d_splats", self.times(id_, kind.num_floats), [*d_M, *others[:num_others]])
+        if kind.has_statistic:
+            self.add("d_tap", self.times(id_, 4), others[num_others:])
+
+    def add(self, name: str, start: ir.Value, values: Sequence[ir.Value]) -> None:
+        base = self.at(self.arguments[name], start, self.real)
+        for k, value in enumerate(values):
+            self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
+
+    def scatter(self, contributes: ir.Value, bases, d_values: Sequence[ir.Value]) -> None:
+        """Adds the cotangents of what was gathered, lane after lane, in order."""
+        if not bases:
+            return
+        b, lanes, columns = self.b, self.lanes, self.kind.num_columns
+        offsets = [self.variable(LONG, lanes.width) for _ in bases]
+        for room, lane_bases in zip(offsets, bases, strict=True):
+            for lane, base in enumerate(lane_bases):
+                b.store(base, self.at(room, LONG(lane), LONG))
+        rooms = [self.variable(self.reals) for _ in d_values]
+        for room, value in zip(rooms, d_values, strict=True):
+            b.store(value, room)
+        bits = b.zext(lanes.bits(contributes), LONG)
+        with self.loop(LONG(0), LONG(lanes.width)) as (lane, _):
+            is_set = b.trunc(b.lshr(bits, lane), BOOL)
+            with b.if_then(is_set):
+                for tap, room in enumerate(offsets):
+                    target = self.at(self.arguments["d_table"], b.load(self.at(room, lane, LONG), typ=LONG), self.real)
+                    for column in range(columns):
+                        value = self.load(rooms[tap * columns + column], lane, self.real)
+                        self.store(b.fadd(self.load(target, column, self.real), value), target, column)
+
+
+@dataclasses.dataclass(frozen=True)
+class Loops:
+    """Compiled loops; each releases the GIL."""
+
+    forward: Any
+    backward: Any
+
+
+@functools.cache
+def loops(kind: Kind) -> Loops:
+    """The loops of a kind, compiled at the first call."""
+    with jax.ensure_compile_time_eval():
+        functions = _Functions(kind)
+    module = ir.Module("loops")
+    tag = f"{abs(hash(kind)):x}"
+    forward, backward = f"forward_{tag}", f"backward_{tag}"
+    _Forward(kind, functions, module, forward, FORWARD).write()
+    _Backward(kind, functions, module, backward, BACKWARD).write()
+    addresses = library.compile_module(module)
+    return Loops(
+        forward=library.as_function(addresses[forward], len(FORWARD), len(INTEGERS)),
+        backward=library.as_function(addresses[backward], len(BACKWARD), len(INTEGERS)),
+    )

@@ -1,0 +1,168 @@
+"""Compositing by native loops on CPUs: what `compositor` does with XLA, faster, on all cores.
+
+Tiles are dealt to threads in contiguous parts of about as many pairs each. Every thread adds to cotangents of its own,
+which are summed in order: results do not depend on timing, only, in the last bits, on the number of threads.
+"""
+
+import concurrent.futures
+import functools
+import hashlib
+import os
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.kernels import foreign
+
+PAIRS_PER_THREAD = 2_000
+"""Fewer pairs than this are not worth another thread."""
+
+
+@functools.cache
+def is_available() -> bool:
+    """Whether native loops can be made here: XLA runs on the CPU, and llvmlite is installed."""
+    if jax.default_backend() != "cpu":
+        return False
+    try:
+        import llvmlite  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def num_threads() -> int:
+    """The cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache
+def _pool() -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(num_threads(), thread_name_prefix="a2tg")
+
+
+def _kind(how, splats, rule):
+    from a2tg_jax.kernels.loops import Kind
+
+    return Kind(
+        rule=jax.tree.structure(rule),
+        num_rows=len(rule.rows),
+        num_columns=rule.params.shape[1],
+        dtype=np.dtype(splats.M.dtype).name,
+        tile_size=how.grid.tile_size,
+        near_plane=how.near_plane,
+        has_geometry=how.has_geometry,
+        has_statistic=how.has_statistic,
+    )
+
+
+def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
+    """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
+    kind = _kind(how, splats, rule)
+    name = _registered(kind, "forward", _forward_handler)
+    shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.tile_size**2), splats.M.dtype)
+    call = jax.ffi.ffi_call(name, shape, vmap_method="sequential")
+    image = call(*_inputs(kind, how, splats, params, rule, lists))[:, None]
+    return image[:, :, :-1], image[:, :, -1]
+
+
+def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: Array, behind: Array):
+    """As `compositor._backward`."""
+    kind = _kind(how, splats, rule)
+    name = _registered(kind, "backward", _backward_handler)
+    dtype, num = splats.M.dtype, splats.M.shape[0]
+    shapes = (
+        jax.ShapeDtypeStruct((num, kind.num_floats), dtype),
+        jax.ShapeDtypeStruct(params.shape, params.dtype),
+        jax.ShapeDtypeStruct(tap.shape if kind.has_statistic else (1, 4), dtype),
+    )
+    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
+    packed, d_params, d_tap = call(*_inputs(kind, how, splats, params, rule, lists), g, behind, jacobian.astype(dtype))
+    d_splats = type(splats)(
+        M=packed[:, :9].reshape(splats.M.shape),
+        opacities=packed[:, 9],
+        colors=packed[:, 10:13],
+        normals=packed[:, 13:16] if kind.has_geometry else jnp.zeros_like(splats.normals),
+    )
+    return d_splats, d_params, d_tap if kind.has_statistic else jnp.zeros_like(tap)
+
+
+def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
+    """ids, starts, splats, rows, table, and (columns, width, height)."""
+    cutoff = rule.cutoff(splats.opacities)[:, None]
+    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
+    packed = jnp.concatenate([*columns, *([splats.normals] if kind.has_geometry else []), cutoff], axis=1)
+    rows = jnp.stack(rule.rows, axis=1) if rule.rows else jnp.zeros((1, 0), jnp.int32)
+    grid = how.grid
+    return (
+        lists.ids, lists.starts, packed, rows, params,
+        jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32),
+    )  # fmt: skip
+
+
+def _registered(kind, which: str, make_handler: Callable) -> str:
+    """The name under which XLA knows the loops of a kind; the same in every process, for its compilation cache."""
+    from a2tg_jax.kernels.loops import loops
+
+    name = f"a2tg_{which}_{hashlib.sha256(repr(kind).encode()).hexdigest()[:16]}"
+    foreign.register(name, make_handler(getattr(loops(kind), which)))
+    return name
+
+
+def _forward_handler(run: Callable) -> foreign.Handler:
+    def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+        *inputs, size = arguments
+        starts, table = inputs[1], inputs[4]
+        pointers = [array.ctypes.data for array in (*inputs, results[0])]
+
+        def part(first: int, last: int, _: int) -> None:
+            run(*pointers, first, last, *map(int, size), len(table))
+
+        _in_parts(part, starts)
+
+    return handler
+
+
+def _backward_handler(run: Callable) -> foreign.Handler:
+    def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+        *inputs, size, g, behind, jacobian = arguments
+        starts, table = inputs[1], inputs[4]
+        parts = _parts(starts)
+        totals = [results, *([np.zeros_like(result) for result in results] for _ in parts[1:])]
+        for result in results:
+            result[...] = 0
+        given = [array.ctypes.data for array in (*inputs, g, behind, jacobian)]
+
+        def part(first: int, last: int, index: int) -> None:
+            outputs = [total.ctypes.data for total in totals[index]]
+            run(*given, *outputs, first, last, *map(int, size), len(table))
+
+        _in_parts(part, starts)
+        for more in totals[1:]:
+            for result, addend in zip(results, more, strict=True):
+                result += addend
+
+    return handler
+
+
+def _parts(starts: np.ndarray) -> list[tuple[int, int]]:
+    """Ranges of tiles with about as many pairs (and tiles) each, one per thread that is worth starting."""
+    num_tiles, num_pairs = len(starts) - 1, int(starts[-1])
+    count = max(1, min(num_threads(), num_pairs // PAIRS_PER_THREAD))
+    work = starts.astype(np.int64) + np.arange(num_tiles + 1)
+    borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
+    borders = [0, *borders, num_tiles]
+    return list(zip(borders[:-1], borders[1:], strict=True))
+
+
+def _in_parts(part: Callable[[int, int, int], None], starts: np.ndarray) -> None:
+    """part(first tile, last tile, index) for every part, each on a thread of its own."""
+    parts = _parts(starts)
+    others = [_pool().submit(part, *span, index) for index, span in enumerate(parts) if index > 0]
+    part(*parts[0], 0)
+    for other in others:
+        other.result()

@@ -1,0 +1,188 @@
+"""One splat at one pixel: where the ray meets it, what it shows there, how light passes it.
+
+Every function here is element-wise: it takes scalars, or arrays that broadcast. It is the one definition of what is
+rendered; `compositor` runs it over arrays, `kernels` compiles it into loops, and both differentiate it by `jax.vjp`.
+
+M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of a splat, g the cotangent of the channels.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import AppearanceRule
+
+MIN_ALPHA = 1 / 255
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
+
+Triple = tuple[Array, Array, Array]
+
+
+class Splat(NamedTuple):
+    """What is differentiated of a splat besides its appearance."""
+
+    M: tuple[Triple, Triple, Triple]
+    """Rows of the homography from (u, v, 1) to pixels."""
+    opacity: Array
+    color: Triple
+    normal: Triple | None
+    """In the world, facing the camera; None where only colour is composited."""
+
+
+class Planes(NamedTuple):
+    """A splat seen from a tile: p = k × l is linear in the pixel (x, y), counted from the tile's centre."""
+
+    p0: Triple
+    """Coefficients of x, y and 1."""
+    p1: Triple
+    p2: Triple
+    determinant: Array
+    center_x: Array
+    """The projected mean."""
+    center_y: Array
+    depth: Array
+    """Of the mean."""
+
+
+class Hit(NamedTuple):
+    """Where the ray of a pixel meets a splat."""
+
+    u: Array
+    """In standard deviations; (0, 0) without a hit."""
+    v: Array
+    rho: Array
+    """min(u² + v², 2·|(x, y) − c|²), the squared distance that the falloff sees."""
+    depth: Array
+
+
+class Shown(NamedTuple):
+    """What a splat shows at a pixel."""
+
+    alpha: Array
+    channels: tuple[Array, ...]
+    """Red, green, blue; and depth, depth², normal x, y, z where the splat has a normal."""
+
+
+def _cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def planes_of(M: tuple[Triple, Triple, Triple], x: Array, y: Array) -> Planes:
+    """The planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1)."""
+    last = M[2]
+    # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
+    first = (M[0][0] - x * last[0], M[0][1] - x * last[1], M[0][2] - x * last[2])
+    second = (M[1][0] - y * last[0], M[1][1] - y * last[1], M[1][2] - y * last[2])
+    a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
+    return Planes(
+        p0=(a[0], b[0], c[0]),
+        p1=(a[1], b[1], c[1]),
+        p2=(a[2], b[2], c[2]),
+        determinant=last[0] * c[0] + last[1] * c[1] + last[2] * c[2],
+        center_x=first[2] / last[2],
+        center_y=second[2] / last[2],
+        depth=last[2],
+    )
+
+
+def intersect(planes: Planes, x: Array, y: Array, near_plane: float) -> Hit:
+    """The hit of a pixel's ray, or the low-pass filter where that is nearer (2DGS, equations 10 and 11).
+
+    The point is (p₀, p₁)/p₂ and its depth det(M)/p₂; depths below `near_plane` are no hit.
+    """
+    p0, p1, p2 = (plane[0] * x + plane[1] * y + plane[2] for plane in planes[:3])
+    # Far out on a nearly parallel plane u² would overflow, and 1/p₂² for the tiniest splats: there the divisor is
+    # held, with a finite gradient.
+    far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
+    least = jnp.maximum(jnp.maximum(jnp.abs(p0), jnp.abs(p1)), jnp.abs(planes.determinant)) / far
+    least = jnp.maximum(least, tiny)
+    is_far = jnp.abs(p2) <= least
+    is_parallel = p2 == 0
+    held = jax.lax.stop_gradient(jnp.where(p2 < 0, -1.0, 1.0) * least)
+    inverse = 1 / jnp.where(is_far, held, p2)
+    depth = planes.determinant * inverse
+    is_hit = ~is_parallel & (depth >= near_plane)
+    u, v = jnp.where(is_hit, p0 * inverse, 0.0), jnp.where(is_hit, p1 * inverse, 0.0)
+
+    dx, dy = x - planes.center_x, y - planes.center_y
+    rho_ray, rho_screen = u * u + v * v, 2 * (dx * dx + dy * dy)
+    is_ray = is_hit & (rho_ray <= rho_screen)
+    return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth))
+
+
+def show(rule: AppearanceRule, splat: Splat, hit: Hit, row, values, log_tap: Array | None = None) -> Shown:
+    """α = min(0.99, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
+
+    Args:
+      rule: the appearance rule.
+      splat: its homography is not read.
+      hit: where the ray meets the splat.
+      row: what the rule keeps of the splat.
+      values: what the rule reads of its table at `rule.lookup(row, hit.u, hit.v)`.
+      log_tap: zero, added to the exponent of the falloff, to read the gradient there; or None.
+    """
+    residual, factor = rule.shade(row, values, hit.u, hit.v)
+    a = splat.opacity * rule.falloff(hit.rho)
+    a = a if factor is None else a * factor
+    a = a if log_tap is None else a * jnp.exp(log_tap)
+    alpha = jnp.where(a >= MIN_ALPHA, jnp.where(a < MAX_ALPHA, a, MAX_ALPHA), 0.0)
+    channels: tuple[Array, ...] = splat.color
+    if residual is not None:
+        channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
+    if splat.normal is not None:
+        channels = (*channels, hit.depth, hit.depth * hit.depth, *splat.normal)
+    return Shown(alpha, channels)
+
+
+def absorb(alpha: Array, light: Array, is_live: Array) -> Triple:
+    """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
+    leave less than 10⁻⁴."""
+    after = light * (1 - alpha)
+    is_live = is_live & (after >= MIN_TRANSMITTANCE)
+    return jnp.where(is_live, alpha * light, 0.0), jnp.where(is_live, after, light), is_live
+
+
+def absorb_vjp(alpha: Array, light: Array, is_live: Array, behind: Array, shown: Array):
+    """`absorb`, and ∂L/∂α, walking front to back.
+
+    With B = Σ g·c·α·T over the splats behind + g_T·T_final, all of which is linear in what this splat lets through,
+    ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never exceeds 0.99.
+
+    Args:
+      alpha, light, is_live: as for `absorb`.
+      behind: B with this splat's own g·c·α·T still in it.
+      shown: g·c, the cotangent's product with this splat's channels.
+
+    Returns:
+      weight, light and is_live behind the splat, B, and ∂L/∂α.
+    """
+    weight, after, live_after = absorb(alpha, light, is_live)
+    behind = behind - weight * shown
+    d_alpha = jnp.where(live_after, light * shown - behind / (1 - alpha), 0.0)
+    return weight, after, live_after, behind, d_alpha
+
+
+def absolute_gradient(M, x: Array, y: Array, tile_x, tile_y, d_log: Array, jacobian, near_plane: float) -> Triple:
+    """|∂L/∂μ| at a pixel per world component, through the falloff only; zero where `d_log` is.
+
+    Args:
+      M: rows of the homography.
+      x, y: the pixel, from the tile's centre (tile_x, tile_y).
+      d_log: ∂L/∂(−ρ/2), the gradient of the logarithm of the falloff.
+      jacobian: rows of ∂M[:, 2]/∂μ = K·Rc.
+    """
+    axes = tuple((row[0], row[1]) for row in M)
+    mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_log)) for row in M)
+
+    def rho(mean):
+        rows = tuple((*axes[i], mean[i]) for i in range(3))
+        return intersect(planes_of(rows, tile_x, tile_y), x, y, near_plane).rho
+
+    _, pull_back = jax.vjp(rho, mean)
+    (d_mean,) = pull_back(-0.5 * d_log)
+    components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
+    return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
