@@ -117,7 +117,7 @@ def _padded_peaks(bucket: Array, length: int) -> Array:
 
 def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
     """Where u, in standard deviations, lies among the `size` texels of its axis, clamped to [0, size − 1]."""
-    unit = (u / EXTENT + 1) / 2
+    unit = (u * (1 / EXTENT) + 1) * 0.5
     x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
     return jnp.clip(x, 0.0, size - 1)
 

@@ -143,8 +143,9 @@ def render_traced(
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, bounds = _project(gaussians, camera, rule, settings, degree, num_live)
-    lists = tile_lists(bounds, jax.lax.stop_gradient(splats.M[:, 2, 2]), grid, settings.capacity or 0)
     is_native = _is_native(settings)
+    list_tiles = native.tile_lists if is_native else tile_lists
+    lists = list_tiles(bounds, jax.lax.stop_gradient(splats.M[:, 2, 2]), grid, settings.capacity or 0)
     how = Compositing(
         grid=grid,
         near_plane=settings.near_plane,

@@ -46,7 +46,7 @@ class TileLists(NamedTuple):
     """Boolean: the pairs did not fit; the lists are then empty."""
 
 
-class _Rectangles(NamedTuple):
+class Rectangles(NamedTuple):
     """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + rows of each splat, and how many these are."""
 
     x0: Array
@@ -55,7 +55,8 @@ class _Rectangles(NamedTuple):
     counts: Array
 
 
-def _tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> _Rectangles:
+def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
+    """The tiles that each splat's box covers."""
     limits = jnp.asarray([grid.width, grid.height], jnp.int32)
     as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
     first = jnp.clip(as_pixels(jnp.ceil(bounds.lower - 0.5)), 0, limits[None, :])
@@ -63,23 +64,48 @@ def _tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> _Rectangles:
     is_empty = jnp.any(last < first, axis=-1)
     begin, end = first // grid.tile_size, last // grid.tile_size + 1
     extent = jnp.where(is_empty[:, None], 0, end - begin)
-    return _Rectangles(begin[:, 0], begin[:, 1], extent[:, 0], extent[:, 0] * extent[:, 1])
+    return Rectangles(begin[:, 0], begin[:, 1], extent[:, 0], extent[:, 0] * extent[:, 1])
 
 
 def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
     """Pairs before the outline test, as a float (it cannot wrap): what the capacity must hold."""
-    return jnp.sum(_tile_rectangles(bounds, grid).counts.astype(jnp.float32))
+    return jnp.sum(tile_rectangles(bounds, grid).counts.astype(jnp.float32))
 
 
-def _outline_touches(bounds: ScreenBounds, x0: Array, y0: Array, tile_size: int) -> Array:
-    """Whether each splat's outline reaches a pixel centre of its tile, whose first pixel is (x0, y0)."""
+class Outline(NamedTuple):
+    """Where one splat (or an array of them) can show on the screen, number by number: see `ScreenBounds`."""
+
+    center_x: Array
+    center_y: Array
+    xx: Array
+    xy: Array
+    yy: Array
+    mean_x: Array
+    mean_y: Array
+    radius: Array
+    is_clipped: Array
+
+
+def outlines(bounds: ScreenBounds) -> Outline:
+    """The outlines of N splats, each entry [N]."""
+    return Outline(
+        *(bounds.ellipse_center[:, k] for k in range(2)),
+        *(bounds.ellipse[:, k] for k in range(3)),
+        *(bounds.means2d[:, k] for k in range(2)),
+        radius=bounds.low_pass_radius,
+        is_clipped=bounds.is_clipped,
+    )
+
+
+def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:
+    """Whether an outline reaches a pixel centre of the tile whose first pixel is (x0, y0); element-wise."""
 
     def distance_to_box(origin_x, origin_y):
         left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
         return left, left + (tile_size - 1), top, top + (tile_size - 1)
 
-    left, right, top, bottom = distance_to_box(bounds.ellipse_center[:, 0], bounds.ellipse_center[:, 1])
-    xx, xy, yy = bounds.ellipse[:, 0], bounds.ellipse[:, 1], bounds.ellipse[:, 2]
+    left, right, top, bottom = distance_to_box(outline.center_x, outline.center_y)
+    xx, xy, yy = outline.xx, outline.xy, outline.yy
     # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
     x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
     y_on_side = jnp.clip(xy / xx * x_side, top, bottom)
@@ -90,9 +116,9 @@ def _outline_touches(bounds: ScreenBounds, x0: Array, y0: Array, tile_size: int)
 
     nearest = jnp.minimum(squared_distance(x_side, y_on_side), squared_distance(x_on_side, y_side))
     is_in_ellipse = nearest <= (xx * yy - xy * xy)
-    left, right, top, bottom = distance_to_box(bounds.means2d[:, 0], bounds.means2d[:, 1])
+    left, right, top, bottom = distance_to_box(outline.mean_x, outline.mean_y)
     nearest = jnp.clip(0.0, left, right) ** 2 + jnp.clip(0.0, top, bottom) ** 2
-    return is_in_ellipse | (nearest <= bounds.low_pass_radius**2) | bounds.is_clipped
+    return is_in_ellipse | (nearest <= outline.radius**2) | outline.is_clipped
 
 
 def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: int) -> TileLists:
@@ -105,7 +131,7 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
       capacity: how many pairs there is room for, before the outline test; `overflow` tells when it did not suffice.
     """
     order = jnp.argsort(depths, stable=True)
-    rectangles = jax.tree.map(lambda x: x[order], _tile_rectangles(bounds, grid))
+    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid))
     total = jnp.sum(rectangles.counts.astype(jnp.float32))
     overflow = total > capacity
     counts = jnp.where(overflow, 0, rectangles.counts)
@@ -119,9 +145,9 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     y = rectangles.y0[rank] + local // columns
     ids = order[rank].astype(jnp.int32)
     dtype = bounds.lower.dtype
-    per_pair = jax.tree.map(lambda leaf: leaf[ids], bounds)
+    per_pair = jax.tree.map(lambda leaf: leaf[ids], outlines(bounds))
     tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
-    is_kept = (position < ends[-1]) & _outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
+    is_kept = (position < ends[-1]) & outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)
     return TileLists(ids, starts, total, overflow)

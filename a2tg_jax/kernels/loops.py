@@ -11,10 +11,9 @@ image [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], behind [til
 d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to.
 """
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -24,10 +23,9 @@ from llvmlite import ir
 
 from a2tg_jax import pixel
 from a2tg_jax.kernels import library
-from a2tg_jax.kernels.lanes import BOOL, INT, Lanes, scalar_type, trace
+from a2tg_jax.kernels.lanes import BOOL, INT, Lanes, trace
+from a2tg_jax.kernels.writer import LONG, Writer
 
-LONG = ir.IntType(64)
-POINTER = ir.PointerType()
 INTEGERS = ("first", "last", "columns", "width", "height", "entries")
 FORWARD = ("ids", "starts", "splats", "rows", "table", "image")
 BACKWARD = ("ids", "starts", "splats", "rows", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap")
@@ -129,19 +127,13 @@ class _Functions:
         self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
 
 
-class _Emitter:
-    """Writes one function of a module."""
+class _Compositing(Writer):
+    """What both passes share."""
 
     def __init__(self, kind: Kind, functions: _Functions, module: ir.Module, name: str, buffers: Sequence[str]):
+        super().__init__(module, name, buffers, INTEGERS, kind.dtype)
         self.kind, self.functions = kind, functions
-        types = [POINTER] * len(buffers) + [INT] * len(INTEGERS)
-        function = ir.Function(module, ir.FunctionType(ir.VoidType(), types), name)
-        for argument in function.args[: len(buffers)]:
-            argument.add_attribute("noalias")
-        self.arguments = dict(zip((*buffers, *INTEGERS), function.args, strict=True))
-        self.b = ir.IRBuilder(function.append_basic_block("entry"))
         self.lanes, self.scalars = Lanes(self.b, kind.lanes), Lanes(self.b, 1)
-        self.real = scalar_type(kind.dtype)
         self.reals = self.lanes.vector(self.real)
         self.integers = self.lanes.vector(INT)
         pixels = np.zeros((2, kind.num_vectors * kind.lanes))
@@ -155,56 +147,8 @@ class _Emitter:
         array = ir.Constant(ir.ArrayType(self.real, len(numbers)), [float(number) for number in numbers])
         table = ir.GlobalVariable(self.b.module, array.type, name)
         table.initializer, table.global_constant, table.align = array, True, library.vector_bytes()
-        table.type = POINTER
+        table.type = ir.PointerType()
         return table
-
-    # Memory.
-
-    def variable(self, type_: ir.Type, count: int = 1) -> ir.Value:
-        """Room for `count` values on the stack."""
-        with self.b.goto_entry_block():
-            room = self.b.alloca(type_, count)
-            room.align, room.type = library.vector_bytes(), POINTER
-        return room
-
-    def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:
-        """The address of entry `index` of an array."""
-        return self.b.gep(base, [index], source_etype=type_)
-
-    def load(self, base: ir.Value, index, type_: ir.Type) -> ir.Value:
-        """Entry `index` of an array, of any alignment."""
-        index = LONG(index) if isinstance(index, int) else index
-        alignment = 4 if type_ == INT else np.dtype(self.kind.dtype).itemsize
-        return self.b.load(self.at(base, index, type_), align=alignment, typ=type_)
-
-    def store(self, value: ir.Value, base: ir.Value, index) -> None:
-        index = LONG(index) if isinstance(index, int) else index
-        self.b.store(value, self.at(base, index, value.type), align=np.dtype(self.kind.dtype).itemsize)
-
-    def long(self, value: ir.Value) -> ir.Value:
-        return self.b.sext(value, LONG)
-
-    def times(self, value: ir.Value, factor: int) -> ir.Value:
-        return self.b.mul(value, LONG(factor))
-
-    @contextlib.contextmanager
-    def loop(self, first: ir.Value, last: ir.Value) -> Iterator[tuple[ir.Value, ir.Block]]:
-        """for index in range(first, last), 64-bit; yields the index and the block that `break` branches to."""
-        counter = self.variable(LONG)
-        self.b.store(first, counter)
-        test, body = self.b.append_basic_block("test"), self.b.append_basic_block("body")
-        after = self.b.append_basic_block("after")
-        self.b.branch(test)
-        self.b.position_at_end(test)
-        index = self.b.load(counter, typ=LONG)
-        self.b.cbranch(self.b.icmp_signed("<", index, last), body, after)
-        self.b.position_at_end(body)
-        yield index, after
-        self.b.store(self.b.add(index, LONG(1)), counter)
-        self.b.branch(test)
-        self.b.position_at_end(after)
-
-    # What both passes share.
 
     def all_tiles(self, composite_tile) -> None:
         """Calls composite_tile(tile, tile_x, tile_y) in a loop, and ends the function."""
@@ -252,47 +196,75 @@ class _Emitter:
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
         return [self.lanes.splat(number) for number in numbers]
 
-    def entry_bases(self, taps: Sequence[ir.Value]) -> list[list[ir.Value]]:
-        """For every tap and lane the address of the table's entry, kept inside the table whatever the lane holds."""
-        b, lanes = self.b, self.lanes
-        most = lanes.splat(b.sub(self.arguments["entries"], INT(1)))
-        bases = []
-        for tap in taps:
-            tap = lanes._most(lanes._least(tap, most), lanes.constant(0, INT))
-            ids = [self.long(b.extract_element(tap, INT(k))) for k in range(lanes.width)]
-            bases.append([self.times(id_, self.kind.num_columns) for id_ in ids])
-        return bases
+    def entries(self, taps: Sequence[ir.Value]) -> list[ir.Value]:
+        """The table's entries that a vector reads, kept inside the table whatever a lane holds."""
+        most = self.lanes.splat(self.b.sub(self.arguments["entries"], INT(1)))
+        return [self.lanes._most(self.lanes._least(tap, most), self.lanes.constant(0, INT)) for tap in taps]
 
-    def gather(self, bases: Sequence[Sequence[ir.Value]]) -> list[ir.Value]:
+    def is_uniform(self, entries: Sequence[ir.Value]) -> ir.Value:
+        """Whether all lanes read one and the same entry for all taps: a texture of one texel, or a large texel."""
+        first = self.lanes.splat(self.b.extract_element(entries[0], INT(0)))
+        is_other = [self.b.icmp_signed("!=", entry, first) for entry in entries]
+        return self.b.not_(self.lanes.any(functools.reduce(self.b.or_, is_other)))
+
+    def entry(self, name: str, id_: ir.Value) -> ir.Value:
+        """The address of an entry of the table, or of its cotangents."""
+        return self.at(self.arguments[name], self.times(self.long(id_), self.kind.num_columns), self.real)
+
+    def gather(self, entries: Sequence[ir.Value], is_uniform: ir.Value | None) -> list[ir.Value]:
         """C vectors for every tap."""
-        entry = ir.VectorType(self.real, self.kind.num_columns)
-        gathered: list[ir.Value] = []
-        for lanes in bases:
-            entries = [self.load(self.at(self.arguments["table"], base, self.real), 0, entry) for base in lanes]
-            gathered += self.transpose(entries)
-        return gathered
+        if is_uniform is None:
+            return []
+        b, kind = self.b, self.kind
+        rooms = [self.variable(self.reals) for _ in range(kind.num_columns * len(entries))]
+        with b.if_else(is_uniform) as (uniform, mixed):
+            with uniform:
+                base = self.entry("table", b.extract_element(entries[0], INT(0)))
+                numbers = [self.lanes.splat(self.load(base, k, self.real)) for k in range(kind.num_columns)]
+                for room, number in zip(rooms, numbers * len(entries), strict=True):
+                    b.store(number, room)
+            with mixed:
+                vector = ir.VectorType(self.real, kind.num_columns)
+                columns: list[ir.Value] = []
+                for entry in entries:
+                    bases = [self.entry("table", b.extract_element(entry, INT(k))) for k in range(self.lanes.width)]
+                    columns += self.transpose([self.load(base, 0, vector) for base in bases])
+                for room, column in zip(rooms, columns, strict=True):
+                    b.store(column, room)
+        return [b.load(room, typ=self.reals) for room in rooms]
 
     def transpose(self, entries: Sequence[ir.Value]) -> list[ir.Value]:
         """L vectors of C as C vectors of L."""
-        b, width = self.b, self.lanes.width
+        if self.kind.num_columns != 4 or self.lanes.width % 4:
+            return self.rearrange(entries, self.lanes.width)
+        return self.transpose_quarters([self.concatenate(entries[k::4]) for k in range(4)])
+
+    def transpose_back(self, columns: Sequence[ir.Value]) -> list[ir.Value]:
+        """C vectors of L as L vectors of C."""
+        width = self.lanes.width
         if self.kind.num_columns != 4 or width % 4:
-            columns = []
-            for k in range(self.kind.num_columns):
-                column = ir.Constant(self.reals, ir.Undefined)
-                for lane, entry in enumerate(entries):
-                    column = b.insert_element(column, b.extract_element(entry, INT(k)), INT(lane))
-                columns.append(column)
-            return columns
-        quarters = [self.concatenate(entries[k::4]) for k in range(4)]
-        low01, low23 = (self.shuffle(quarters[k], quarters[k + 1], (0, "0", 1, "1")) for k in (0, 2))
-        high01, high23 = (self.shuffle(quarters[k], quarters[k + 1], (2, "2", 3, "3")) for k in (0, 2))
+            return self.rearrange(columns, self.kind.num_columns)
+        quarters = self.transpose_quarters(columns)
+        masks = [ir.Constant(ir.VectorType(INT, 4), list(range(first, first + 4))) for first in range(0, width, 4)]
+        return [self.b.shuffle_vector(quarters[k], quarters[k], mask) for mask in masks for k in range(4)]
+
+    def rearrange(self, vectors: Sequence[ir.Value], width: int) -> list[ir.Value]:
+        """The transpose of any number of vectors, element by element; `width` is how many there are."""
+        rows = []
+        for k in range(vectors[0].type.count):
+            row = ir.Constant(ir.VectorType(self.real, width), ir.Undefined)
+            for place, vector in enumerate(vectors):
+                row = self.b.insert_element(row, self.b.extract_element(vector, INT(k)), INT(place))
+            rows.append(row)
+        return rows
+
+    def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
+        """Four vectors, every four lanes of them transposed as a 4×4 matrix."""
+        low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
+        high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
         first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
-        return [
-            self.shuffle(low01, low23, first),
-            self.shuffle(low01, low23, second),
-            self.shuffle(high01, high23, first),
-            self.shuffle(high01, high23, second),
-        ]
+        pairs = (low01, low23, first), (low01, low23, second), (high01, high23, first), (high01, high23, second)
+        return [self.shuffle(*pair) for pair in pairs]
 
     def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
         """The pattern in every four lanes; numbers are lanes of x, strings of y."""
@@ -313,7 +285,7 @@ class _Emitter:
         return pieces[0]
 
 
-class _Forward(_Emitter):
+class _Forward(_Compositing):
     """Channels and transmittance of the tiles."""
 
     def write(self) -> None:
@@ -349,7 +321,8 @@ class _Forward(_Emitter):
             is_live = b.icmp_signed("!=", state, lanes.constant(0, INT))
             is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, limit))
             with b.if_then(lanes.any(is_reached)):
-                values = self.gather(self.entry_bases(taps))
+                entries = self.entries(taps)
+                values = self.gather(entries, self.is_uniform(entries) if entries else None)
                 before = [self.load(light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
                 after, still_live, *totals = lanes.emit(functions.forward, [*planes, *splat, *row, *values, x, y, *before])
                 self.store(after, light, k)
@@ -368,7 +341,7 @@ class _Forward(_Emitter):
                 self.store(self.load(array, k, self.real), base, self.b.add(k, LONG(index * num_pixels)))
 
 
-class _Backward(_Emitter):
+class _Backward(_Compositing):
     """Cotangents of the splats, of the table, and the absolute gradient."""
 
     def write(self) -> None:
@@ -419,8 +392,9 @@ class _Backward(_Emitter):
             is_live = b.icmp_signed("!=", self.load(live, k, self.integers), lanes.constant(0, INT))
             is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, limit))
             with b.if_then(lanes.any(is_reached)):
-                bases = self.entry_bases(taps)
-                values = self.gather(bases)
+                entries = self.entries(taps)
+                is_uniform = self.is_uniform(entries) if entries else None
+                values = self.gather(entries, is_uniform)
                 before = [self.load(light, k, self.reals), is_live, self.load(behind, k, self.reals)]
                 cotangents = [self.load(channel, k, self.reals) for channel in g]
                 at_pixel = [*planes, *splat, *row, *values, x, y, *tile_center, *before, *cotangents, *jacobian]
@@ -437,7 +411,8 @@ class _Backward(_Emitter):
                         # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
                         value = b.select(contributes, value, zero)
                         b.store(b.fadd(b.load(total, typ=self.reals), value), total)
-                    self.scatter(contributes, bases, d_values)
+                    d_values = [b.select(contributes, value, zero) for value in d_values]
+                    self.scatter(entries, is_uniform, d_values)
             now = self.load(live, k, self.integers)
             b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
         with b.if_then(b.load(any_reached, typ=BOOL)):
@@ -460,27 +435,28 @@ class _Backward(_Emitter):
         for k, value in enumerate(values):
             self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
 
-    def scatter(self, contributes: ir.Value, bases, d_values: Sequence[ir.Value]) -> None:
+    def scatter(self, entries: Sequence[ir.Value], is_uniform: ir.Value | None, d_values: Sequence[ir.Value]) -> None:
         """Adds the cotangents of what was gathered, lane after lane, in order."""
-        if not bases:
+        if is_uniform is None:
             return
-        b, lanes, columns = self.b, self.lanes, self.kind.num_columns
-        offsets = [self.variable(LONG, lanes.width) for _ in bases]
-        for room, lane_bases in zip(offsets, bases, strict=True):
-            for lane, base in enumerate(lane_bases):
-                b.store(base, self.at(room, LONG(lane), LONG))
-        rooms = [self.variable(self.reals) for _ in d_values]
-        for room, value in zip(rooms, d_values, strict=True):
-            b.store(value, room)
-        bits = b.zext(lanes.bits(contributes), LONG)
-        with self.loop(LONG(0), LONG(lanes.width)) as (lane, _):
-            is_set = b.trunc(b.lshr(bits, lane), BOOL)
-            with b.if_then(is_set):
-                for tap, room in enumerate(offsets):
-                    target = self.at(self.arguments["d_table"], b.load(self.at(room, lane, LONG), typ=LONG), self.real)
-                    for column in range(columns):
-                        value = self.load(rooms[tap * columns + column], lane, self.real)
-                        self.store(b.fadd(self.load(target, column, self.real), value), target, column)
+        b, columns = self.b, self.kind.num_columns
+        by_tap = [d_values[k : k + columns] for k in range(0, len(d_values), columns)]
+        with b.if_else(is_uniform) as (uniform, mixed):
+            with uniform:
+                sums = [functools.reduce(self.add_up, same) for same in zip(*by_tap, strict=True)]
+                total = functools.reduce(self.add_up, self.transpose_back(sums))
+                self.add_entry(b.extract_element(entries[0], INT(0)), total)
+            with mixed:
+                for entry, vectors in zip(entries, by_tap, strict=True):
+                    for lane, row in enumerate(self.transpose_back(vectors)):
+                        self.add_entry(b.extract_element(entry, INT(lane)), row)
+
+    def add_entry(self, id_: ir.Value, addend: ir.Value) -> None:
+        base = self.entry("d_table", id_)
+        self.store(self.add_up(self.load(base, 0, addend.type), addend), base, 0)
+
+    def add_up(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        return self.b.fadd(x, y)
 
 
 @dataclasses.dataclass(frozen=True)

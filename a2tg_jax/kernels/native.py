@@ -15,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.geometry import ScreenBounds
 from a2tg_jax.kernels import foreign
+from a2tg_jax.tiles import TileGrid, TileLists, outlines, tile_rectangles
 
 PAIRS_PER_THREAD = 2_000
 """Fewer pairs than this are not worth another thread."""
@@ -89,6 +91,52 @@ def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: A
         normals=packed[:, 13:16] if kind.has_geometry else jnp.zeros_like(splats.normals),
     )
     return d_splats, d_params, d_tap if kind.has_statistic else jnp.zeros_like(tap)
+
+
+def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: int) -> TileLists:
+    """As `tiles.tile_lists`."""
+    from a2tg_jax.kernels.lists import list_loops
+
+    rectangles = tile_rectangles(bounds, grid)
+    total = jnp.sum(rectangles.counts.astype(jnp.float32))
+    overflow = total > capacity
+    counts = jnp.where(overflow, 0, rectangles.counts)
+    rectangles = jnp.stack([rectangles.x0, rectangles.y0, rectangles.columns, counts], axis=1)
+    dtype = bounds.lower.dtype
+    outline = jnp.stack([entry.astype(dtype) for entry in outlines(bounds)], axis=1)
+    name = f"a2tg_lists_{dtype}_{grid.tile_size}"
+    foreign.register(name, functools.partial(_list_handler, list_loops(str(dtype), grid.tile_size)))
+    shapes = jax.ShapeDtypeStruct((capacity,), jnp.int32), jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32)
+    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
+    ids, starts = call(depths, rectangles, outline, jnp.asarray([grid.columns], jnp.int32))
+    return TileLists(ids, starts, total, overflow)
+
+
+def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    depths, rectangles, outline, columns = arguments
+    ids, starts = results
+    order = _depth_order(depths, np.flatnonzero(rectangles[:, 3]))
+    capacity = max(1, int(rectangles[:, 3].sum(dtype=np.int64)))
+    counts, tiles, splats = (np.zeros(len(starts), np.int32), *np.empty((2, capacity), np.int32))
+    address = lambda *arrays: [array.ctypes.data for array in arrays]  # noqa: E731
+    loops.find(*address(order, rectangles, outline, counts, tiles, splats), len(order), int(columns[0]))
+    starts[0] = 0
+    np.cumsum(counts[:-1], out=starts[1:])
+    num_pairs, cursors = int(starts[-1]), starts[:-1].copy()
+    loops.place(*address(tiles, splats, cursors, ids), num_pairs)
+    ids[num_pairs:] = 0
+
+
+def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """The visible splats by depth, ties by index: int32. float32 depths are sorted by radix, 16 bits at a time."""
+    depths = depths[visible]
+    if depths.dtype != np.float32:
+        return visible[np.argsort(depths, kind="stable")].astype(np.int32)
+    # Depths of what is visible are positive, and then ordered as their bits are.
+    bits = depths.view(np.uint32)
+    order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
+    order = order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]
+    return visible[order].astype(np.int32)
 
 
 def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:

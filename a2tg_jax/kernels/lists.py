@@ -1,0 +1,110 @@
+"""Native loops that list the splats of each tile: a counting sort, in time proportional to the pairs.
+
+    find(order, rectangles, outlines, counts, tiles, splats; num_splats, columns)
+    place(tiles, splats, cursors, ids; num_pairs)
+
+`find` goes through the splats in the given order, front to back, and writes down every pair whose outline touches its
+tile; `place` moves them tile by tile, in the same order. Buffers: order [M], rectangles [N, 4] (x0, y0, columns,
+count), outlines [N, 9], counts [tiles + 1], whose last entry counts all pairs; tiles and splats [capacity];
+cursors [tiles], where each tile's list begins, and in the end where it ends; ids [capacity].
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from llvmlite import ir
+
+from a2tg_jax.kernels import library
+from a2tg_jax.kernels.lanes import INT, Lanes, trace
+from a2tg_jax.kernels.writer import LONG, Writer
+from a2tg_jax.tiles import Outline, outline_touches
+
+FIND = ("order", "rectangles", "outlines", "counts", "tiles", "splats")
+PLACE = ("tiles", "splats", "cursors", "ids")
+NUM_NUMBERS = len(Outline._fields)
+
+
+class _Find(Writer):
+    def __init__(self, module: ir.Module, name: str, dtype: str, tile_size: int):
+        super().__init__(module, name, FIND, ("num_splats", "columns"), dtype)
+        self.tile_size = tile_size
+        number, flag = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((), jnp.bool_)
+        outline = Outline(*[number] * (NUM_NUMBERS - 1), is_clipped=flag)
+        touches = functools.partial(outline_touches, tile_size=tile_size)
+        self.touches, _ = trace(touches, outline, number, number)
+
+    def write(self) -> None:
+        b, given = self.b, self.arguments
+        num_found = self.variable(LONG)
+        b.store(LONG(0), num_found)
+        with self.loop(LONG(0), self.long(given["num_splats"])) as (rank, _):
+            id_ = self.load(given["order"], rank, INT)
+            rectangle = self.at(given["rectangles"], self.times(self.long(id_), 4), INT)
+            x0, y0, columns, count = (self.load(rectangle, k, INT) for k in range(4))
+            with b.if_then(b.icmp_signed(">", count, INT(0))):
+                outline = self.outline(id_)
+                rows = b.sdiv(count, columns)
+                with (
+                    self.loop(self.long(y0), self.long(b.add(y0, rows))) as (y, _),
+                    self.loop(self.long(x0), self.long(b.add(x0, columns))) as (x, _),
+                    b.if_then(self.is_touched(outline, x, y)),
+                ):
+                    tile = b.trunc(b.add(b.mul(y, self.long(given["columns"])), x), INT)
+                    found = b.load(num_found, typ=LONG)
+                    self.store(tile, given["tiles"], found)
+                    self.store(id_, given["splats"], found)
+                    b.store(b.add(found, LONG(1)), num_found)
+                    number = self.load(given["counts"], self.long(tile), INT)
+                    self.store(b.add(number, INT(1)), given["counts"], self.long(tile))
+        b.ret_void()
+
+    def outline(self, id_: ir.Value) -> list[ir.Value]:
+        base = self.at(self.arguments["outlines"], self.times(self.long(id_), NUM_NUMBERS), self.real)
+        *numbers, is_clipped = (self.load(base, k, self.real) for k in range(NUM_NUMBERS))
+        return [*numbers, self.b.fcmp_ordered(">", is_clipped, self.real(0.0))]
+
+    def is_touched(self, outline: list[ir.Value], x: ir.Value, y: ir.Value) -> ir.Value:
+        size = self.real(self.tile_size)
+        corner = [self.b.fmul(self.b.sitofp(index, self.real), size) for index in (x, y)]
+        (touches,) = Lanes(self.b, 1).emit(self.touches, [*outline, *corner])
+        return touches
+
+
+class _Place(Writer):
+    def __init__(self, module: ir.Module, name: str):
+        super().__init__(module, name, PLACE, ("num_pairs",), "float32")
+
+    def write(self) -> None:
+        b, given = self.b, self.arguments
+        with self.loop(LONG(0), self.long(given["num_pairs"])) as (pair, _):
+            tile = self.long(self.load(given["tiles"], pair, INT))
+            cursor = self.load(given["cursors"], tile, INT)
+            self.store(self.load(given["splats"], pair, INT), given["ids"], self.long(cursor))
+            self.store(b.add(cursor, INT(1)), given["cursors"], tile)
+        b.ret_void()
+
+
+@dataclasses.dataclass(frozen=True)
+class ListLoops:
+    """Compiled loops; each releases the GIL."""
+
+    find: Any
+    place: Any
+
+
+@functools.cache
+def list_loops(dtype: str, tile_size: int) -> ListLoops:
+    """The loops for outlines of a dtype and tiles of a size, compiled at the first call."""
+    module = ir.Module("lists")
+    find, place = f"find_{dtype}_{tile_size}", f"place_{dtype}_{tile_size}"
+    with jax.ensure_compile_time_eval():
+        _Find(module, find, dtype, tile_size).write()
+    _Place(module, place).write()
+    addresses = library.compile_module(module)
+    return ListLoops(
+        find=library.as_function(addresses[find], len(FIND), 2),
+        place=library.as_function(addresses[place], len(PLACE), 1),
+    )
