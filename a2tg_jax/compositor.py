@@ -1,12 +1,14 @@
 """Front-to-back compositing of tiles, given any appearance rule, with an exact gradient in constant memory.
 
 G tiles at a time, P pixels a tile, B splats a block, D channels (colour, then depth and normal where asked for).
-What happens at one pixel is `pixel`'s; here it is done for all of them, by XLA, or by `kernels.native` on CPUs.
+What happens at one pixel is `pixel`'s; here it is done for all of them, by XLA, by `kernels.native` on CPUs, or by
+`kernels.pallas` on GPUs.
 
 The backward pass walks front to back too (`pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
 """
 
 import functools
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -16,7 +18,7 @@ from jax import Array
 
 from a2tg_jax import pixel
 from a2tg_jax.appearance import AppearanceRule
-from a2tg_jax.kernels import native
+from a2tg_jax.kernels.choice import Compositor
 from a2tg_jax.numerics import pixel_sum, spread
 from a2tg_jax.tiles import TileGrid, TileLists
 
@@ -45,10 +47,10 @@ class Compositing(NamedTuple):
     """Depth, squared depth and normals are composited beside the colour."""
     has_statistic: bool
     """The backward pass also yields the absolute positional gradient."""
+    compositor: Compositor
+    """Native loops, Pallas kernels, or XLA."""
     tile_batch: int
-    """Tiles composited at once by XLA."""
-    is_native: bool
-    """By native loops instead of XLA."""
+    """Tiles composited at once by XLA; 1 with the others."""
 
     @property
     def num_channels(self) -> int:
@@ -107,7 +109,7 @@ def _composite_tiles_bwd(how, residuals, cotangents):
     splats, params, rule, lists, jacobian, tap, channels, transmittance = residuals
     g, g_transmittance = cotangents
     behind = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
-    backward = native.backward if how.is_native else _backward
+    backward = _backward if how.compositor == "xla" else _accelerated(how).backward
     d_splats, d_params, d_tap = backward(how, splats, params, rule, lists, jacobian, tap, g, behind)
     return d_splats, d_params, None, None, None, d_tap
 
@@ -115,10 +117,21 @@ def _composite_tiles_bwd(how, residuals, cotangents):
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
+def _accelerated(how: Compositing) -> ModuleType:
+    """The module with the kernels, imported where they are used: Pallas adds to JAX's settings when it is."""
+    if how.compositor == "native":
+        from a2tg_jax.kernels import native
+
+        return native
+    from a2tg_jax.kernels import pallas
+
+    return pallas
+
+
 def _forward(how: Compositing, splats: Splats, params: Array, rule, lists: TileLists) -> tuple[Array, Array]:
     """Channels [groups, G, D, P] and transmittance [groups, G, P]."""
-    if how.is_native:
-        return native.forward(how, splats, params, rule, lists)
+    if how.compositor != "xla":
+        return _accelerated(how).forward(how, splats, params, rule, lists)
     ids, dtype = _padded_ids(lists), splats.M.dtype
 
     def group(index):
@@ -318,6 +331,7 @@ def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, 
         lambda splats, values, log_tap: _show(how, rule, splats, row, values, at, tile, log_tap),
         splats, values, log_tap,
     )  # fmt: skip
+    g = g[:, None]
     seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 
     def add_splat(carry, splat):

@@ -98,12 +98,12 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float) -> Hit:
     # Far out on a nearly parallel plane u² would overflow, and 1/p₂² for the tiniest splats: there the divisor is
     # held, with a finite gradient.
     far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
-    least = jnp.maximum(jnp.maximum(jnp.abs(p0), jnp.abs(p1)), jnp.abs(planes.determinant)) / far
+    q0, q1, q2, determinant = jax.lax.stop_gradient((p0, p1, p2, planes.determinant))
+    least = jnp.maximum(jnp.maximum(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
     least = jnp.maximum(least, tiny)
-    is_far = jnp.abs(p2) <= least
-    is_parallel = p2 == 0
-    held = jax.lax.stop_gradient(jnp.where(p2 < 0, -1.0, 1.0) * least)
-    inverse = 1 / jnp.where(is_far, held, p2)
+    is_far = jnp.abs(q2) <= least
+    is_parallel = q2 == 0
+    inverse = 1 / jnp.where(is_far, jnp.where(q2 < 0, -least, least), p2)
     depth = planes.determinant * inverse
     is_hit = ~is_parallel & (depth >= near_plane)
     u, v = jnp.where(is_hit, p0 * inverse, 0.0), jnp.where(is_hit, p1 * inverse, 0.0)

@@ -20,6 +20,7 @@ from a2tg_jax.compositor import Compositing, Splats, composite
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.geometry import ScreenBounds, homographies, screen_bounds
 from a2tg_jax.kernels import native
+from a2tg_jax.kernels.choice import choose
 from a2tg_jax.lookup import TextureOptions, textured_appearance
 from a2tg_jax.sh import sh_colors
 from a2tg_jax.texture import AtlasLayout, Textures
@@ -43,8 +44,8 @@ class RenderSettings:
     """How textures are read."""
     capacity: int | None = None
     """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
-    compositor: Literal["auto", "native", "xla"] = "auto"
-    """Native loops or XLA; "auto": native loops on CPUs where llvmlite is installed, XLA elsewhere."""
+    compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
+    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had."""
     tile_batch: int | None = None
     """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
 
@@ -143,16 +144,16 @@ def render_traced(
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, bounds = _project(gaussians, camera, rule, settings, degree, num_live)
-    is_native = _is_native(settings)
-    list_tiles = native.tile_lists if is_native else tile_lists
+    compositor = choose(settings.compositor, settings.tile_size)
+    list_tiles = native.tile_lists if compositor == "native" else tile_lists
     lists = list_tiles(bounds, jax.lax.stop_gradient(splats.M[:, 2, 2]), grid, settings.capacity or 0)
     how = Compositing(
         grid=grid,
         near_plane=settings.near_plane,
         has_geometry=has_geometry,
         has_statistic=tap is not None,
-        tile_batch=1 if is_native else min(_tile_batch(settings) or grid.num, grid.num),
-        is_native=is_native,
+        compositor=compositor,
+        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
     )
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
@@ -248,12 +249,6 @@ def _primal_value(x):
                 return x
             x = inner
     return x
-
-
-def _is_native(settings: RenderSettings) -> bool:
-    if settings.compositor == "native" and not native.is_available():
-        raise ValueError("compositor='native' needs JAX on the CPU and llvmlite: pip install llvmlite, or say 'auto'")
-    return settings.compositor != "xla" and native.is_available()
 
 
 def _tile_batch(settings: RenderSettings) -> int:

@@ -88,13 +88,8 @@ class Outline(NamedTuple):
 
 def outlines(bounds: ScreenBounds) -> Outline:
     """The outlines of N splats, each entry [N]."""
-    return Outline(
-        *(bounds.ellipse_center[:, k] for k in range(2)),
-        *(bounds.ellipse[:, k] for k in range(3)),
-        *(bounds.means2d[:, k] for k in range(2)),
-        radius=bounds.low_pass_radius,
-        is_clipped=bounds.is_clipped,
-    )
+    numbers = jnp.concatenate([bounds.ellipse_center, bounds.ellipse, bounds.means2d], axis=1)
+    return Outline._make([*jnp.moveaxis(numbers, 1, 0), bounds.low_pass_radius, bounds.is_clipped])
 
 
 def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:

@@ -11,6 +11,7 @@ from scenes_random import as_camera, as_gaussians, as_settings, as_textures, dra
 
 from a2tg_jax import RenderOutput, RenderSettings, render_image
 
+COMPOSITORS = ("native", "xla")
 FIELDS = ("color", "alpha", "depth", "normal")
 OFFICIAL = Rules(uv="align-corners", outside="identity", rgb="unit")
 OPTIONS = {
@@ -45,22 +46,31 @@ def assert_equal_in_float64(scene: Scene, rules: Rules, settings: RenderSettings
 
 
 @pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", COMPOSITORS)
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
 @pytest.mark.parametrize("seed", [0, 3, 4, 9])
-def test_float64(seed, tile_size):
-    assert_equal_in_float64(draw_scene(seed), DEFAULT_RULES, as_settings(tile_size=tile_size))
+def test_float64(seed, tile_size, compositor):
+    settings = as_settings(tile_size=tile_size, compositor=compositor)
+    assert_equal_in_float64(draw_scene(seed), DEFAULT_RULES, settings)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("tile_size", [3, 5])
+def test_float64_with_tiles_that_fill_no_vector(tile_size):
+    assert_equal_in_float64(draw_scene(3), DEFAULT_RULES, as_settings(tile_size=tile_size, compositor="native"))
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("tile_batch", [0, 1, 5])
 def test_float64_with_so_many_tiles_at_once(tile_batch):
-    assert_equal_in_float64(draw_scene(4), DEFAULT_RULES, as_settings(tile_batch=tile_batch))
+    assert_equal_in_float64(draw_scene(4), DEFAULT_RULES, as_settings(tile_batch=tile_batch, compositor="xla"))
 
 
 @pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", COMPOSITORS)
 @pytest.mark.parametrize("option", OPTIONS)
-def test_float64_options(option):
-    assert_equal_in_float64(draw_scene(9), OPTIONS[option], as_settings(OPTIONS[option]))
+def test_float64_options(option, compositor):
+    assert_equal_in_float64(draw_scene(9), OPTIONS[option], as_settings(OPTIONS[option], compositor=compositor))
 
 
 @pytest.mark.usefixtures("x64")
@@ -86,15 +96,15 @@ def test_image_sizes(width, height):
     assert_equal_in_float64(draw_scene(2, num=20, width=width, height=height), DEFAULT_RULES, as_settings(tile_size=8))
 
 
-@pytest.mark.parametrize("tile_size", [8, 16])
+@pytest.mark.parametrize(("compositor", "tile_size"), [("native", 8), ("native", 16), ("xla", 8)])
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 6, 7])
-def test_float32(seed, tile_size):
+def test_float32(seed, compositor, tile_size):
     """99% of the pixels to 1e-5 and 99.9% to 3e-4, leaving out those that decide within 1e-4 of a threshold."""
     scene = draw_scene(seed)
     expected = oracle.render(scene)
     is_compared = expected.margin > 1e-4
     assert is_compared.mean() > 0.95
-    output = render_scene(scene, "float32", as_settings(tile_size=tile_size))
+    output = render_scene(scene, "float32", as_settings(tile_size=tile_size, compositor=compositor))
     for name, error in errors(output, expected, is_compared).items():
         assert output.color.dtype == jnp.float32
         assert np.mean(error < 1e-5) >= 0.99, name

@@ -175,10 +175,11 @@ def assert_textures_match(gradient: Inputs, scene: Scene, rules: Rules):
 
 
 @pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", ["native", "xla"])
 @pytest.mark.parametrize("seed", SMOOTH_SEEDS)
-def test_every_leaf_against_differences(seed):
+def test_every_leaf_against_differences(seed, compositor):
     scene = smooth_scene(seed, DEFAULT_RULES)
-    _, gradient = package_gradient(scene, "float64", RenderSettings())
+    _, gradient = package_gradient(scene, "float64", RenderSettings(compositor=compositor))
     assert_leaves_match(gradient, scene, DEFAULT_RULES)
     assert_textures_match(gradient, scene, DEFAULT_RULES)
 
@@ -202,13 +203,14 @@ def test_gradients_without_textures_against_differences():
 
 @pytest.mark.usefixtures("x64")
 def test_gradients_do_not_depend_on_tiles():
-    """Nor on how many are composited at once; the last row of the viewmat and the buckets' padding have none."""
+    """Nor on who composites how many at once; the last row of the viewmat and the buckets' padding have none."""
     scene = draw_scene(3)
     _, expected = package_gradient(scene, "float64", as_settings(tile_size=32))
     np.testing.assert_array_equal(expected.viewmat[3], 0)
-    _, gradient = package_gradient(scene, "float64", as_settings(tile_batch=0))
-    for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(gradient), strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
+    for settings in (as_settings(), as_settings(compositor="xla"), as_settings(compositor="xla", tile_batch=0)):
+        _, gradient = package_gradient(scene, "float64", settings)
+        for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(gradient), strict=True):
+            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
 
     _, layout = as_textures(scene, "float64")
     repacked, _ = textures_from_arrays(texture_arrays(expected.textures, layout))

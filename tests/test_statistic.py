@@ -34,10 +34,11 @@ def statistic(scene: Scene, cotangent: np.ndarray, settings: RenderSettings) -> 
     ("rules", "settings"),
     [
         (DEFAULT_RULES, as_settings()),
-        (DEFAULT_RULES, as_settings(tile_size=16, tile_batch=0)),
+        (DEFAULT_RULES, as_settings(compositor="xla")),
+        (DEFAULT_RULES, as_settings(compositor="xla", tile_size=16, tile_batch=0)),
         (OFFICIAL, RenderSettings.official()),
     ],
-    ids=["default", "all tiles at once", "official"],
+    ids=["native", "xla", "xla, all tiles at once", "official"],
 )
 @pytest.mark.parametrize("seed", [4, 9])
 def test_statistic(seed, rules, settings):

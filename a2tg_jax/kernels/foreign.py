@@ -107,7 +107,7 @@ def _enter(frame: _CallFrame, handler: Handler) -> int | None:
         return None
     try:
         handler(_arrays(frame.arguments), _arrays(frame.results))
-    except BaseException as error:  # noqa: BLE001 - it cannot pass through C, so XLA is told
+    except BaseException as error:  # nothing may pass through C: XLA is told instead
         sys.excepthook(type(error), error, error.__traceback__)
         message = f"{type(error).__name__}: {error}".encode()
         arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
@@ -124,4 +124,5 @@ def _array(buffer: _Buffer) -> np.ndarray:
     num_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
     if num_bytes == 0:
         return np.empty(shape, dtype)
-    return np.frombuffer((ctypes.c_char * num_bytes).from_address(buffer.data), dtype).reshape(shape)
+    memory = (ctypes.c_ubyte * num_bytes).from_address(buffer.data)
+    return np.frombuffer(memoryview(memory), dtype).reshape(shape)

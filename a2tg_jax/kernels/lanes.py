@@ -65,7 +65,9 @@ class Lanes:
             return value
         undefined = ir.Constant(self.vector(value.type), ir.Undefined)
         first = self.builder.insert_element(undefined, value, INT(0))
-        return self.builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(INT, self.width), [0] * self.width))
+        return self.builder.shuffle_vector(
+            first, undefined, ir.Constant(ir.VectorType(INT, self.width), [0] * self.width)
+        )
 
     def intrinsic(self, name: str, operands: Sequence[ir.Value], overload: ir.Type | None = None, result=None):
         """Calls llvm.<name> of these operands."""
@@ -105,13 +107,13 @@ class Lanes:
     def _emit(self, jaxpr: core.Jaxpr, consts, arguments: Sequence[ir.Value]) -> list[ir.Value]:
         values: dict[core.Var, ir.Value] = {}
 
-        def read(atom) -> ir.Value:
+        def read(atom: Any) -> ir.Value:
             if isinstance(atom, core.Literal):
-                return self.constant(atom.val, scalar_type(atom.aval.dtype))
+                return self.constant(atom.val, scalar_type(_dtype(atom)))
             return values[atom]
 
         for variable, value in zip(jaxpr.constvars, consts, strict=True):
-            values[variable] = self.constant(value, scalar_type(variable.aval.dtype))
+            values[variable] = self.constant(value, scalar_type(_dtype(variable)))
         values.update(zip(jaxpr.invars, arguments, strict=True))
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
@@ -158,6 +160,10 @@ class Lanes:
         if not _is_float(x.type):
             return self.builder.select(self.builder.icmp_signed("<", x, y), x, y)
         return self.builder.select(self.builder.fcmp_unordered("<", x, y), x, y)
+
+
+def _dtype(atom: Any) -> np.dtype:
+    return atom.aval.dtype
 
 
 def scalar_of(type_: ir.Type) -> ir.Type:

@@ -31,8 +31,9 @@ class _Find(Writer):
     def __init__(self, module: ir.Module, name: str, dtype: str, tile_size: int):
         super().__init__(module, name, FIND, ("num_splats", "columns"), dtype)
         self.tile_size = tile_size
-        number, flag = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((), jnp.bool_)
-        outline = Outline(*[number] * (NUM_NUMBERS - 1), is_clipped=flag)
+        number: Any = jax.ShapeDtypeStruct((), dtype)
+        flag: Any = jax.ShapeDtypeStruct((), jnp.bool_)
+        outline = Outline._make([number] * (NUM_NUMBERS - 1) + [flag])
         touches = functools.partial(outline_touches, tile_size=tile_size)
         self.touches, _ = trace(touches, outline, number, number)
 

@@ -74,7 +74,7 @@ class _Functions:
 
     def __init__(self, kind: Kind):
         rule = jax.tree.unflatten(kind.rule, [None] * kind.rule.num_leaves)
-        number = jax.ShapeDtypeStruct((), kind.dtype)
+        number: Any = jax.ShapeDtypeStruct((), kind.dtype)
         integer, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), jnp.bool_)
         triple, near_plane = (number,) * 3, kind.near_plane
         splat = pixel.Splat((triple,) * 3, number, triple, triple if kind.has_geometry else None)
@@ -289,7 +289,7 @@ class _Forward(_Compositing):
     """Channels and transmittance of the tiles."""
 
     def write(self) -> None:
-        kind, b = self.kind, self.b
+        kind = self.kind
         light = self.variable(self.reals, kind.num_vectors)
         live = self.variable(self.integers, kind.num_vectors)
         channels = [self.variable(self.reals, kind.num_vectors) for _ in range(kind.num_channels)]
@@ -324,7 +324,9 @@ class _Forward(_Compositing):
                 entries = self.entries(taps)
                 values = self.gather(entries, self.is_uniform(entries) if entries else None)
                 before = [self.load(light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
-                after, still_live, *totals = lanes.emit(functions.forward, [*planes, *splat, *row, *values, x, y, *before])
+                after, still_live, *totals = lanes.emit(
+                    functions.forward, [*planes, *splat, *row, *values, x, y, *before]
+                )
                 self.store(after, light, k)
                 self.store(b.zext(still_live, self.integers), live, k)
                 for total, channel in zip(totals, channels, strict=True):

@@ -7,6 +7,7 @@ which are summed in order: results do not depend on timing, only, in the last bi
 import concurrent.futures
 import functools
 import hashlib
+import itertools
 import os
 from collections.abc import Callable
 
@@ -21,18 +22,6 @@ from a2tg_jax.tiles import TileGrid, TileLists, outlines, tile_rectangles
 
 PAIRS_PER_THREAD = 2_000
 """Fewer pairs than this are not worth another thread."""
-
-
-@functools.cache
-def is_available() -> bool:
-    """Whether native loops can be made here: XLA runs on the CPU, and llvmlite is installed."""
-    if jax.default_backend() != "cpu":
-        return False
-    try:
-        import llvmlite  # noqa: F401
-    except ImportError:
-        return False
-    return True
 
 
 def num_threads() -> int:
@@ -97,11 +86,10 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     """As `tiles.tile_lists`."""
     from a2tg_jax.kernels.lists import list_loops
 
-    rectangles = tile_rectangles(bounds, grid)
-    total = jnp.sum(rectangles.counts.astype(jnp.float32))
+    x0, y0, columns, counts = tile_rectangles(bounds, grid)
+    total = jnp.sum(counts.astype(jnp.float32))
     overflow = total > capacity
-    counts = jnp.where(overflow, 0, rectangles.counts)
-    rectangles = jnp.stack([rectangles.x0, rectangles.y0, rectangles.columns, counts], axis=1)
+    rectangles = jnp.stack([x0, y0, columns, jnp.where(overflow, 0, counts)], axis=1)
     dtype = bounds.lower.dtype
     outline = jnp.stack([entry.astype(dtype) for entry in outlines(bounds)], axis=1)
     name = f"a2tg_lists_{dtype}_{grid.tile_size}"
@@ -204,7 +192,7 @@ def _parts(starts: np.ndarray) -> list[tuple[int, int]]:
     work = starts.astype(np.int64) + np.arange(num_tiles + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
     borders = [0, *borders, num_tiles]
-    return list(zip(borders[:-1], borders[1:], strict=True))
+    return list(itertools.pairwise(borders))
 
 
 def _in_parts(part: Callable[[int, int, int], None], starts: np.ndarray) -> None:

@@ -1,0 +1,268 @@
+"""Compositing by Pallas kernels on GPUs: one program per tile, all its pixels at once, around the functions of `pixel`.
+
+The kernels are lowered by the Triton backend. Their buffers are those of `loops`; what a splat adds to the gradient is
+summed over the tile's pixels and added atomically, so gradients are reproducible to rounding only.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.experimental import pallas as pl
+
+from a2tg_jax import pixel
+from a2tg_jax.kernels.choice import triton
+
+IS_COMPILED_AHEAD = False
+"""Set where kernels are compiled on a machine that has no GPU, for one that has; else CPUs interpret them."""
+
+
+class Kind(NamedTuple):
+    """What a pair of kernels is made for; hashable."""
+
+    rule: Any
+    """The tree structure of an appearance rule: its class and static fields."""
+    columns: int
+    """Tiles in a row of the image."""
+    width: int
+    height: int
+    tile_size: int
+    near_plane: float
+    has_geometry: bool
+    has_statistic: bool
+    is_interpreted: bool
+    """Run by the interpreter, on any device, for tests."""
+
+    @property
+    def num_channels(self) -> int:
+        return 8 if self.has_geometry else 3
+
+    @property
+    def num_pixels(self) -> int:
+        return self.tile_size**2
+
+
+class _Tile(NamedTuple):
+    """Where a program's pixels are."""
+
+    center_x: Array
+    center_y: Array
+    x: Array
+    """[P] from the centre."""
+    y: Array
+    is_inside: Array
+    first: Array
+    last: Array
+
+
+def _tile(kind: Kind, starts, dtype) -> _Tile:
+    index, size = pl.program_id(0), kind.tile_size
+    center_x = ((index % kind.columns) * size).astype(dtype) + size / 2
+    center_y = ((index // kind.columns) * size).astype(dtype) + size / 2
+    place = jax.lax.iota(jnp.int32, kind.num_pixels)
+    x = (place % size).astype(dtype) - (size - 1) / 2
+    y = (place // size).astype(dtype) - (size - 1) / 2
+    is_inside = (center_x + x < kind.width) & (center_y + y < kind.height)
+    return _Tile(center_x, center_y, x, y, is_inside, starts[index], starts[index + 1])
+
+
+def _splat(kind: Kind, splats, id_) -> pixel.Splat:
+    numbers = [splats[id_, k] for k in range(16 if kind.has_geometry else 13)]
+    M = tuple(tuple(numbers[3 * i : 3 * i + 3]) for i in range(3))
+    normal = tuple(numbers[13:16]) if kind.has_geometry else None
+    return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal)  # type: ignore[arg-type]
+
+
+def _row(rows, id_) -> tuple[Array, ...]:
+    return tuple(rows[id_, k] for k in range(rows.shape[1]))
+
+
+def _values(table, entries) -> Any:
+    return tuple(tuple(table[entry, column] for column in range(table.shape[1])) for entry in entries)
+
+
+def _forward_kernel(kind: Kind, rule, ids, starts, splats, rows, table, image):
+    tile = _tile(kind, starts, splats.dtype)
+
+    def is_unfinished(carry):
+        at, _, live, _ = carry
+        return (at < tile.last) & (jnp.max(live) > 0)
+
+    def add_splat(carry):
+        at, light, live, channels = carry
+        id_ = ids[at]
+        splat, row = _splat(kind, splats, id_), _row(rows, id_)
+        hit = pixel.intersect(pixel.planes_of(splat.M, tile.center_x, tile.center_y), tile.x, tile.y, kind.near_plane)
+        shown = pixel.show(rule, splat, hit, row, _values(table, rule.lookup(row, hit.u, hit.v)))
+        weight, light, is_live = pixel.absorb(shown.alpha, light, live > 0)
+        channels = tuple(total + weight * channel for total, channel in zip(channels, shown.channels, strict=True))
+        return at + 1, light, is_live.astype(jnp.int32), channels
+
+    dark = jnp.zeros_like(tile.x)
+    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), (dark,) * kind.num_channels)
+    _, light, _, channels = jax.lax.while_loop(is_unfinished, add_splat, carry)
+    for k, channel in enumerate((*channels, light)):
+        image[pl.program_id(0), k, :] = channel
+
+
+def _backward_kernel(
+    kind: Kind, rule, ids, starts, splats, rows, table, g, behind, jacobian, *zeros_and_results
+):  # fmt: skip
+    d_splats, d_table, d_tap = zeros_and_results[3:]
+    tile = _tile(kind, starts, splats.dtype)
+    index = pl.program_id(0)
+    cotangents = tuple(g[index, k, :] for k in range(kind.num_channels))
+    axes = tuple(tuple(jacobian[i, k] for k in range(3)) for i in range(3))
+
+    def is_unfinished(carry):
+        at, _, live, _ = carry
+        return (at < tile.last) & (jnp.max(live) > 0)
+
+    def add_splat(carry):
+        at, light, live, behind = carry
+        id_ = ids[at]
+        splat, row = _splat(kind, splats, id_), _row(rows, id_)
+        planes, to_M = jax.vjp(lambda M: pixel.planes_of(M, tile.center_x, tile.center_y), splat.M)
+        spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
+        hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
+        entries = rule.lookup(row, hit.u, hit.v)
+        log_tap = jnp.zeros_like(tile.x) if kind.has_statistic else None
+
+        def show(planes, opacity, color, normal, values, log_tap):
+            hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
+            return pixel.show(rule, pixel.Splat(splat.M, opacity, color, normal), hit, row, values, log_tap)
+
+        floats = spread((planes, splat.opacity, splat.color, splat.normal))
+        shown, pull_back = jax.vjp(show, *floats, _values(table, entries), log_tap)
+        seen = sum(cotangent * channel for cotangent, channel in zip(cotangents, shown.channels, strict=True))
+        weight, light, is_live, behind, d_alpha = pixel.absorb_vjp(shown.alpha, light, live > 0, behind, seen)
+        d_shown = pixel.Shown(d_alpha, tuple(weight * cotangent for cotangent in cotangents))
+        *d_floats, d_values, d_log = pull_back(d_shown)
+        contributes = weight > 0
+        # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
+        total = lambda x: jnp.sum(jnp.where(contributes, x, jnp.zeros_like(x)))  # noqa: E731
+        d_planes, *others = jax.tree.map(total, d_floats)
+        for k, number in enumerate(jax.tree.leaves((to_M(d_planes), *others))):
+            _add(kind, d_splats, (id_, k), number)
+        for entry, columns in zip(entries, d_values, strict=True):
+            for column, value in enumerate(columns):
+                _add_all(kind, d_table, entry, column, jnp.where(contributes, value, jnp.zeros_like(value)))
+        if kind.has_statistic:
+            center = tile.center_x, tile.center_y
+            absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d_log, axes, kind.near_plane)
+            for k, number in enumerate((*map(total, absolute), jnp.sum(contributes.astype(weight.dtype)))):
+                _add(kind, d_tap, (id_, k), number)
+        return at + 1, light, is_live.astype(jnp.int32), behind
+
+    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), behind[index, :])
+    jax.lax.while_loop(is_unfinished, add_splat, carry)
+
+
+def _triton() -> Any:
+    module = triton()
+    if module is None:
+        raise ValueError("this JAX has no Triton backend of Pallas: use compositor='xla', or 'auto'")
+    return module
+
+
+def _add(kind: Kind, total, place: tuple[Array, int], number: Array) -> None:
+    """Adds a number to an entry that other programs add to as well."""
+    row, column = place
+    if kind.is_interpreted:
+        total[row, column] += number
+    else:
+        _triton().atomic_add(total, (row, jnp.int32(column)), number)
+
+
+def _add_all(kind: Kind, total, rows: Array, column: int, numbers: Array) -> None:
+    """Adds numbers [P] to entries [P] of a column, which may repeat. The interpreter would lose repeated ones."""
+    if not kind.is_interpreted:
+        _triton().atomic_add(total, (rows, jnp.full_like(rows, column)), numbers)
+        return
+
+    def add_one(k, _):
+        is_it = jax.lax.iota(jnp.int32, rows.shape[0]) == k
+        row = jnp.sum(jnp.where(is_it, rows, 0))
+        total[row, column] += jnp.sum(jnp.where(is_it, numbers, jnp.zeros_like(numbers)))
+        return 0
+
+    jax.lax.fori_loop(0, rows.shape[0], add_one, 0)
+
+
+def _call(kind: Kind, kernel, shapes, num_inputs: int, num_tiles: int, aliases: dict[int, int]):
+    everything = pl.BlockSpec(memory_space=pl.ANY)
+    # Two pixels a thread, in tiles of 16×16.
+    num_warps = min(4, max(1, kind.num_pixels // 64))
+    params = {} if kind.is_interpreted else {"compiler_params": _triton().CompilerParams(num_warps, 1)}
+    return pl.pallas_call(
+        kernel,
+        out_shape=shapes,
+        grid=(num_tiles,),
+        in_specs=[everything] * num_inputs,
+        out_specs=jax.tree.map(lambda _: everything, shapes),
+        input_output_aliases=aliases,
+        interpret=kind.is_interpreted,
+        **params,
+    )
+
+
+def _kind(how, rule) -> Kind:
+    grid = how.grid
+    return Kind(
+        rule=jax.tree.structure(rule),
+        columns=grid.columns,
+        width=grid.width,
+        height=grid.height,
+        tile_size=grid.tile_size,
+        near_plane=how.near_plane,
+        has_geometry=how.has_geometry,
+        has_statistic=how.has_statistic,
+        is_interpreted=jax.default_backend() == "cpu" and not IS_COMPILED_AHEAD,
+    )
+
+
+def _inputs(how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
+    """ids, starts, splats, rows and table; without columns or rows there is one that is not read."""
+    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
+    packed = jnp.concatenate([*columns, *([splats.normals] if how.has_geometry else [])], axis=1)
+    num = packed.shape[0]
+    rows = jnp.stack(rule.rows, axis=1) if rule.rows else jnp.zeros((num, 1), jnp.int32)
+    return lists.ids, lists.starts, packed, rows, params if params.shape[1] else jnp.zeros((1, 1), packed.dtype)
+
+
+def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
+    """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
+    kind = _kind(how, rule)
+    kernel = functools.partial(_forward_kernel, kind, _without_arrays(rule))
+    shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.num_pixels), splats.M.dtype)
+    inputs = _inputs(how, splats, params, rule, lists)
+    image = _call(kind, kernel, shape, len(inputs), how.grid.num, {})(*inputs)[:, None]
+    return image[:, :, :-1], image[:, :, -1]
+
+
+def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: Array, behind: Array):
+    """As `compositor._backward`."""
+    kind = _kind(how, rule)
+    kernel = functools.partial(_backward_kernel, kind, _without_arrays(rule))
+    inputs = (*_inputs(how, splats, params, rule, lists), g[:, 0], behind[:, 0], jacobian.astype(splats.M.dtype))
+    packed, table = inputs[2], inputs[4]
+    zeros = (jnp.zeros_like(packed), jnp.zeros_like(table), jnp.zeros_like(tap))
+    shapes = tuple(jax.ShapeDtypeStruct(zero.shape, zero.dtype) for zero in zeros)
+    aliases = {len(inputs) + k: k for k in range(3)}
+    call = _call(kind, kernel, shapes, len(inputs) + 3, how.grid.num, aliases)
+    packed, table, d_tap = call(*inputs, *zeros)
+    d_splats = type(splats)(
+        M=packed[:, :9].reshape(splats.M.shape),
+        opacities=packed[:, 9],
+        colors=packed[:, 10:13],
+        normals=packed[:, 13:16] if kind.has_geometry else jnp.zeros_like(splats.normals),
+    )
+    return d_splats, table if params.shape[1] else jnp.zeros_like(params), d_tap
+
+
+def _without_arrays(rule):
+    """The rule as its element-wise functions see it: static fields only."""
+    return jax.tree.unflatten(jax.tree.structure(rule), [np.nan] * len(jax.tree.leaves(rule)))

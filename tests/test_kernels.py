@@ -1,0 +1,225 @@
+"""The native loops apart from the images they make: translation, threads, lists, errors, other rules and fallback."""
+
+import dataclasses
+import itertools
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from llvmlite import ir
+from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
+
+from a2tg_jax import RenderSettings, render_appearance, render_image
+from a2tg_jax.appearance import gaussian_cutoff
+from a2tg_jax.geometry import homographies, screen_bounds
+from a2tg_jax.kernels import foreign, lanes, library, native
+from a2tg_jax.kernels.writer import LONG, Writer
+from a2tg_jax.render import appearance_of, render_traced
+from a2tg_jax.tiles import TileGrid, tile_lists
+
+FUNCTIONS = {
+    "arithmetic": lambda x, y: (x + y) * (x - y) / (2 + y * y),
+    "exp": lambda x, y: jnp.exp(x * 10) + jnp.exp(-y),
+    "log and sqrt": lambda x, y: jnp.log(1 + x * x) + jnp.sqrt(y * y),
+    "powers": lambda x, y: x**3 + jnp.square(y) + (2 + x) ** -2,
+    "floor": lambda x, y: jnp.floor(3 * x) + jnp.floor(y).astype(jnp.int32).astype(y.dtype),
+    "choices": lambda x, y: jnp.where((x < y) & ~(x < 0), x, -y) + jnp.where((x != y) | (y > 0), 1.0, 2.0),
+    "limits": lambda x, y: jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y) + jnp.minimum(x, 0.2) + abs(y) + jnp.sign(x),
+    "integers": lambda x, y: (jnp.maximum((x * 9).astype(jnp.int32) * 3 - 1, -2)).astype(x.dtype) + y,
+    "gradient": lambda x, y: jax.grad(lambda x: jnp.clip(x, -0.5, 0.5) * jnp.exp(x) / (1.5 + y))(x),
+}
+
+
+class Elementwise(Writer):
+    """A loop that applies a function of two numbers to arrays."""
+
+    def __init__(self, function, dtype: str, width: int, name: str):
+        self.module = ir.Module(name)
+        super().__init__(self.module, name, ("x", "y", "out"), ("num",), dtype)
+        number = jax.ShapeDtypeStruct((), dtype)
+        traced, _ = lanes.trace(function, number, number)
+        at = lanes.Lanes(self.b, width)
+        with self.loop(LONG(0), self.long(self.arguments["num"])) as (k, _):
+            inputs = [self.load(self.arguments[name], k, at.vector(self.real)) for name in "xy"]
+            self.store(at.emit(traced, inputs)[0], self.arguments["out"], k)
+        self.b.ret_void()
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("width", [1, 4, 8])
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("float64", 1e-13)])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_translated_functions_are_those_of_jax(name, dtype, tolerance, width):
+    x, y = np.random.default_rng(0).normal(size=(2, 64)).astype(dtype)
+    x[:4], y[:4] = [0, 0.5, -0.5, 0.25], [0, 0.5, 1, 0.25]
+    tag = f"{name}_{dtype}_{width}".replace(" ", "_")
+    addresses = library.compile_module(Elementwise(FUNCTIONS[name], dtype, width, tag).module)
+    out = np.empty_like(x)
+    run = library.as_function(addresses[tag], 3, 1)
+    run(*(array.ctypes.data for array in (x, y, out)), len(x) // width)
+    expected = jax.vmap(FUNCTIONS[name])(jnp.asarray(x), jnp.asarray(y))
+    np.testing.assert_allclose(out, expected, rtol=tolerance, atol=tolerance)
+
+
+def test_what_cannot_be_translated_is_named():
+    builder = Elementwise(lambda x, y: x, "float32", 1, "refused")
+    traced, _ = lanes.trace(jnp.tan, jax.ShapeDtypeStruct((), jnp.float32))
+    with pytest.raises(NotImplementedError, match="'tan'"):
+        lanes.Lanes(builder.b, 1).emit(traced, [lanes.Lanes(builder.b, 1).constant(1.0, builder.real)])
+
+
+def test_an_error_in_a_handler_reaches_the_caller(capsys):
+    def handler(arguments, results):
+        raise ValueError(f"refused {arguments[0].tolist()}")
+
+    foreign.register("a2tg_test_error", handler)
+    x = jnp.arange(3, dtype=jnp.float32)
+    with pytest.raises(Exception, match=r"refused \[0\.0, 1\.0, 2\.0\]"):
+        jax.block_until_ready(jax.ffi.ffi_call("a2tg_test_error", jax.ShapeDtypeStruct((3,), jnp.float32))(x))
+    assert "ValueError: refused" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("tile_size", [8, 16])
+def test_lists_are_those_of_xla(tile_size, dtype):
+    scene = draw_scene(4, num=300)
+    gaussians, camera = as_gaussians(scene, dtype), as_camera(scene, dtype)
+    M, _ = homographies(gaussians, camera)
+    # Equal depths, to see ties in order of the index.
+    depths = jnp.round(M[:, 2, 2], 1)
+    bounds = screen_bounds(M, gaussian_cutoff(gaussians.opacities), 0.2)
+    grid = TileGrid(scene.width, scene.height, tile_size)
+    ours = jax.jit(lambda: native.tile_lists(bounds, depths, grid, 20_000))()
+    expected = jax.jit(lambda: tile_lists(bounds, depths, grid, 20_000))()
+    np.testing.assert_array_equal(ours.starts, expected.starts)
+    num_pairs = int(ours.starts[-1])
+    assert num_pairs > 500
+    np.testing.assert_array_equal(ours.ids[:num_pairs], expected.ids[:num_pairs])
+    assert ours.num_pairs == expected.num_pairs and not ours.overflow
+
+    full = jax.jit(lambda: native.tile_lists(bounds, depths, grid, 100))()
+    assert full.overflow and full.starts[-1] == 0
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_share_the_work_and_nothing_else(monkeypatch, threads):
+    """Images are bit for bit those of one thread; gradients, summed by thread, are equal to rounding."""
+    scene = draw_scene(3, num=60)
+    gaussians, camera, textures = as_gaussians(scene, "float32"), as_camera(scene, "float32"), None
+    textures, layout = as_textures(scene, "float32")
+
+    def loss(gaussians, textures):
+        output = render_image(gaussians, camera, textures, layout)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth), output
+
+    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    monkeypatch.setattr(native, "num_threads", lambda: 1)
+    (_, one), expected = differentiate(gaussians, textures)
+    monkeypatch.setattr(native, "num_threads", lambda: threads)
+    monkeypatch.setattr(native, "PAIRS_PER_THREAD", 10)
+    (_, many), found = differentiate(gaussians, textures)
+    np.testing.assert_array_equal(many.color, one.color)
+    np.testing.assert_array_equal(many.depth, one.depth)
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5 * float(jnp.abs(a).max()))
+
+
+def test_parts_cover_all_tiles():
+    starts = np.concatenate([[0], np.cumsum(np.random.default_rng(0).integers(0, 500, 100))]).astype(np.int32)
+    parts = native._parts(starts)
+    assert parts[0][0] == 0 and parts[-1][1] == 100
+    assert all(one[1] == other[0] for one, other in itertools.pairwise(parts))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class HalvesAppearance:
+    """A rule of another kind: two colours and one opacity a splat, [2N, 3], by the sign of u, and another falloff."""
+
+    params: jax.Array
+    first: jax.Array
+    sharpness: float = dataclasses.field(metadata={"static": True})
+
+    @property
+    def rows(self):
+        return (self.first,)
+
+    def lookup(self, row, u, v):
+        return (row[0] + (u > 0).astype(jnp.int32),)
+
+    def shade(self, row, values, u, v):
+        ((a, b, c),) = values
+        return (a, b * u, c), None
+
+    def falloff(self, rho):
+        return jnp.exp(-0.5 * rho) / (1 + self.sharpness * rho)
+
+    def cutoff(self, opacities):
+        return gaussian_cutoff(opacities)
+
+
+@pytest.mark.usefixtures("x64")
+def test_any_appearance_rule_is_compiled():
+    scene = draw_scene(9)
+    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    params = jnp.asarray(np.random.default_rng(0).normal(size=(2 * gaussians.num, 3)))
+    first = jnp.arange(gaussians.num, dtype=jnp.int32) * 2
+
+    def loss(gaussians, params, compositor):
+        rule = HalvesAppearance(params, first, 0.2)
+        output = render_appearance(gaussians, camera, rule, settings=RenderSettings(compositor=compositor))
+        return jnp.sum(output.color**2), output.color
+
+    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    (_, expected), wanted = differentiate(gaussians, params, "xla")
+    (_, image), found = differentiate(gaussians, params, "native")
+    assert jnp.abs(wanted[1]).max() > 1e-3
+    np.testing.assert_allclose(image, expected, atol=1e-10)
+    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
+
+
+@pytest.mark.parametrize("has_textures", [False, True])
+def test_pallas_kernels_are_those_of_xla(has_textures):
+    """Interpreted, on a small scene: the image, the gradient, and the absolute positional gradient."""
+    scene = draw_scene(4, num=16, width=19, height=13)
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    textures, layout = as_textures(scene, "float32") if has_textures else (None, None)
+
+    def loss(gaussians, textures, tap, compositor):
+        settings = RenderSettings(compositor=compositor, capacity=1024)
+        rule = appearance_of(gaussians, textures, layout, settings)
+        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, tap=tap)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
+
+    differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)
+    inputs = gaussians, textures, jnp.zeros((gaussians.num, 4))
+    (_, expected), wanted = differentiate(*inputs, "xla")
+    (_, output), found = differentiate(*inputs, "pallas")
+    assert expected.alpha.max() > 0.5 and wanted[2][:, 3].max() > 10
+    for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
+
+
+def test_without_llvmlite_xla_composites():
+    script = """
+import sys
+sys.modules["llvmlite"] = None
+import jax.numpy as jnp
+from a2tg_jax import Camera, RenderSettings, init_from_points, render_image
+gaussians = init_from_points([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]], [[1, 1, 1]] * 3)
+camera = Camera(jnp.eye(4), jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
+assert render_image(gaussians, camera).alpha.max() > 0.05
+try:
+    render_image(gaussians, camera, settings=RenderSettings(compositor="native"))
+except ValueError as error:
+    assert "pip install llvmlite" in str(error)
+else:
+    raise AssertionError("nothing was refused")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
