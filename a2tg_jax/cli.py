@@ -40,7 +40,7 @@ OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
-  a2tg demo                            a whole run on a built-in scene, a few minutes on two cores
+  a2tg demo                            a whole run on a built-in scene, about a minute on two cores
   a2tg sfm photos/ scene/              camera poses for plain photographs, by COLMAP
   a2tg train scene/ --out runs/scene   train in two stages, evaluate, write a report
   a2tg eval runs/scene                 measure a run again
@@ -55,7 +55,7 @@ With A2TG_DEBUG=1 in the environment an error shows its traceback."""
 class Demo:
     """Train the built-in synthetic scene with textures and, for comparison, without.
 
-    Takes a few minutes on two cores and writes a report with pictures: open runs/demo/report.html.
+    Takes about a minute on two cores and writes a report with pictures: open runs/demo/report.html.
     """
 
     out: Path = Path("runs/demo")

@@ -141,9 +141,9 @@ def show(rule: AppearanceRule, splat: Splat, hit: Hit, row, values, log_tap: Arr
 def absorb(alpha: Array, light: Array, is_live: Array) -> Triple:
     """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
     leave less than 10⁻⁴."""
-    after = light * (1 - alpha)
-    is_live = is_live & (after >= MIN_TRANSMITTANCE)
-    return jnp.where(is_live, alpha * light, 0.0), jnp.where(is_live, after, light), is_live
+    is_live = is_live & (light * (1 - alpha) >= MIN_TRANSMITTANCE)
+    weight = jnp.where(is_live, alpha * light, 0.0)
+    return weight, light - weight, is_live
 
 
 def absorb_vjp(alpha: Array, light: Array, is_live: Array, behind: Array, shown: Array):

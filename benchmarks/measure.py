@@ -99,7 +99,7 @@ def measure_stages(case: dict) -> dict:
     depths = splats.M[:, 2, 2]
     find_lists = jax.jit(lambda bounds, depths: native.tile_lists(bounds, depths, grid, settings.capacity))
     lists = find_lists(bounds, depths)
-    how = Compositing(grid, settings.near_plane, False, False, 1, True)
+    how = Compositing(grid, settings.near_plane, False, False, "native", 1)
     jacobian, tap = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 
     def colors(splats, rule):
