@@ -166,6 +166,50 @@ def absorb_vjp(alpha: Array, light: Array, is_live: Array, behind: Array, shown:
     return weight, after, live_after, behind, d_alpha
 
 
+class Cotangents(NamedTuple):
+    """What one splat at one pixel adds to the gradient."""
+
+    planes: Planes
+    opacity: Array
+    color: Triple
+    normal: Triple | None
+    values: tuple
+    """Of what the rule read of its table."""
+    log_falloff: Array | None
+    """∂L/∂(log of the falloff), where asked for."""
+
+
+def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, row, values, x, y, light, is_live):
+    """One splat at one pixel of the forward pass: what it adds to the channels, and light and liveness behind it."""
+    shown = show(rule, splat, intersect(planes, x, y, near_plane), row, values)
+    weight, light, is_live = absorb(shown.alpha, light, is_live)
+    return tuple(weight * channel for channel in shown.channels), light, is_live
+
+
+def composite_vjp(
+    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, row, values, x, y, light, is_live, behind, g,
+    has_log: bool,
+):  # fmt: skip
+    """One splat at one pixel of the backward pass; `behind` and `g` as in `absorb_vjp`, g channel by channel.
+
+    Returns:
+      (light, is_live, behind) behind the splat, its weight, and its Cotangents, which mean something only where the
+      weight is positive: elsewhere they may not even be finite.
+    """
+
+    def of_floats(planes, opacity, color, normal, values, log_tap):
+        hit = intersect(planes, x, y, near_plane)
+        return show(rule, Splat(splat.M, opacity, color, normal), hit, row, values, log_tap)
+
+    log_tap = jnp.zeros_like(light) if has_log else None
+    floats = planes, splat.opacity, splat.color, splat.normal, values, log_tap
+    shown, pull_back = jax.vjp(of_floats, *floats)
+    seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
+    weight, light, is_live, behind, d_alpha = absorb_vjp(shown.alpha, light, is_live, behind, seen)
+    cotangents = Cotangents(*pull_back(Shown(d_alpha, tuple(weight * g_k for g_k in g))))
+    return (light, is_live, behind), weight, cotangents
+
+
 def absolute_gradient(M, x: Array, y: Array, tile_x, tile_y, d_log: Array, jacobian, near_plane: float) -> Triple:
     """|∂L/∂μ| at a pixel per world component, through the falloff only; zero where `d_log` is.
 

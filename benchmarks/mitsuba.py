@@ -2,8 +2,8 @@
 
     PYTHON_WITH_MITSUBA -m benchmarks.mitsuba '{"num": 10000, "width": 320, "height": 240, "threads": 1}'
 
-The ellipsoids are the workload's Gaussians with a third scale of a tenth of the smaller one: Mitsuba has no flat ones. It
-traces rays; one sample a pixel, L1 against a fixed random image, gradients for all of the ellipsoids' parameters.
+The ellipsoids are the workload's Gaussians with a third scale of a tenth of the smaller one: Mitsuba has no flat ones.
+It traces rays; one sample a pixel, L1 against a fixed random image, gradients for all of the ellipsoids' parameters.
 """
 
 import json

@@ -133,11 +133,14 @@ class Lanes:
         return [PRIMITIVES[name](self, operands, equation)]
 
     def exp(self, x: ir.Value) -> ir.Value:
-        """exp to about one unit in the last place: 2^n·p(r) with r = x − n·ln 2, |r| <= ln 2 / 2."""
+        """exp to about one unit in the last place: 2^n·p(r) with r = x − n·ln 2, |r| <= ln 2 / 2.
+
+        In float32 the argument is held in [−87, 88], where the result is a normal number.
+        """
         if scalar_of(x.type) == ir.DoubleType():
             return self.intrinsic("exp", [x])
         b, number = self.builder, functools.partial(self.constant, scalar=ir.FloatType())
-        x = self._least(self._most(x, number(-87.0)), number(88.0))
+        x = self.smaller(self.larger(x, number(-87.0)), number(88.0))
         n = self.intrinsic("rint", [self._mul(x, number(math.log2(math.e)))])
         r = b.fsub(x, self._mul(n, number(0.693359375)), flags=FLAGS)
         r = b.fsub(r, self._mul(n, number(-2.12194440e-4)), flags=FLAGS)
@@ -151,12 +154,14 @@ class Lanes:
     def _mul(self, x: ir.Value, y: ir.Value) -> ir.Value:
         return self.builder.fmul(x, y, flags=FLAGS)
 
-    def _most(self, x: ir.Value, y: ir.Value) -> ir.Value:
+    def larger(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """max(x, y), lane by lane; x where either is not a number."""
         if not _is_float(x.type):
             return self.builder.select(self.builder.icmp_signed(">", x, y), x, y)
         return self.builder.select(self.builder.fcmp_unordered(">", x, y), x, y)
 
-    def _least(self, x: ir.Value, y: ir.Value) -> ir.Value:
+    def smaller(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """min(x, y), lane by lane; x where either is not a number."""
         if not _is_float(x.type):
             return self.builder.select(self.builder.icmp_signed("<", x, y), x, y)
         return self.builder.select(self.builder.fcmp_unordered("<", x, y), x, y)
@@ -256,12 +261,12 @@ def _sign(lanes: Lanes, operands, _) -> ir.Value:
 
 def _clamp(lanes: Lanes, operands, _) -> ir.Value:
     low, x, high = operands
-    return lanes._least(lanes._most(x, low), high)
+    return lanes.smaller(lanes.larger(x, low), high)
 
 
 def _absolute(lanes: Lanes, operands, _) -> ir.Value:
     (x,) = operands
-    return lanes.intrinsic("fabs", [x]) if _is_float(x.type) else lanes._most(x, lanes.builder.neg(x))
+    return lanes.intrinsic("fabs", [x]) if _is_float(x.type) else lanes.larger(x, lanes.builder.neg(x))
 
 
 def _identity(lanes: Lanes, operands, _) -> ir.Value:
@@ -276,8 +281,8 @@ PRIMITIVES: dict[str, Callable[[Lanes, list[ir.Value], Any], ir.Value]] = {
     "div": _binary("fdiv", "sdiv"),
     "square": lambda lanes, operands, _: lanes._mul(operands[0], operands[0]),
     "neg": _negate,
-    "max": lambda lanes, operands, _: lanes._most(*operands),
-    "min": lambda lanes, operands, _: lanes._least(*operands),
+    "max": lambda lanes, operands, _: lanes.larger(*operands),
+    "min": lambda lanes, operands, _: lanes.smaller(*operands),
     "abs": _absolute,
     "sign": _sign,
     "floor": _intrinsic("floor"),

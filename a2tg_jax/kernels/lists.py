@@ -101,8 +101,7 @@ def list_loops(dtype: str, tile_size: int) -> ListLoops:
     """The loops for outlines of a dtype and tiles of a size, compiled at the first call."""
     module = ir.Module("lists")
     find, place = f"find_{dtype}_{tile_size}", f"place_{dtype}_{tile_size}"
-    with jax.ensure_compile_time_eval():
-        _Find(module, find, dtype, tile_size).write()
+    _Find(module, find, dtype, tile_size).write()
     _Place(module, place).write()
     addresses = library.compile_module(module)
     return ListLoops(

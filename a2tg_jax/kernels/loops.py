@@ -16,15 +16,14 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax import pixel
 from a2tg_jax.kernels import library
-from a2tg_jax.kernels.lanes import BOOL, INT, Lanes, trace
-from a2tg_jax.kernels.writer import LONG, Writer
+from a2tg_jax.kernels.functions import Functions, Kind
+from a2tg_jax.kernels.lanes import BOOL, INT, Lanes
+from a2tg_jax.kernels.table import TableWriter
+from a2tg_jax.kernels.writer import LONG
 
 INTEGERS = ("first", "last", "columns", "width", "height", "entries")
 FORWARD = ("ids", "starts", "splats", "rows", "table", "image")
@@ -33,106 +32,12 @@ CUTOFF_SLACK = 1e-3
 """Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Kind:
-    """What a pair of loops is made for; hashable."""
-
-    rule: Any
-    """The tree structure of an appearance rule: its class and static fields."""
-    num_rows: int
-    """Integers that the rule keeps of a splat."""
-    num_columns: int
-    """C, numbers in an entry of its table."""
-    dtype: Any
-    tile_size: int
-    near_plane: float
-    has_geometry: bool
-    has_statistic: bool
-
-    @property
-    def num_channels(self) -> int:
-        return 8 if self.has_geometry else 3
-
-    @property
-    def num_floats(self) -> int:
-        """S: the 9 entries of M, opacity, colour (, normal), and the squared distance beyond which nothing shows."""
-        return 17 if self.has_geometry else 14
-
-    @property
-    def lanes(self) -> int:
-        """L."""
-        return library.vector_bytes() // np.dtype(self.dtype).itemsize
-
-    @property
-    def num_vectors(self) -> int:
-        """Vectors of L pixels in a tile, the last one perhaps not full."""
-        return -(-(self.tile_size**2) // self.lanes)
-
-
-class _Functions:
-    """The jaxprs of one kind."""
-
-    def __init__(self, kind: Kind):
-        rule = jax.tree.unflatten(kind.rule, [None] * kind.rule.num_leaves)
-        number: Any = jax.ShapeDtypeStruct((), kind.dtype)
-        integer, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), jnp.bool_)
-        triple, near_plane = (number,) * 3, kind.near_plane
-        splat = pixel.Splat((triple,) * 3, number, triple, triple if kind.has_geometry else None)
-        row = (integer,) * kind.num_rows
-
-        self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
-        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
-        self.num_planes = structure.num_leaves
-
-        def rho_and_entries(planes, row, x, y):
-            hit = pixel.intersect(planes, x, y, near_plane)
-            return hit.rho, rule.lookup(row, hit.u, hit.v)
-
-        self.reach, structure = trace(rho_and_entries, planes, row, number, number)
-        self.num_taps = structure.num_leaves - 1
-        values = ((number,) * kind.num_columns,) * self.num_taps
-
-        def show(planes, splat, row, values, x, y, log_tap=None):
-            return pixel.show(rule, splat, pixel.intersect(planes, x, y, near_plane), row, values, log_tap)
-
-        def forward(planes, splat, row, values, x, y, light, is_live, channels):
-            shown = show(planes, splat, row, values, x, y)
-            weight, light, is_live = pixel.absorb(shown.alpha, light, is_live)
-            added = tuple(total + weight * channel for total, channel in zip(channels, shown.channels, strict=True))
-            return light, is_live, added
-
-        def backward(planes, splat, row, values, x, y, tile_x, tile_y, light, is_live, behind, g, jacobian):
-            log_tap = jnp.zeros((), kind.dtype) if kind.has_statistic else None
-            floats = (planes, splat.opacity, splat.color, splat.normal, values, log_tap)
-
-            def of_floats(planes, opacity, color, normal, values, log_tap):
-                return show(planes, pixel.Splat(splat.M, opacity, color, normal), row, values, x, y, log_tap)
-
-            shown, pull_back = jax.vjp(of_floats, *floats)
-            seen = sum(g[k] * channel for k, channel in enumerate(shown.channels))
-            weight, light, is_live, behind, d_alpha = pixel.absorb_vjp(shown.alpha, light, is_live, behind, seen)
-            *d_floats, d_values, d_log = pull_back(pixel.Shown(d_alpha, tuple(weight * g_k for g_k in g)))
-            tap = ()
-            if kind.has_statistic:
-                tap = pixel.absolute_gradient(splat.M, x, y, tile_x, tile_y, d_log, jacobian, near_plane)
-            return (light, is_live, behind), weight > 0, d_values, (*d_floats, tap)
-
-        def prepare_vjp(M, x, y, d_planes):
-            return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
-
-        channels = (number,) * kind.num_channels
-        self.forward, _ = trace(forward, planes, splat, row, values, number, number, number, flag, channels)
-        at_pixel = planes, splat, row, values, number, number, number, number, number, flag, number, channels
-        self.backward, _ = trace(backward, *at_pixel, (triple,) * 3)
-        self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
-
-
-class _Compositing(Writer):
+class _Compositing(TableWriter):
     """What both passes share."""
 
-    def __init__(self, kind: Kind, functions: _Functions, module: ir.Module, name: str, buffers: Sequence[str]):
+    def __init__(self, kind: Kind, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
         super().__init__(module, name, buffers, INTEGERS, kind.dtype)
-        self.kind, self.functions = kind, functions
+        self.kind, self.functions, self.num_columns = kind, functions, kind.num_columns
         self.lanes, self.scalars = Lanes(self.b, kind.lanes), Lanes(self.b, 1)
         self.reals = self.lanes.vector(self.real)
         self.integers = self.lanes.vector(INT)
@@ -195,94 +100,6 @@ class _Compositing(Writer):
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
         return [self.lanes.splat(number) for number in numbers]
-
-    def entries(self, taps: Sequence[ir.Value]) -> list[ir.Value]:
-        """The table's entries that a vector reads, kept inside the table whatever a lane holds."""
-        most = self.lanes.splat(self.b.sub(self.arguments["entries"], INT(1)))
-        return [self.lanes._most(self.lanes._least(tap, most), self.lanes.constant(0, INT)) for tap in taps]
-
-    def is_uniform(self, entries: Sequence[ir.Value]) -> ir.Value:
-        """Whether all lanes read one and the same entry for all taps: a texture of one texel, or a large texel."""
-        first = self.lanes.splat(self.b.extract_element(entries[0], INT(0)))
-        is_other = [self.b.icmp_signed("!=", entry, first) for entry in entries]
-        return self.b.not_(self.lanes.any(functools.reduce(self.b.or_, is_other)))
-
-    def entry(self, name: str, id_: ir.Value) -> ir.Value:
-        """The address of an entry of the table, or of its cotangents."""
-        return self.at(self.arguments[name], self.times(self.long(id_), self.kind.num_columns), self.real)
-
-    def gather(self, entries: Sequence[ir.Value], is_uniform: ir.Value | None) -> list[ir.Value]:
-        """C vectors for every tap."""
-        if is_uniform is None:
-            return []
-        b, kind = self.b, self.kind
-        rooms = [self.variable(self.reals) for _ in range(kind.num_columns * len(entries))]
-        with b.if_else(is_uniform) as (uniform, mixed):
-            with uniform:
-                base = self.entry("table", b.extract_element(entries[0], INT(0)))
-                numbers = [self.lanes.splat(self.load(base, k, self.real)) for k in range(kind.num_columns)]
-                for room, number in zip(rooms, numbers * len(entries), strict=True):
-                    b.store(number, room)
-            with mixed:
-                vector = ir.VectorType(self.real, kind.num_columns)
-                columns: list[ir.Value] = []
-                for entry in entries:
-                    bases = [self.entry("table", b.extract_element(entry, INT(k))) for k in range(self.lanes.width)]
-                    columns += self.transpose([self.load(base, 0, vector) for base in bases])
-                for room, column in zip(rooms, columns, strict=True):
-                    b.store(column, room)
-        return [b.load(room, typ=self.reals) for room in rooms]
-
-    def transpose(self, entries: Sequence[ir.Value]) -> list[ir.Value]:
-        """L vectors of C as C vectors of L."""
-        if self.kind.num_columns != 4 or self.lanes.width % 4:
-            return self.rearrange(entries, self.lanes.width)
-        return self.transpose_quarters([self.concatenate(entries[k::4]) for k in range(4)])
-
-    def transpose_back(self, columns: Sequence[ir.Value]) -> list[ir.Value]:
-        """C vectors of L as L vectors of C."""
-        width = self.lanes.width
-        if self.kind.num_columns != 4 or width % 4:
-            return self.rearrange(columns, self.kind.num_columns)
-        quarters = self.transpose_quarters(columns)
-        masks = [ir.Constant(ir.VectorType(INT, 4), list(range(first, first + 4))) for first in range(0, width, 4)]
-        return [self.b.shuffle_vector(quarters[k], quarters[k], mask) for mask in masks for k in range(4)]
-
-    def rearrange(self, vectors: Sequence[ir.Value], width: int) -> list[ir.Value]:
-        """The transpose of any number of vectors, element by element; `width` is how many there are."""
-        rows = []
-        for k in range(vectors[0].type.count):
-            row = ir.Constant(ir.VectorType(self.real, width), ir.Undefined)
-            for place, vector in enumerate(vectors):
-                row = self.b.insert_element(row, self.b.extract_element(vector, INT(k)), INT(place))
-            rows.append(row)
-        return rows
-
-    def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
-        """Four vectors, every four lanes of them transposed as a 4×4 matrix."""
-        low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
-        high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
-        first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
-        pairs = (low01, low23, first), (low01, low23, second), (high01, high23, first), (high01, high23, second)
-        return [self.shuffle(*pair) for pair in pairs]
-
-    def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
-        """The pattern in every four lanes; numbers are lanes of x, strings of y."""
-        width = self.lanes.width
-        mask = [
-            quarter + (width + int(lane) if isinstance(lane, str) else lane)
-            for quarter in range(0, width, 4)
-            for lane in pattern
-        ]
-        return self.b.shuffle_vector(x, y, ir.Constant(ir.VectorType(INT, width), mask))
-
-    def concatenate(self, pieces: Sequence[ir.Value]) -> ir.Value:
-        pieces = list(pieces)
-        while len(pieces) > 1:
-            count = pieces[0].type.count * 2
-            mask = ir.Constant(ir.VectorType(INT, count), list(range(count)))
-            pieces = [self.b.shuffle_vector(*pieces[k : k + 2], mask) for k in range(0, len(pieces), 2)]
-        return pieces[0]
 
 
 class _Forward(_Compositing):
@@ -399,7 +216,7 @@ class _Backward(_Compositing):
                 values = self.gather(entries, is_uniform)
                 before = [self.load(light, k, self.reals), is_live, self.load(behind, k, self.reals)]
                 cotangents = [self.load(channel, k, self.reals) for channel in g]
-                at_pixel = [*planes, *splat, *row, *values, x, y, *tile_center, *before, *cotangents, *jacobian]
+                at_pixel = [*planes, *splat, *row, *values, x, y, *before, *cotangents, *tile_center, *jacobian]
                 after, still_live, left, contributes, *rest = lanes.emit(functions.backward, at_pixel)
                 self.store(after, light, k)
                 self.store(b.zext(still_live, self.integers), live, k)
@@ -437,29 +254,6 @@ class _Backward(_Compositing):
         for k, value in enumerate(values):
             self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
 
-    def scatter(self, entries: Sequence[ir.Value], is_uniform: ir.Value | None, d_values: Sequence[ir.Value]) -> None:
-        """Adds the cotangents of what was gathered, lane after lane, in order."""
-        if is_uniform is None:
-            return
-        b, columns = self.b, self.kind.num_columns
-        by_tap = [d_values[k : k + columns] for k in range(0, len(d_values), columns)]
-        with b.if_else(is_uniform) as (uniform, mixed):
-            with uniform:
-                sums = [functools.reduce(self.add_up, same) for same in zip(*by_tap, strict=True)]
-                total = functools.reduce(self.add_up, self.transpose_back(sums))
-                self.add_entry(b.extract_element(entries[0], INT(0)), total)
-            with mixed:
-                for entry, vectors in zip(entries, by_tap, strict=True):
-                    for lane, row in enumerate(self.transpose_back(vectors)):
-                        self.add_entry(b.extract_element(entry, INT(lane)), row)
-
-    def add_entry(self, id_: ir.Value, addend: ir.Value) -> None:
-        base = self.entry("d_table", id_)
-        self.store(self.add_up(self.load(base, 0, addend.type), addend), base, 0)
-
-    def add_up(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        return self.b.fadd(x, y)
-
 
 @dataclasses.dataclass(frozen=True)
 class Loops:
@@ -472,8 +266,7 @@ class Loops:
 @functools.cache
 def loops(kind: Kind) -> Loops:
     """The loops of a kind, compiled at the first call."""
-    with jax.ensure_compile_time_eval():
-        functions = _Functions(kind)
+    functions = Functions(kind)
     module = ir.Module("loops")
     tag = f"{abs(hash(kind)):x}"
     forward, backward = f"forward_{tag}", f"backward_{tag}"

@@ -18,6 +18,7 @@ from jax import Array
 
 from a2tg_jax.geometry import ScreenBounds
 from a2tg_jax.kernels import foreign
+from a2tg_jax.kernels.packing import pack_rows, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists, outlines, tile_rectangles
 
 PAIRS_PER_THREAD = 2_000
@@ -37,7 +38,7 @@ def _pool() -> concurrent.futures.ThreadPoolExecutor:
 
 
 def _kind(how, splats, rule):
-    from a2tg_jax.kernels.loops import Kind
+    from a2tg_jax.kernels.functions import Kind
 
     return Kind(
         rule=jax.tree.structure(rule),
@@ -73,12 +74,7 @@ def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: A
     )
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
     packed, d_params, d_tap = call(*_inputs(kind, how, splats, params, rule, lists), g, behind, jacobian.astype(dtype))
-    d_splats = type(splats)(
-        M=packed[:, :9].reshape(splats.M.shape),
-        opacities=packed[:, 9],
-        colors=packed[:, 10:13],
-        normals=packed[:, 13:16] if kind.has_geometry else jnp.zeros_like(splats.normals),
-    )
+    d_splats = unpack_splats(packed, splats, kind.has_geometry)
     return d_splats, d_params, d_tap if kind.has_statistic else jnp.zeros_like(tap)
 
 
@@ -129,15 +125,9 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
     """ids, starts, splats, rows, table, and (columns, width, height)."""
-    cutoff = rule.cutoff(splats.opacities)[:, None]
-    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
-    packed = jnp.concatenate([*columns, *([splats.normals] if kind.has_geometry else []), cutoff], axis=1)
-    rows = jnp.stack(rule.rows, axis=1) if rule.rows else jnp.zeros((1, 0), jnp.int32)
-    grid = how.grid
-    return (
-        lists.ids, lists.starts, packed, rows, params,
-        jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32),
-    )  # fmt: skip
+    packed = pack_splats(splats, kind.has_geometry, rule.cutoff(splats.opacities))
+    size = jnp.asarray([how.grid.columns, how.grid.width, how.grid.height], jnp.int32)
+    return lists.ids, lists.starts, packed, pack_rows(rule), params, size
 
 
 def _registered(kind, which: str, make_handler: Callable) -> str:

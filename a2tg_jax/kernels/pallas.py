@@ -15,6 +15,7 @@ from jax.experimental import pallas as pl
 
 from a2tg_jax import pixel
 from a2tg_jax.kernels.choice import triton
+from a2tg_jax.kernels.packing import NUM_PLAIN, NUM_WITH_NORMAL, pack_rows, pack_splats, unpack_splats
 
 IS_COMPILED_AHEAD = False
 """Set where kernels are compiled on a machine that has no GPU, for one that has; else CPUs interpret them."""
@@ -70,7 +71,7 @@ def _tile(kind: Kind, starts, dtype) -> _Tile:
 
 
 def _splat(kind: Kind, splats, id_) -> pixel.Splat:
-    numbers = [splats[id_, k] for k in range(16 if kind.has_geometry else 13)]
+    numbers = [splats[id_, k] for k in range(NUM_WITH_NORMAL if kind.has_geometry else NUM_PLAIN)]
     M = tuple(tuple(numbers[3 * i : 3 * i + 3]) for i in range(3))
     normal = tuple(numbers[13:16]) if kind.has_geometry else None
     return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal)  # type: ignore[arg-type]
@@ -95,10 +96,12 @@ def _forward_kernel(kind: Kind, rule, ids, starts, splats, rows, table, image):
         at, light, live, channels = carry
         id_ = ids[at]
         splat, row = _splat(kind, splats, id_), _row(rows, id_)
-        hit = pixel.intersect(pixel.planes_of(splat.M, tile.center_x, tile.center_y), tile.x, tile.y, kind.near_plane)
-        shown = pixel.show(rule, splat, hit, row, _values(table, rule.lookup(row, hit.u, hit.v)))
-        weight, light, is_live = pixel.absorb(shown.alpha, light, live > 0)
-        channels = tuple(total + weight * channel for total, channel in zip(channels, shown.channels, strict=True))
+        planes = pixel.planes_of(splat.M, tile.center_x, tile.center_y)
+        hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
+        values = _values(table, rule.lookup(row, hit.u, hit.v))
+        at_pixel = planes, splat, row, values, tile.x, tile.y, light, live > 0
+        added, light, is_live = pixel.composite(rule, kind.near_plane, *at_pixel)
+        channels = tuple(total + more for total, more in zip(channels, added, strict=True))
         return at + 1, light, is_live.astype(jnp.int32), channels
 
     dark = jnp.zeros_like(tile.x)
@@ -126,33 +129,26 @@ def _backward_kernel(
         id_ = ids[at]
         splat, row = _splat(kind, splats, id_), _row(rows, id_)
         planes, to_M = jax.vjp(lambda M: pixel.planes_of(M, tile.center_x, tile.center_y), splat.M)
-        spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
         hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
         entries = rule.lookup(row, hit.u, hit.v)
-        log_tap = jnp.zeros_like(tile.x) if kind.has_statistic else None
-
-        def show(planes, opacity, color, normal, values, log_tap):
-            hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
-            return pixel.show(rule, pixel.Splat(splat.M, opacity, color, normal), hit, row, values, log_tap)
-
-        floats = spread((planes, splat.opacity, splat.color, splat.normal))
-        shown, pull_back = jax.vjp(show, *floats, _values(table, entries), log_tap)
-        seen = sum(cotangent * channel for cotangent, channel in zip(cotangents, shown.channels, strict=True))
-        weight, light, is_live, behind, d_alpha = pixel.absorb_vjp(shown.alpha, light, live > 0, behind, seen)
-        d_shown = pixel.Shown(d_alpha, tuple(weight * cotangent for cotangent in cotangents))
-        *d_floats, d_values, d_log = pull_back(d_shown)
+        # A number per pixel, so that each pixel has a cotangent of its own.
+        spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
+        at_pixel = spread(planes), spread(splat), row, _values(table, entries), tile.x, tile.y, light, live > 0
+        (light, is_live, behind), weight, d = pixel.composite_vjp(
+            rule, kind.near_plane, *at_pixel, behind, cotangents, kind.has_statistic
+        )
         contributes = weight > 0
         # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
         total = lambda x: jnp.sum(jnp.where(contributes, x, jnp.zeros_like(x)))  # noqa: E731
-        d_planes, *others = jax.tree.map(total, d_floats)
+        d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal))
         for k, number in enumerate(jax.tree.leaves((to_M(d_planes), *others))):
             _add(kind, d_splats, (id_, k), number)
-        for entry, columns in zip(entries, d_values, strict=True):
+        for entry, columns in zip(entries, d.values, strict=True):
             for column, value in enumerate(columns):
                 _add_all(kind, d_table, entry, column, jnp.where(contributes, value, jnp.zeros_like(value)))
         if kind.has_statistic:
             center = tile.center_x, tile.center_y
-            absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d_log, axes, kind.near_plane)
+            absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d.log_falloff, axes, kind.near_plane)
             for k, number in enumerate((*map(total, absolute), jnp.sum(contributes.astype(weight.dtype)))):
                 _add(kind, d_tap, (id_, k), number)
         return at + 1, light, is_live.astype(jnp.int32), behind
@@ -226,11 +222,9 @@ def _kind(how, rule) -> Kind:
 
 def _inputs(how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
     """ids, starts, splats, rows and table; without columns or rows there is one that is not read."""
-    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
-    packed = jnp.concatenate([*columns, *([splats.normals] if how.has_geometry else [])], axis=1)
-    num = packed.shape[0]
-    rows = jnp.stack(rule.rows, axis=1) if rule.rows else jnp.zeros((num, 1), jnp.int32)
-    return lists.ids, lists.starts, packed, rows, params if params.shape[1] else jnp.zeros((1, 1), packed.dtype)
+    packed = pack_splats(splats, how.has_geometry)
+    table = params if params.shape[1] else jnp.zeros((1, 1), packed.dtype)
+    return lists.ids, lists.starts, packed, pack_rows(rule, least_columns=1), table
 
 
 def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
@@ -254,12 +248,7 @@ def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: A
     aliases = {len(inputs) + k: k for k in range(3)}
     call = _call(kind, kernel, shapes, len(inputs) + 3, how.grid.num, aliases)
     packed, table, d_tap = call(*inputs, *zeros)
-    d_splats = type(splats)(
-        M=packed[:, :9].reshape(splats.M.shape),
-        opacities=packed[:, 9],
-        colors=packed[:, 10:13],
-        normals=packed[:, 13:16] if kind.has_geometry else jnp.zeros_like(splats.normals),
-    )
+    d_splats = unpack_splats(packed, splats, kind.has_geometry)
     return d_splats, table if params.shape[1] else jnp.zeros_like(params), d_tap
 
 

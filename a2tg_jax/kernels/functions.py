@@ -1,0 +1,95 @@
+"""What native loops are made for, and the scalar functions that they apply."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax import pixel
+from a2tg_jax.kernels import library
+from a2tg_jax.kernels.lanes import trace
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """What a pair of loops is made for; hashable."""
+
+    rule: Any
+    """The tree structure of an appearance rule: its class and static fields."""
+    num_rows: int
+    """Integers that the rule keeps of a splat."""
+    num_columns: int
+    """C, numbers in an entry of its table."""
+    dtype: Any
+    tile_size: int
+    near_plane: float
+    has_geometry: bool
+    has_statistic: bool
+
+    @property
+    def num_channels(self) -> int:
+        return 8 if self.has_geometry else 3
+
+    @property
+    def num_floats(self) -> int:
+        """S: the 9 entries of M, opacity, colour (, normal), and the squared distance beyond which nothing shows."""
+        return 17 if self.has_geometry else 14
+
+    @property
+    def lanes(self) -> int:
+        """L."""
+        return library.vector_bytes() // np.dtype(self.dtype).itemsize
+
+    @property
+    def num_vectors(self) -> int:
+        """Vectors of L pixels in a tile, the last one perhaps not full."""
+        return -(-(self.tile_size**2) // self.lanes)
+
+
+class Functions:
+    """The jaxprs of one kind, all of scalars."""
+
+    def __init__(self, kind: Kind):
+        rule = jax.tree.unflatten(kind.rule, [None] * kind.rule.num_leaves)
+        number: Any = jax.ShapeDtypeStruct((), kind.dtype)
+        integer, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), jnp.bool_)
+        triple, near_plane = (number,) * 3, kind.near_plane
+        splat = pixel.Splat((triple,) * 3, number, triple, triple if kind.has_geometry else None)
+        row = (integer,) * kind.num_rows
+
+        self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
+        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
+        self.num_planes = structure.num_leaves
+
+        def prepare_vjp(M, x, y, d_planes):
+            return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+
+        self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
+
+        def reach(planes, row, x, y):
+            hit = pixel.intersect(planes, x, y, near_plane)
+            return hit.rho, rule.lookup(row, hit.u, hit.v)
+
+        self.reach, structure = trace(reach, planes, row, number, number)
+        self.num_taps = structure.num_leaves - 1
+
+        def forward(planes, splat, row, values, x, y, light, is_live, channels):
+            at_pixel = planes, splat, row, values, x, y, light, is_live
+            added, light, is_live = pixel.composite(rule, near_plane, *at_pixel)
+            return light, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
+
+        def backward(planes, splat, row, values, x, y, light, is_live, behind, g, center, jacobian):
+            at_pixel = planes, splat, row, values, x, y, light, is_live, behind, g
+            state, weight, d = pixel.composite_vjp(rule, near_plane, *at_pixel, kind.has_statistic)
+            tap = ()
+            if kind.has_statistic:
+                tap = pixel.absolute_gradient(splat.M, x, y, *center, d.log_falloff, jacobian, near_plane)
+            return state, weight > 0, d.values, (d.planes, d.opacity, d.color, d.normal, tap)
+
+        values = ((number,) * kind.num_columns,) * self.num_taps
+        at_pixel = planes, splat, row, values, number, number, number, flag
+        channels = (number,) * kind.num_channels
+        self.forward, _ = trace(forward, *at_pixel, channels)
+        self.backward, _ = trace(backward, *at_pixel, number, channels, (number, number), (triple,) * 3)

@@ -1,0 +1,29 @@
+"""The splats, the rule's rows and its table as plain arrays, as kernels read them; and their cotangents back again."""
+
+import jax.numpy as jnp
+from jax import Array
+
+NUM_PLAIN, NUM_WITH_NORMAL = 13, 16
+"""Numbers of a splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
+
+
+def pack_splats(splats, has_geometry: bool, *more: Array) -> Array:
+    """[N, S] with one splat a row, and further columns [N] after it."""
+    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
+    columns += [splats.normals] if has_geometry else []
+    return jnp.concatenate([*columns, *(column[:, None] for column in more)], axis=1)
+
+
+def unpack_splats(packed: Array, like, has_geometry: bool):
+    """Cotangents [N, S] as those of splats."""
+    return type(like)(
+        M=packed[:, :9].reshape(like.M.shape),
+        opacities=packed[:, 9],
+        colors=packed[:, 10:13],
+        normals=packed[:, 13:16] if has_geometry else jnp.zeros_like(like.normals),
+    )
+
+
+def pack_rows(rule, least_columns: int = 0) -> Array:
+    """[N, I] int32 what the rule keeps of every splat; a rule that keeps nothing gives one row of `least_columns`."""
+    return jnp.stack(rule.rows, axis=1) if rule.rows else jnp.zeros((1, least_columns), jnp.int32)

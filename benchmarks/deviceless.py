@@ -1,0 +1,106 @@
+"""Compiles the Pallas kernels for a GPU on a machine without one, and prints what they need.
+
+    pip install --no-deps jax-cuda13-plugin==X.Y.Z jax-cuda13-pjrt==X.Y.Z     # of the installed jax X.Y.Z
+    python -m benchmarks.deviceless h200.txtpb --ptxas ptxas
+
+The argument is XLA's description of the GPU (openxla/xla, xla/backends/gpu/target_config/specs). Nothing is executed.
+With ptxas, registers and spills of each kernel are printed beside the temporary memory of the whole program.
+"""
+
+import argparse
+import dataclasses
+import os
+import pathlib
+import re
+import subprocess
+import tempfile
+
+NUM_GAUSSIANS, NUM_PAIRS = 1_000_000, 10_000_000
+WIDTH, HEIGHT, TILE_SIZE = 1920, 1088, 16
+SPILLS = re.compile(r"(\d+) bytes spill stores, (\d+) bytes spill loads")
+REGISTERS = re.compile(r"Used (\d+) registers")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("target", type=pathlib.Path)
+    parser.add_argument("--ptxas", help="NVIDIA's assembler, for registers and spills")
+    parser.add_argument("--architecture", default="sm_90a")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as dump:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_dump_to={dump}"
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
+        for name, function, inputs in programs():
+            compiled = compile_for(args.target, function, inputs)
+            memory = compiled.memory_analysis().temp_size_in_bytes / 1e6
+            print(f"{name:32s} temporary memory {memory:6.1f} MB  {assembled(pathlib.Path(dump), args)}", flush=True)
+
+
+def programs():
+    """Names, functions and the shapes of their arguments: forward and backward, plain and textured."""
+    import jax
+    import jax.numpy as jnp
+
+    from a2tg_jax.appearance import PlainAppearance
+    from a2tg_jax.compositor import Compositing, Splats, composite
+    from a2tg_jax.kernels import pallas
+    from a2tg_jax.lookup import TexturedAppearance, TextureOptions
+    from a2tg_jax.tiles import TileGrid, TileLists
+
+    pallas.IS_COMPILED_AHEAD = True
+    num, grid = NUM_GAUSSIANS, TileGrid(WIDTH, HEIGHT, TILE_SIZE)
+    floats = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
+    integers = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.int32)  # noqa: E731
+    splats = Splats(floats(num, 3, 3), floats(num, 3), floats(num), floats(num, 3))
+    lists = TileLists(integers(NUM_PAIRS), integers(grid.num + 1), floats(), jax.ShapeDtypeStruct((), jnp.bool_))
+    textured = TexturedAppearance(floats(4 * num, 4), (integers(num),) * 3, floats(num), TextureOptions())
+
+    for name, rule in (("plain", PlainAppearance()), ("textured", textured)):
+        for has_statistic in (False, True):
+            how = Compositing(grid, 0.2, False, has_statistic, "pallas", 1)
+            inputs = splats, rule, lists, floats(3, 3), floats(num, 4)
+
+            def forward(*inputs, how=how):
+                return composite(how, *inputs)
+
+            def backward(splats, rule, lists, jacobian, tap, how=how):
+                def loss(splats, params, tap):
+                    shown = dataclasses.replace(rule, params=params) if params.shape[1] else rule
+                    channels, transmittance = composite(how, splats, shown, lists, jacobian, tap)
+                    return jnp.sum(channels) + jnp.sum(transmittance)
+
+                return jax.grad(loss, argnums=(0, 1, 2))(splats, rule.params, tap)
+
+            if not has_statistic:
+                yield f"{name}, forward", forward, inputs
+            yield f"{name}, backward{' with statistic' if has_statistic else ''}", backward, inputs
+
+
+def compile_for(target: pathlib.Path, function, inputs):
+    """The program for the GPU that the file describes."""
+    import jax
+    from jax.experimental import topologies
+
+    topology = topologies.get_topology_desc(platform="cuda", target_config=target.read_text(), topology="1x1x1")
+    mesh = topologies.make_mesh(topology, (1,), ("x",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    placed = jax.tree.map(lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=sharding), inputs)
+    return jax.jit(function).lower(*placed).compile()
+
+
+def assembled(dump: pathlib.Path, args: argparse.Namespace) -> str:
+    """Registers and spills of the kernels compiled since the last call."""
+    found = []
+    for path in sorted(dump.glob("*.ptx")):
+        kernel = re.search(r"\.entry (_\w+_kernel)", path.read_text())
+        if args.ptxas and kernel:
+            command = [args.ptxas, f"-arch={args.architecture}", "-v", str(path), "-o", os.devnull]
+            log = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+            for registers, spills in zip(REGISTERS.findall(log), SPILLS.findall(log), strict=True):
+                found.append(f"{registers} registers, {int(spills[0]) + int(spills[1])} bytes spilled")
+        path.unlink()
+    return "; ".join(found)
+
+
+if __name__ == "__main__":
+    main()
