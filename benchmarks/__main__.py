@@ -30,12 +30,15 @@ transmittance take; the backward pass does this again and about twice as much fo
 
 def main() -> None:
     args = parse_arguments()
-    sections = {name: section(args) for name, section in SECTIONS.items() if not args.only or name in args.only}
-    report = {"machine": machine(), **sections}
-    if "render" in sections and "limit" in sections:
-        report["growth"] = fit_growth(sections["render"])
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(report, indent=1) + "\n")
+    report: dict = {"machine": machine()}
+    for name, section in SECTIONS.items():
+        if not args.only or name in args.only:
+            report[name] = section(args)
+            if name == "render":
+                report["growth"] = fit_growth(report[name])
+            # After every section: what was measured is kept if the rest is interrupted.
+            args.out.write_text(json.dumps(report, indent=1) + "\n")
     print(f"\nwritten to {args.out}")
 
 

@@ -62,7 +62,7 @@ def plot_stages(cases: list[dict], path: pathlib.Path) -> None:
     panel.invert_yaxis()
     panel.set(xlabel="ms, forward and backward")
     panel.set_xscale("linear")
-    panel.legend(loc="lower right")
+    panel.legend(loc="upper right")
     figure.savefig(path, dpi=110)
 
 
