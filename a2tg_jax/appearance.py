@@ -51,6 +51,11 @@ class AppearanceRule(Protocol):
         """[N] squared distance rho beyond which the splat shows less than 1/255; not positive where it never does."""
         ...
 
+    @property
+    def num_bytes(self) -> int:
+        """Reported memory of the parameters, padding left out (host)."""
+        ...
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +81,10 @@ class PlainAppearance:
 
     def cutoff(self, opacities: Array) -> Array:
         return gaussian_cutoff(opacities)
+
+    @property
+    def num_bytes(self) -> int:
+        return 0
 
 
 def gaussian_cutoff(peak: Array) -> Array:

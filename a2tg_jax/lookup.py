@@ -80,6 +80,11 @@ class TexturedAppearance:
     def cutoff(self, opacities: Array) -> Array:
         return gaussian_cutoff(opacities * self.peaks)
 
+    @property
+    def num_bytes(self) -> int:
+        _, height, width = self.rows
+        return 16 * int(np.sum(np.asarray(height, np.int64) * np.asarray(width, np.int64)))
+
     def _texel_coordinates(self, row, u: Array, v: Array) -> tuple[Array, Array]:
         _, height, width = row
         size_u, size_v = width.astype(u.dtype), height.astype(v.dtype)

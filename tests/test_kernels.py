@@ -161,6 +161,10 @@ class HalvesAppearance:
     def cutoff(self, opacities):
         return gaussian_cutoff(opacities)
 
+    @property
+    def num_bytes(self):
+        return 4 * self.params.size
+
 
 @pytest.mark.usefixtures("x64")
 def test_any_appearance_rule_is_compiled():

@@ -26,10 +26,12 @@ from a2tg_jax import (
     RenderOutput,
     RenderSettings,
     allocate_textures,
+    parameter_bytes,
     plan_render,
     render_image,
     texture_arrays,
 )
+from a2tg_jax.render import appearance_of
 
 FIELDS = ("color", "alpha", "depth", "normal")
 rendered = functools.partial(render_scene, dtype="float64")
@@ -228,3 +230,11 @@ def test_quaternion_of_a_rotation():
     """The helper that moves worlds in these tests inverts the oracle's rotation."""
     rotation = rotation_of(3)
     np.testing.assert_allclose(oracle.rotation_matrix(quaternion(rotation)), rotation, atol=1e-12)
+
+
+def test_a_rule_reports_the_bytes_of_its_textures():
+    scene = draw_scene(0)
+    gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    rule = appearance_of(gaussians, textures, layout, RenderSettings())
+    assert rule.num_bytes == parameter_bytes(gaussians, layout) - 232 * gaussians.num
+    assert appearance_of(gaussians, None, None, RenderSettings()).num_bytes == 0
