@@ -8,6 +8,7 @@ The backward pass walks front to back too (`pixel.absorb_vjp`), so that nothing 
 """
 
 import functools
+import math
 from types import ModuleType
 from typing import NamedTuple
 
@@ -154,7 +155,7 @@ def _forward(how: Compositing, splats: Splats, params: Array, rule, lists: TileL
 def _backward(how: Compositing, splats: Splats, params: Array, rule, lists: TileLists, jacobian, tap, g, behind):
     """The cotangents of splats, parameters and tap, given those of the channels, g [groups, G, D, P], and what they
     make of the whole list, `behind` [groups, G, P]."""
-    widths = [leaf.size // leaf.shape[0] for leaf in splats]
+    widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
     totals = packed, jnp.zeros_like(params), jnp.zeros_like(tap)
     ids = _padded_ids(lists)

@@ -69,7 +69,19 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
 
 def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
     """Pairs before the outline test, as a float (it cannot wrap): what the capacity must hold."""
-    return jnp.sum(tile_rectangles(bounds, grid).counts.astype(jnp.float32))
+    return total_pairs(tile_rectangles(bounds, grid).counts)
+
+
+def total_pairs(counts: Array) -> Array:
+    """The sum of counts [N] as a float32, to a few units in the last place: blocks are summed as integers first, so
+    that no small count is lost beside a large sum."""
+    blocks = jnp.pad(counts, (0, -counts.shape[0] % 256)).reshape(-1, 256)
+    return jnp.sum(jnp.sum(blocks, axis=1, dtype=jnp.int32).astype(jnp.float32))
+
+
+def exceeds(total: Array, capacity: int) -> Array:
+    """Whether so many pairs, known to about 2⁻²⁰ of their number, may be more than there is room for."""
+    return total + jnp.floor(total * 2.0**-20) > capacity
 
 
 class Outline(NamedTuple):
@@ -127,8 +139,8 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     """
     order = jnp.argsort(depths, stable=True)
     rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid))
-    total = jnp.sum(rectangles.counts.astype(jnp.float32))
-    overflow = total > capacity
+    total = total_pairs(rectangles.counts)
+    overflow = exceeds(total, capacity)
     counts = jnp.where(overflow, 0, rectangles.counts)
     ends = jnp.cumsum(counts)
     num = depths.shape[0]

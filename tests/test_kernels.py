@@ -13,12 +13,12 @@ from llvmlite import ir
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import gaussian_cutoff
+from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import foreign, lanes, library, native
 from a2tg_jax.kernels.writer import LONG, Writer
 from a2tg_jax.render import appearance_of, render_traced
-from a2tg_jax.tiles import TileGrid, tile_lists
+from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
 
 FUNCTIONS = {
     "arithmetic": lambda x, y: (x + y) * (x - y) / (2 + y * y),
@@ -207,6 +207,62 @@ def test_pallas_kernels_are_those_of_xla(has_textures):
     assert expected.alpha.max() > 0.5 and wanted[2][:, 3].max() > 10
     for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
+
+
+@pytest.mark.usefixtures("x64")
+def test_mixed_precisions_are_composited_in_the_larger():
+    """Gaussians and textures in float32 under a float64 camera: the gradients keep their dtypes."""
+    scene = draw_scene(4)
+    gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+
+    def loss(gaussians, textures, camera):
+        color = render_image(gaussians, camera, textures, layout, settings=RenderSettings(compositor="native")).color
+        return jnp.sum(color**2), color
+
+    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    with jax.numpy_dtype_promotion("standard"):
+        (_, expected), wanted = differentiate(gaussians, textures, as_camera(scene, "float32"))
+        (_, image), found = differentiate(gaussians, textures, as_camera(scene, "float64"))
+    assert image.dtype == jnp.float64
+    assert np.mean(abs(np.asarray(image) - np.asarray(expected)) < 1e-5) > 0.99
+    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        assert a.dtype == b.dtype == jnp.float32
+        np.testing.assert_allclose(b, a, rtol=0, atol=2e-2 * float(jnp.abs(a).max()))
+
+
+def test_a_rule_defined_anew_is_compiled_anew():
+    scene = draw_scene(9)
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+
+    def image(residual):
+        @jax.tree_util.register_dataclass
+        @dataclasses.dataclass(frozen=True)
+        class Anew(PlainAppearance):
+            def shade(self, row, values, u, v):
+                return (residual * jnp.ones_like(u),) * 3, None
+
+        return render_appearance(gaussians, camera, Anew()).color
+
+    assert jnp.max(jnp.abs(image(0.0) - image(0.5))) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"compositor": "XLA"}, "got 'XLA'"),
+        ({"tile_size": 65}, "1..64"),
+        ({"compositor": "pallas", "tile_size": 12}, "power"),
+    ],
+)
+def test_compositors_that_cannot_be_are_refused(settings, words):
+    scene = draw_scene(0, num=3)
+    with pytest.raises(ValueError, match=words):
+        render_image(as_gaussians(scene, "float32"), as_camera(scene, "float32"), settings=RenderSettings(**settings))
+
+
+def test_large_sums_of_pairs_lose_no_small_count():
+    counts = jnp.concatenate([jnp.full(256, 2**20, jnp.int32), jnp.ones(100_000, jnp.int32)])
+    assert abs(float(total_pairs(counts)) - (2**28 + 100_000)) <= 64
 
 
 def test_without_llvmlite_xla_composites():

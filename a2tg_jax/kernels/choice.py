@@ -8,22 +8,30 @@ from typing import Literal
 
 import jax
 
+MAX_TILE_SIZE = 64
+"""Native loops keep a tile on the stack."""
 Compositor = Literal["native", "pallas", "xla"]
 
 
 def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -> Compositor:
-    """The compositor that is wanted, or with "auto" the fastest that JAX's default device can run.
+    """The compositor that is wanted, or with "auto" the fastest that JAX's default backend can run.
 
     Raises:
-      ValueError: if native loops are wanted where they cannot run.
+      ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
     """
+    if wanted not in ("auto", "native", "pallas", "xla"):
+        raise ValueError(f"compositor must be 'auto', 'native', 'pallas' or 'xla'; got {wanted!r}")
+    if not 1 <= tile_size <= MAX_TILE_SIZE:
+        raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
+    is_power_of_two = tile_size & (tile_size - 1) == 0
+    if wanted == "pallas" and not is_power_of_two:
+        raise ValueError(f"compositor='pallas' needs a tile_size that is a power of two; got {tile_size}")
     if wanted == "native" and not has_native():
         raise ValueError("compositor='native' needs JAX on the CPU and llvmlite: pip install llvmlite, or say 'auto'")
     if wanted != "auto":
         return wanted
     if has_native():
         return "native"
-    is_power_of_two = tile_size & (tile_size - 1) == 0
     return "pallas" if is_power_of_two and has_pallas() else "xla"
 
 

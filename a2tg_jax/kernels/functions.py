@@ -17,7 +17,9 @@ class Kind:
     """What a pair of loops is made for; hashable."""
 
     rule: Any
-    """The tree structure of an appearance rule: its class and static fields."""
+    """The tree structure of an appearance rule, with its static fields."""
+    rule_class: type
+    """Its class, which equality of tree structures disregards."""
     num_rows: int
     """Integers that the rule keeps of a splat."""
     num_columns: int

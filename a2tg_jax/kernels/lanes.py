@@ -15,7 +15,7 @@ from jax.extend import core
 from llvmlite import ir
 
 FLAGS = ("contract",)
-"""Products and sums may fuse; nothing else of IEEE arithmetic is given up."""
+"""Products and sums may fuse; nothing else of IEEE arithmetic is given up within a lane."""
 INT = ir.IntType(32)
 BOOL = ir.IntType(1)
 
@@ -80,7 +80,7 @@ class Lanes:
         return self.builder.call(function, operands, fastmath=FLAGS if _is_float(overload) else ())
 
     def sum(self, value: ir.Value) -> ir.Value:
-        """The sum over lanes, by halves."""
+        """The sum over lanes, in an order of LLVM's choice."""
         if self.width == 1:
             return value
         scalar = value.type.element
@@ -129,7 +129,10 @@ class Lanes:
         if inner is not None:
             return self.emit(inner, operands) if hasattr(inner, "consts") else self._emit(inner, (), operands)
         if name not in PRIMITIVES:
-            raise NotImplementedError(f"native loops have no translation for the primitive '{name}'")
+            raise NotImplementedError(
+                f"native loops have no translation for the primitive '{name}': leave this rule to XLA, by "
+                "RenderSettings(compositor='xla')"
+            )
         return [PRIMITIVES[name](self, operands, equation)]
 
     def exp(self, x: ir.Value) -> ir.Value:

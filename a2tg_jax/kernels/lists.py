@@ -5,8 +5,8 @@
 
 `find` goes through the splats in the given order, front to back, and writes down every pair whose outline touches its
 tile; `place` moves them tile by tile, in the same order. Buffers: order [M], rectangles [N, 4] (x0, y0, columns,
-count), outlines [N, 9], counts [tiles + 1], whose last entry counts all pairs; tiles and splats [capacity];
-cursors [tiles], where each tile's list begins, and in the end where it ends; ids [capacity].
+count), outlines [N, 9], counts [tiles]; tiles and splats [capacity]; ids [capacity]; cursors [tiles], where each tile's
+list begins, and in the end where it ends.
 """
 
 import dataclasses

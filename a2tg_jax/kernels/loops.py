@@ -13,6 +13,7 @@ d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to.
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -255,6 +256,9 @@ class _Backward(_Compositing):
             self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
 
 
+_numbers = itertools.count()
+
+
 @dataclasses.dataclass(frozen=True)
 class Loops:
     """Compiled loops; each releases the GIL."""
@@ -268,7 +272,7 @@ def loops(kind: Kind) -> Loops:
     """The loops of a kind, compiled at the first call."""
     functions = Functions(kind)
     module = ir.Module("loops")
-    tag = f"{abs(hash(kind)):x}"
+    tag = next(_numbers)
     forward, backward = f"forward_{tag}", f"backward_{tag}"
     _Forward(kind, functions, module, forward, FORWARD).write()
     _Backward(kind, functions, module, backward, BACKWARD).write()

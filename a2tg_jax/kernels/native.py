@@ -9,7 +9,9 @@ import functools
 import hashlib
 import itertools
 import os
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +21,11 @@ from jax import Array
 from a2tg_jax.geometry import ScreenBounds
 from a2tg_jax.kernels import foreign
 from a2tg_jax.kernels.packing import pack_rows, pack_splats, unpack_splats
-from a2tg_jax.tiles import TileGrid, TileLists, outlines, tile_rectangles
+from a2tg_jax.tiles import TileGrid, TileLists, exceeds, outlines, tile_rectangles, total_pairs
 
+_LOCK = threading.RLock()
+_names: dict[str, Any] = {}
+"""Whose loops each name stands for."""
 PAIRS_PER_THREAD = 2_000
 """Fewer pairs than this are not worth another thread."""
 
@@ -42,6 +47,7 @@ def _kind(how, splats, rule):
 
     return Kind(
         rule=jax.tree.structure(rule),
+        rule_class=type(rule),
         num_rows=len(rule.rows),
         num_columns=rule.params.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
@@ -69,13 +75,15 @@ def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: A
     dtype, num = splats.M.dtype, splats.M.shape[0]
     shapes = (
         jax.ShapeDtypeStruct((num, kind.num_floats), dtype),
-        jax.ShapeDtypeStruct(params.shape, params.dtype),
+        jax.ShapeDtypeStruct(params.shape, dtype),
         jax.ShapeDtypeStruct(tap.shape if kind.has_statistic else (1, 4), dtype),
     )
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    packed, d_params, d_tap = call(*_inputs(kind, how, splats, params, rule, lists), g, behind, jacobian.astype(dtype))
+    cotangents = (array.astype(dtype) for array in (g, behind, jacobian))
+    packed, d_params, d_tap = call(*_inputs(kind, how, splats, params, rule, lists), *cotangents)
     d_splats = unpack_splats(packed, splats, kind.has_geometry)
-    return d_splats, d_params, d_tap if kind.has_statistic else jnp.zeros_like(tap)
+    d_tap = d_tap.astype(tap.dtype) if kind.has_statistic else jnp.zeros_like(tap)
+    return d_splats, d_params.astype(params.dtype), d_tap
 
 
 def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: int) -> TileLists:
@@ -83,13 +91,14 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     from a2tg_jax.kernels.lists import list_loops
 
     x0, y0, columns, counts = tile_rectangles(bounds, grid)
-    total = jnp.sum(counts.astype(jnp.float32))
-    overflow = total > capacity
+    total = total_pairs(counts)
+    overflow = exceeds(total, capacity)
     rectangles = jnp.stack([x0, y0, columns, jnp.where(overflow, 0, counts)], axis=1)
     dtype = bounds.lower.dtype
     outline = jnp.stack([entry.astype(dtype) for entry in outlines(bounds)], axis=1)
     name = f"a2tg_lists_{dtype}_{grid.tile_size}"
-    foreign.register(name, functools.partial(_list_handler, list_loops(str(dtype), grid.tile_size)))
+    with _LOCK:
+        foreign.register(name, functools.partial(_list_handler, list_loops(str(dtype), grid.tile_size)))
     shapes = jax.ShapeDtypeStruct((capacity,), jnp.int32), jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32)
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
     ids, starts = call(depths, rectangles, outline, jnp.asarray([grid.columns], jnp.int32))
@@ -107,6 +116,10 @@ def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray])
     starts[0] = 0
     np.cumsum(counts[:-1], out=starts[1:])
     num_pairs, cursors = int(starts[-1]), starts[:-1].copy()
+    if num_pairs > len(ids):
+        raise ValueError(
+            f"there are {num_pairs} pairs of a splat and a tile, but room for {len(ids)}: raise the capacity"
+        )
     loops.place(*address(tiles, splats, cursors, ids), num_pairs)
     ids[num_pairs:] = 0
 
@@ -125,17 +138,21 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
     """ids, starts, splats, rows, table, and (columns, width, height)."""
-    packed = pack_splats(splats, kind.has_geometry, rule.cutoff(splats.opacities))
+    packed = pack_splats(splats, kind.has_geometry, rule.cutoff(splats.opacities)).astype(kind.dtype)
     size = jnp.asarray([how.grid.columns, how.grid.width, how.grid.height], jnp.int32)
-    return lists.ids, lists.starts, packed, pack_rows(rule), params, size
+    return lists.ids, lists.starts, packed, pack_rows(rule), params.astype(kind.dtype), size
 
 
 def _registered(kind, which: str, make_handler: Callable) -> str:
-    """The name under which XLA knows the loops of a kind; the same in every process, for its compilation cache."""
+    """The name under which XLA knows the loops of a kind; the same in every process, for its compilation cache, but
+    another one for another rule that looks the same, such as one that was defined anew."""
     from a2tg_jax.kernels.loops import loops
 
     name = f"a2tg_{which}_{hashlib.sha256(repr(kind).encode()).hexdigest()[:16]}"
-    foreign.register(name, make_handler(getattr(loops(kind), which)))
+    with _LOCK:
+        while _names.setdefault(name, kind) != kind:
+            name += "_"
+        foreign.register(name, make_handler(getattr(loops(kind), which)))
     return name
 
 
@@ -148,7 +165,7 @@ def _forward_handler(run: Callable) -> foreign.Handler:
         def part(first: int, last: int, _: int) -> None:
             run(*pointers, first, last, *map(int, size), len(table))
 
-        _in_parts(part, starts)
+        _in_parts(part, _parts(starts))
 
     return handler
 
@@ -167,7 +184,7 @@ def _backward_handler(run: Callable) -> foreign.Handler:
             outputs = [total.ctypes.data for total in totals[index]]
             run(*given, *outputs, first, last, *map(int, size), len(table))
 
-        _in_parts(part, starts)
+        _in_parts(part, parts)
         for more in totals[1:]:
             for result, addend in zip(results, more, strict=True):
                 result += addend
@@ -185,10 +202,15 @@ def _parts(starts: np.ndarray) -> list[tuple[int, int]]:
     return list(itertools.pairwise(borders))
 
 
-def _in_parts(part: Callable[[int, int, int], None], starts: np.ndarray) -> None:
+def _in_parts(part: Callable[[int, int, int], None], parts: list[tuple[int, int]]) -> None:
     """part(first tile, last tile, index) for every part, each on a thread of its own."""
-    parts = _parts(starts)
-    others = [_pool().submit(part, *span, index) for index, span in enumerate(parts) if index > 0]
-    part(*parts[0], 0)
+    others: list[concurrent.futures.Future] = []
+    try:
+        for index, span in enumerate(parts[1:], start=1):
+            others.append(_pool().submit(part, *span, index))
+        part(*parts[0], 0)
+    finally:
+        # Whatever happens, nobody may write to XLA's buffers once they are given back.
+        concurrent.futures.wait(others)
     for other in others:
         other.result()

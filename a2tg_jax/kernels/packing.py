@@ -17,13 +17,13 @@ def pack_splats(splats, has_geometry: bool, *more: Array) -> Array:
 def unpack_splats(packed: Array, like, has_geometry: bool):
     """Cotangents [N, S] as those of splats."""
     return type(like)(
-        M=packed[:, :9].reshape(like.M.shape),
-        opacities=packed[:, 9],
-        colors=packed[:, 10:13],
-        normals=packed[:, 13:16] if has_geometry else jnp.zeros_like(like.normals),
+        M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
+        opacities=packed[:, 9].astype(like.opacities.dtype),
+        colors=packed[:, 10:13].astype(like.colors.dtype),
+        normals=packed[:, 13:16].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
     )
 
 
 def pack_rows(rule, least_columns: int = 0) -> Array:
     """[N, I] int32 what the rule keeps of every splat; a rule that keeps nothing gives one row of `least_columns`."""
-    return jnp.stack(rule.rows, axis=1) if rule.rows else jnp.zeros((1, least_columns), jnp.int32)
+    return jnp.stack(rule.rows, axis=1).astype(jnp.int32) if rule.rows else jnp.zeros((1, least_columns), jnp.int32)

@@ -1,7 +1,7 @@
 """Compositing by Pallas kernels on GPUs: one program per tile, all its pixels at once, around the functions of `pixel`.
 
-The kernels are lowered by the Triton backend. Their buffers are those of `loops`; what a splat adds to the gradient is
-summed over the tile's pixels and added atomically, so gradients are reproducible to rounding only.
+The kernels are lowered by the Triton backend. Their buffers are those of `loops`, but for the cutoff. What a splat adds
+to the gradient is summed over the tile's pixels and added atomically: gradients are reproducible to rounding only.
 """
 
 import functools
