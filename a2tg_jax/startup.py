@@ -16,8 +16,9 @@ WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 def configure_cpu(*, use_cache: bool = True) -> None:
     """Makes JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
-    Adds two flags to XLA_FLAGS, of which the user's own settings have precedence: while-loops are compiled whole
-    (a tile's compositing is one), and vectors are 512 bits wide where the processor has AVX-512. A GPU is not affected.
+    Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS, of which the user's own settings have
+    precedence: while-loops are compiled whole, which compositing by XLA gains from, and vectors are 512 bits wide where
+    the processor has AVX-512. Native compositing needs neither. A GPU is not affected.
     The command line calls this; programs and notebooks may.
 
     Args:

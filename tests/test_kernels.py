@@ -211,7 +211,10 @@ def test_pallas_kernels_are_those_of_xla(has_textures):
 
 @pytest.mark.usefixtures("x64")
 def test_mixed_precisions_are_composited_in_the_larger():
-    """Gaussians and textures in float32 under a float64 camera: the gradients keep their dtypes."""
+    """Gaussians and textures in float32 under a float64 camera: the gradients keep their dtypes.
+
+    Rounding decides here and there whether a splat reaches 1/255, which moves a gradient by that pixel's share.
+    """
     scene = draw_scene(4)
     gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
 

@@ -10,6 +10,7 @@ import numpy as np
 from a2tg_jax import pixel
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.lanes import trace
+from a2tg_jax.kernels.packing import num_numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Kind:
     """Integers that the rule keeps of a splat."""
     num_columns: int
     """C, numbers in an entry of its table."""
-    dtype: Any
+    dtype: str
     tile_size: int
     near_plane: float
     has_geometry: bool
@@ -36,8 +37,8 @@ class Kind:
 
     @property
     def num_floats(self) -> int:
-        """S: the 9 entries of M, opacity, colour (, normal), and the squared distance beyond which nothing shows."""
-        return 17 if self.has_geometry else 14
+        """S: the splat's own numbers, and the squared distance beyond which it does not show."""
+        return num_numbers(self.has_geometry) + 1
 
     @property
     def lanes(self) -> int:

@@ -69,15 +69,13 @@ class Lanes:
             first, undefined, ir.Constant(ir.VectorType(INT, self.width), [0] * self.width)
         )
 
-    def intrinsic(self, name: str, operands: Sequence[ir.Value], overload: ir.Type | None = None, result=None):
-        """Calls llvm.<name> of these operands."""
-        overload = operands[0].type if overload is None else overload
-        result = overload if result is None else result
-        function_type = ir.FunctionType(result, [operand.type for operand in operands])
-        module = self.builder.module
-        name = f"llvm.{name}.{_suffix(overload)}"
+    def intrinsic(self, name: str, operands: Sequence[ir.Value]) -> ir.Value:
+        """Calls llvm.<name> of floats of one type, which gives a float of that type."""
+        type_, module = operands[0].type, self.builder.module
+        name = f"llvm.{name}.{_suffix(type_)}"
+        function_type = ir.FunctionType(type_, [operand.type for operand in operands])
         function = module.globals.get(name) or ir.Function(module, function_type, name)
-        return self.builder.call(function, operands, fastmath=FLAGS if _is_float(overload) else ())
+        return self.builder.call(function, operands, fastmath=FLAGS)
 
     def sum(self, value: ir.Value) -> ir.Value:
         """The sum over lanes, in an order of LLVM's choice."""
@@ -311,5 +309,4 @@ PRIMITIVES: dict[str, Callable[[Lanes, list[ir.Value], Any], ir.Value]] = {
     "reshape": _identity,
     "squeeze": _identity,
     "stop_gradient": _identity,
-    "zeros_like": lambda lanes, operands, _: ir.Constant(operands[0].type, None),
 }

@@ -15,7 +15,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -33,6 +33,20 @@ CUTOFF_SLACK = 1e-3
 """Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
 
 
+class _LoadedSplat(NamedTuple):
+    """A splat as the pixels of a tile want it."""
+
+    numbers: list[ir.Value]
+    """As they lie in memory, without the cutoff."""
+    planes: list[ir.Value]
+    """In every lane, as all that follows."""
+    spread: list[ir.Value]
+    """The numbers."""
+    row: list[ir.Value]
+    limit: ir.Value
+    """Squared distance within which a pixel is looked at."""
+
+
 class _Compositing(TableWriter):
     """What both passes share."""
 
@@ -47,6 +61,8 @@ class _Compositing(TableWriter):
         pixels[:, : kind.tile_size**2] -= (kind.tile_size - 1) / 2
         # Lanes past the last pixel lie outside of every image.
         pixels[:, kind.tile_size**2 :] = 1e9
+        self.light = self.variable(self.reals, kind.num_vectors)
+        self.live = self.variable(self.integers, kind.num_vectors)
         self.pixel_y, self.pixel_x = (self._table(f"{name}.{k}", row) for k, row in zip("yx", pixels, strict=True))
 
     def _table(self, name: str, numbers) -> ir.Value:
@@ -91,6 +107,38 @@ class _Compositing(TableWriter):
             inside.append(b.fcmp_ordered("<", at, limit))
         return b.zext(b.and_(*inside), self.integers)
 
+    def begin_tile(self, tile_x: ir.Value, tile_y: ir.Value) -> None:
+        """Full light everywhere; live are the pixels inside the image."""
+        with self.all_vectors() as (k, _):
+            self.store(self.lanes.constant(1.0, self.real), self.light, k)
+            self.store(self.live_at_first(k, tile_x, tile_y), self.live, k)
+
+    def load_splat(self, id_: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> _LoadedSplat:
+        """A splat of the list, prepared for a tile."""
+        *numbers, cutoff = self.splat_numbers(id_)
+        planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], tile_x, tile_y])
+        limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
+        spread = self.spread(planes), self.spread(numbers), self.spread(self.row_numbers(id_))
+        return _LoadedSplat(numbers, *spread, self.lanes.splat(limit))
+
+    def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
+        """Calls composite(k, x, y, taps, is_live) for every vector k of the tile's pixels that the splat may reach;
+        returns whether a pixel of the tile is still live."""
+        b, lanes = self.b, self.lanes
+        none = lanes.constant(0, INT)
+        any_live = self.variable(self.integers)
+        b.store(none, any_live)
+        with self.all_vectors() as (k, _):
+            x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
+            rho, *taps = lanes.emit(self.functions.reach, [*splat.planes, *splat.row, x, y])
+            is_live = b.icmp_signed("!=", self.load(self.live, k, self.integers), none)
+            is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, splat.limit))
+            with b.if_then(lanes.any(is_reached)):
+                composite(k, x, y, taps, is_live)
+            now = self.load(self.live, k, self.integers)
+            b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
+        return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), none))
+
     def splat_numbers(self, id_: ir.Value) -> list[ir.Value]:
         base = self.at(self.arguments["splats"], self.times(id_, self.kind.num_floats), self.real)
         return [self.load(base, k, self.real) for k in range(self.kind.num_floats)]
@@ -107,51 +155,34 @@ class _Forward(_Compositing):
     """Channels and transmittance of the tiles."""
 
     def write(self) -> None:
-        kind = self.kind
-        light = self.variable(self.reals, kind.num_vectors)
-        live = self.variable(self.integers, kind.num_vectors)
-        channels = [self.variable(self.reals, kind.num_vectors) for _ in range(kind.num_channels)]
+        channels = [self.variable(self.reals, self.kind.num_vectors) for _ in range(self.kind.num_channels)]
 
         def tile(tile, tile_x, tile_y):
+            self.begin_tile(tile_x, tile_y)
             with self.all_vectors() as (k, _):
-                self.store(self.lanes.constant(1.0, self.real), light, k)
-                self.store(self.live_at_first(k, tile_x, tile_y), live, k)
                 for channel in channels:
                     self.store(self.lanes.constant(0.0, self.real), channel, k)
-            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, light, live, channels))
-            self.write_tile(tile, [*channels, light])
+            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, channels))
+            self.write_tile(tile, [*channels, self.light])
 
         self.all_tiles(tile)
 
-    def splat(self, tile_x, tile_y, light, live, channels, id_) -> ir.Value:
+    def splat(self, tile_x, tile_y, channels, id_) -> ir.Value:
         """Adds one splat to a tile; returns whether a pixel is still live."""
-        b, lanes, functions = self.b, self.lanes, self.functions
-        *numbers, cutoff = self.splat_numbers(id_)
-        planes = self.spread(self.scalars.emit(functions.prepare, [*numbers[:9], tile_x, tile_y]))
-        splat, row = self.spread(numbers), self.spread(self.row_numbers(id_))
-        limit = lanes.splat(b.fadd(cutoff, self.real(CUTOFF_SLACK)))
-        any_live = self.variable(self.integers)
-        b.store(lanes.constant(0, INT), any_live)
-        with self.all_vectors() as (k, _):
-            x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
-            rho, *taps = lanes.emit(functions.reach, [*planes, *row, x, y])
-            state = self.load(live, k, self.integers)
-            is_live = b.icmp_signed("!=", state, lanes.constant(0, INT))
-            is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, limit))
-            with b.if_then(lanes.any(is_reached)):
-                entries = self.entries(taps)
-                values = self.gather(entries, self.is_uniform(entries) if entries else None)
-                before = [self.load(light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
-                after, still_live, *totals = lanes.emit(
-                    functions.forward, [*planes, *splat, *row, *values, x, y, *before]
-                )
-                self.store(after, light, k)
-                self.store(b.zext(still_live, self.integers), live, k)
-                for total, channel in zip(totals, channels, strict=True):
-                    self.store(total, channel, k)
-            now = self.load(live, k, self.integers)
-            b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
-        return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), lanes.constant(0, INT)))
+        splat = self.load_splat(id_, tile_x, tile_y)
+
+        def composite(k, x, y, taps, is_live):
+            entries = self.entries(taps)
+            values = self.gather(entries, self.is_uniform(entries) if entries else None)
+            state = [self.load(self.light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
+            at_pixel = [*splat.planes, *splat.spread, *splat.row, *values, x, y, *state]
+            after, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
+            self.store(after, self.light, k)
+            self.store(self.b.zext(still_live, self.integers), self.live, k)
+            for total, channel in zip(totals, channels, strict=True):
+                self.store(total, channel, k)
+
+        return self.reached_vectors(splat, composite)
 
     def write_tile(self, tile: ir.Value, arrays: Sequence[ir.Value]) -> None:
         num_pixels = self.kind.tile_size**2
@@ -165,18 +196,13 @@ class _Backward(_Compositing):
     """Cotangents of the splats, of the table, and the absolute gradient."""
 
     def write(self) -> None:
-        kind = self.kind
-        light, behind = (self.variable(self.reals, kind.num_vectors) for _ in range(2))
-        live = self.variable(self.integers, kind.num_vectors)
-        g = [self.variable(self.reals, kind.num_vectors) for _ in range(kind.num_channels)]
+        behind, *g = (self.variable(self.reals, self.kind.num_vectors) for _ in range(1 + self.kind.num_channels))
 
         def tile(tile, tile_x, tile_y):
-            with self.all_vectors() as (k, _):
-                self.store(self.lanes.constant(1.0, self.real), light, k)
-                self.store(self.live_at_first(k, tile_x, tile_y), live, k)
+            self.begin_tile(tile_x, tile_y)
             self.read_tile(tile, [behind], self.arguments["behind"])
             self.read_tile(tile, g, self.arguments["g"])
-            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, light, live, behind, g))
+            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, behind, g))
 
         self.all_tiles(tile)
 
@@ -189,55 +215,46 @@ class _Backward(_Compositing):
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
                 self.store(self.load(base, self.b.add(k, LONG(index * num_pixels)), self.real), array, k)
 
-    def splat(self, tile_x, tile_y, light, live, behind, g, id_) -> ir.Value:
+    def splat(self, tile_x, tile_y, behind, g, id_) -> ir.Value:
         """Adds the cotangents of one splat in a tile; returns whether a pixel is still live."""
-        b, lanes, functions, kind = self.b, self.lanes, self.functions, self.kind
-        *numbers, cutoff = self.splat_numbers(id_)
-        planes = self.spread(self.scalars.emit(functions.prepare, [*numbers[:9], tile_x, tile_y]))
-        splat, row = self.spread(numbers), self.spread(self.row_numbers(id_))
+        b, lanes, kind = self.b, self.lanes, self.kind
+        splat, zero = self.load_splat(id_, tile_x, tile_y), self.lanes.constant(0.0, self.real)
         tile_center = self.spread([tile_x, tile_y])
         jacobian = self.spread([self.load(self.arguments["jacobian"], k, self.real) for k in range(9)])
-        limit = lanes.splat(b.fadd(cutoff, self.real(CUTOFF_SLACK)))
-        any_live, any_reached = self.variable(self.integers), self.variable(BOOL)
-        b.store(lanes.constant(0, INT), any_live)
-        b.store(BOOL(0), any_reached)
-        num_sums = functions.num_planes + (len(numbers) - 9) + (4 if kind.has_statistic else 0)
+        any_contributes = self.variable(BOOL)
+        b.store(BOOL(0), any_contributes)
+        num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.has_statistic else 0)
         totals = [self.variable(self.reals) for _ in range(num_sums)]
-        zero = lanes.constant(0.0, self.real)
         for total in totals:
             b.store(zero, total)
-        with self.all_vectors() as (k, _):
-            x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
-            rho, *taps = lanes.emit(functions.reach, [*planes, *row, x, y])
-            is_live = b.icmp_signed("!=", self.load(live, k, self.integers), lanes.constant(0, INT))
-            is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, limit))
-            with b.if_then(lanes.any(is_reached)):
-                entries = self.entries(taps)
-                is_uniform = self.is_uniform(entries) if entries else None
-                values = self.gather(entries, is_uniform)
-                before = [self.load(light, k, self.reals), is_live, self.load(behind, k, self.reals)]
-                cotangents = [self.load(channel, k, self.reals) for channel in g]
-                at_pixel = [*planes, *splat, *row, *values, x, y, *before, *cotangents, *tile_center, *jacobian]
-                after, still_live, left, contributes, *rest = lanes.emit(functions.backward, at_pixel)
-                self.store(after, light, k)
-                self.store(b.zext(still_live, self.integers), live, k)
-                self.store(left, behind, k)
-                d_values, sums = rest[: len(values)], rest[len(values) :]
-                if kind.has_statistic:
-                    sums.append(lanes.constant(1.0, self.real))
-                with b.if_then(lanes.any(contributes)):
-                    b.store(BOOL(1), any_reached)
-                    for total, value in zip(totals, sums, strict=True):
-                        # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
-                        value = b.select(contributes, value, zero)
-                        b.store(b.fadd(b.load(total, typ=self.reals), value), total)
-                    d_values = [b.select(contributes, value, zero) for value in d_values]
-                    self.scatter(entries, is_uniform, d_values)
-            now = self.load(live, k, self.integers)
-            b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
-        with b.if_then(b.load(any_reached, typ=BOOL)):
-            self.add_totals(id_, numbers, tile_x, tile_y, totals)
-        return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), lanes.constant(0, INT)))
+
+        def composite(k, x, y, taps, is_live):
+            entries = self.entries(taps)
+            is_uniform = self.is_uniform(entries) if entries else None
+            values = self.gather(entries, is_uniform)
+            state = [self.load(self.light, k, self.reals), is_live, self.load(behind, k, self.reals)]
+            cotangents = [self.load(channel, k, self.reals) for channel in g]
+            at_pixel = [*splat.planes, *splat.spread, *splat.row, *values, x, y]
+            at_pixel += [*state, *cotangents, *tile_center, *jacobian]
+            after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
+            self.store(after, self.light, k)
+            self.store(b.zext(still_live, self.integers), self.live, k)
+            self.store(left, behind, k)
+            d_values, sums = rest[: len(values)], rest[len(values) :]
+            if kind.has_statistic:
+                sums.append(lanes.constant(1.0, self.real))
+            # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
+            chosen = functools.partial(b.select, contributes, rhs=zero)
+            with b.if_then(lanes.any(contributes)):
+                b.store(BOOL(1), any_contributes)
+                for total, value in zip(totals, sums, strict=True):
+                    b.store(b.fadd(b.load(total, typ=self.reals), chosen(value)), total)
+                self.scatter(entries, is_uniform, [chosen(value) for value in d_values])
+
+        is_live = self.reached_vectors(splat, composite)
+        with b.if_then(b.load(any_contributes, typ=BOOL)):
+            self.add_totals(id_, splat.numbers, tile_x, tile_y, totals)
+        return is_live
 
     def add_totals(self, id_, numbers, tile_x, tile_y, totals) -> None:
         """Sums over lanes, carried from the planes to the homography, added to the splat's rows of the results."""

@@ -3,8 +3,10 @@
 import jax.numpy as jnp
 from jax import Array
 
-NUM_PLAIN, NUM_WITH_NORMAL = 13, 16
-"""Numbers of a splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
+
+def num_numbers(has_geometry: bool) -> int:
+    """Numbers of a splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
+    return 16 if has_geometry else 13
 
 
 def pack_splats(splats, has_geometry: bool, *more: Array) -> Array:

@@ -15,35 +15,15 @@ from jax.experimental import pallas as pl
 
 from a2tg_jax import pixel
 from a2tg_jax.kernels.choice import triton
-from a2tg_jax.kernels.packing import NUM_PLAIN, NUM_WITH_NORMAL, pack_rows, pack_splats, unpack_splats
+from a2tg_jax.kernels.packing import num_numbers, pack_rows, pack_splats, unpack_splats
+from a2tg_jax.tiles import TileGrid
 
 IS_COMPILED_AHEAD = False
 """Set where kernels are compiled on a machine that has no GPU, for one that has; else CPUs interpret them."""
 
 
-class Kind(NamedTuple):
-    """What a pair of kernels is made for; hashable."""
-
-    rule: Any
-    """The tree structure of an appearance rule: its class and static fields."""
-    columns: int
-    """Tiles in a row of the image."""
-    width: int
-    height: int
-    tile_size: int
-    near_plane: float
-    has_geometry: bool
-    has_statistic: bool
-    is_interpreted: bool
-    """Run by the interpreter, on any device, for tests."""
-
-    @property
-    def num_channels(self) -> int:
-        return 8 if self.has_geometry else 3
-
-    @property
-    def num_pixels(self) -> int:
-        return self.tile_size**2
+def _is_interpreted() -> bool:
+    return jax.default_backend() == "cpu" and not IS_COMPILED_AHEAD
 
 
 class _Tile(NamedTuple):
@@ -59,21 +39,21 @@ class _Tile(NamedTuple):
     last: Array
 
 
-def _tile(kind: Kind, starts, dtype) -> _Tile:
-    index, size = pl.program_id(0), kind.tile_size
-    center_x = ((index % kind.columns) * size).astype(dtype) + size / 2
-    center_y = ((index // kind.columns) * size).astype(dtype) + size / 2
-    place = jax.lax.iota(jnp.int32, kind.num_pixels)
+def _tile(grid: TileGrid, starts, dtype) -> _Tile:
+    index, size = pl.program_id(0), grid.tile_size
+    center_x = ((index % grid.columns) * size).astype(dtype) + size / 2
+    center_y = ((index // grid.columns) * size).astype(dtype) + size / 2
+    place = jax.lax.iota(jnp.int32, size**2)
     x = (place % size).astype(dtype) - (size - 1) / 2
     y = (place // size).astype(dtype) - (size - 1) / 2
-    is_inside = (center_x + x < kind.width) & (center_y + y < kind.height)
+    is_inside = (center_x + x < grid.width) & (center_y + y < grid.height)
     return _Tile(center_x, center_y, x, y, is_inside, starts[index], starts[index + 1])
 
 
-def _splat(kind: Kind, splats, id_) -> pixel.Splat:
-    numbers = [splats[id_, k] for k in range(NUM_WITH_NORMAL if kind.has_geometry else NUM_PLAIN)]
+def _splat(splats, id_, has_geometry: bool) -> pixel.Splat:
+    numbers = [splats[id_, k] for k in range(num_numbers(has_geometry))]
     M = tuple(tuple(numbers[3 * i : 3 * i + 3]) for i in range(3))
-    normal = tuple(numbers[13:16]) if kind.has_geometry else None
+    normal = tuple(numbers[13:16]) if has_geometry else None
     return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal)  # type: ignore[arg-type]
 
 
@@ -85,76 +65,73 @@ def _values(table, entries) -> Any:
     return tuple(tuple(table[entry, column] for column in range(table.shape[1])) for entry in entries)
 
 
-def _forward_kernel(kind: Kind, rule, ids, starts, splats, rows, table, image):
-    tile = _tile(kind, starts, splats.dtype)
+def _is_unfinished(tile: _Tile, carry) -> Array:
+    at, _, live, _ = carry
+    return (at < tile.last) & (jnp.max(live) > 0)
 
-    def is_unfinished(carry):
-        at, _, live, _ = carry
-        return (at < tile.last) & (jnp.max(live) > 0)
+
+def _forward_kernel(how, rule, ids, starts, splats, rows, table, image):
+    tile = _tile(how.grid, starts, splats.dtype)
 
     def add_splat(carry):
         at, light, live, channels = carry
         id_ = ids[at]
-        splat, row = _splat(kind, splats, id_), _row(rows, id_)
+        splat, row = _splat(splats, id_, how.has_geometry), _row(rows, id_)
         planes = pixel.planes_of(splat.M, tile.center_x, tile.center_y)
-        hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
+        hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane)
         values = _values(table, rule.lookup(row, hit.u, hit.v))
         at_pixel = planes, splat, row, values, tile.x, tile.y, light, live > 0
-        added, light, is_live = pixel.composite(rule, kind.near_plane, *at_pixel)
+        added, light, is_live = pixel.composite(rule, how.near_plane, *at_pixel)
         channels = tuple(total + more for total, more in zip(channels, added, strict=True))
         return at + 1, light, is_live.astype(jnp.int32), channels
 
     dark = jnp.zeros_like(tile.x)
-    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), (dark,) * kind.num_channels)
-    _, light, _, channels = jax.lax.while_loop(is_unfinished, add_splat, carry)
+    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), (dark,) * how.num_channels)
+    _, light, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tile), add_splat, carry)
     for k, channel in enumerate((*channels, light)):
         image[pl.program_id(0), k, :] = channel
 
 
 def _backward_kernel(
-    kind: Kind, rule, ids, starts, splats, rows, table, g, behind, jacobian, *zeros_and_results
+    how, rule, ids, starts, splats, rows, table, g, behind, jacobian, *zeros_and_results
 ):  # fmt: skip
     d_splats, d_table, d_tap = zeros_and_results[3:]
-    tile = _tile(kind, starts, splats.dtype)
+    tile = _tile(how.grid, starts, splats.dtype)
     index = pl.program_id(0)
-    cotangents = tuple(g[index, k, :] for k in range(kind.num_channels))
+    cotangents = tuple(g[index, k, :] for k in range(how.num_channels))
     axes = tuple(tuple(jacobian[i, k] for k in range(3)) for i in range(3))
-
-    def is_unfinished(carry):
-        at, _, live, _ = carry
-        return (at < tile.last) & (jnp.max(live) > 0)
 
     def add_splat(carry):
         at, light, live, behind = carry
         id_ = ids[at]
-        splat, row = _splat(kind, splats, id_), _row(rows, id_)
+        splat, row = _splat(splats, id_, how.has_geometry), _row(rows, id_)
         planes, to_M = jax.vjp(lambda M: pixel.planes_of(M, tile.center_x, tile.center_y), splat.M)
-        hit = pixel.intersect(planes, tile.x, tile.y, kind.near_plane)
+        hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane)
         entries = rule.lookup(row, hit.u, hit.v)
         # A number per pixel, so that each pixel has a cotangent of its own.
         spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
         at_pixel = spread(planes), spread(splat), row, _values(table, entries), tile.x, tile.y, light, live > 0
         (light, is_live, behind), weight, d = pixel.composite_vjp(
-            rule, kind.near_plane, *at_pixel, behind, cotangents, kind.has_statistic
+            rule, how.near_plane, *at_pixel, behind, cotangents, how.has_statistic
         )
         contributes = weight > 0
         # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
         total = lambda x: jnp.sum(jnp.where(contributes, x, jnp.zeros_like(x)))  # noqa: E731
         d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal))
         for k, number in enumerate(jax.tree.leaves((to_M(d_planes), *others))):
-            _add(kind, d_splats, (id_, k), number)
+            _add(d_splats, (id_, k), number)
         for entry, columns in zip(entries, d.values, strict=True):
             for column, value in enumerate(columns):
-                _add_all(kind, d_table, entry, column, jnp.where(contributes, value, jnp.zeros_like(value)))
-        if kind.has_statistic:
+                _add_all(d_table, entry, column, jnp.where(contributes, value, jnp.zeros_like(value)))
+        if how.has_statistic:
             center = tile.center_x, tile.center_y
-            absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d.log_falloff, axes, kind.near_plane)
+            absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d.log_falloff, axes, how.near_plane)
             for k, number in enumerate((*map(total, absolute), jnp.sum(contributes.astype(weight.dtype)))):
-                _add(kind, d_tap, (id_, k), number)
+                _add(d_tap, (id_, k), number)
         return at + 1, light, is_live.astype(jnp.int32), behind
 
     carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), behind[index, :])
-    jax.lax.while_loop(is_unfinished, add_splat, carry)
+    jax.lax.while_loop(functools.partial(_is_unfinished, tile), add_splat, carry)
 
 
 def _triton() -> Any:
@@ -164,18 +141,18 @@ def _triton() -> Any:
     return module
 
 
-def _add(kind: Kind, total, place: tuple[Array, int], number: Array) -> None:
+def _add(total, place: tuple[Array, int], number: Array) -> None:
     """Adds a number to an entry that other programs add to as well."""
     row, column = place
-    if kind.is_interpreted:
+    if _is_interpreted():
         total[row, column] += number
     else:
         _triton().atomic_add(total, (row, jnp.int32(column)), number)
 
 
-def _add_all(kind: Kind, total, rows: Array, column: int, numbers: Array) -> None:
+def _add_all(total, rows: Array, column: int, numbers: Array) -> None:
     """Adds numbers [P] to entries [P] of a column, which may repeat. The interpreter would lose repeated ones."""
-    if not kind.is_interpreted:
+    if not _is_interpreted():
         _triton().atomic_add(total, (rows, jnp.full_like(rows, column)), numbers)
         return
 
@@ -188,35 +165,20 @@ def _add_all(kind: Kind, total, rows: Array, column: int, numbers: Array) -> Non
     jax.lax.fori_loop(0, rows.shape[0], add_one, 0)
 
 
-def _call(kind: Kind, kernel, shapes, num_inputs: int, num_tiles: int, aliases: dict[int, int]):
+def _call(grid: TileGrid, kernel, shapes, num_inputs: int, aliases: dict[int, int]):
     everything = pl.BlockSpec(memory_space=pl.ANY)
     # Two pixels a thread, in tiles of 16×16.
-    num_warps = min(4, max(1, kind.num_pixels // 64))
-    params = {} if kind.is_interpreted else {"compiler_params": _triton().CompilerParams(num_warps, 1)}
+    num_warps = min(4, max(1, grid.tile_size**2 // 64))
+    params = {} if _is_interpreted() else {"compiler_params": _triton().CompilerParams(num_warps, 1)}
     return pl.pallas_call(
         kernel,
         out_shape=shapes,
-        grid=(num_tiles,),
+        grid=(grid.num,),
         in_specs=[everything] * num_inputs,
         out_specs=jax.tree.map(lambda _: everything, shapes),
         input_output_aliases=aliases,
-        interpret=kind.is_interpreted,
+        interpret=_is_interpreted(),
         **params,
-    )
-
-
-def _kind(how, rule) -> Kind:
-    grid = how.grid
-    return Kind(
-        rule=jax.tree.structure(rule),
-        columns=grid.columns,
-        width=grid.width,
-        height=grid.height,
-        tile_size=grid.tile_size,
-        near_plane=how.near_plane,
-        has_geometry=how.has_geometry,
-        has_statistic=how.has_statistic,
-        is_interpreted=jax.default_backend() == "cpu" and not IS_COMPILED_AHEAD,
     )
 
 
@@ -229,26 +191,24 @@ def _inputs(how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
 
 def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
     """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    kind = _kind(how, rule)
-    kernel = functools.partial(_forward_kernel, kind, _without_arrays(rule))
-    shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.num_pixels), splats.M.dtype)
+    kernel = functools.partial(_forward_kernel, how, _without_arrays(rule))
+    shape = jax.ShapeDtypeStruct((how.grid.num, how.num_channels + 1, how.grid.tile_size**2), splats.M.dtype)
     inputs = _inputs(how, splats, params, rule, lists)
-    image = _call(kind, kernel, shape, len(inputs), how.grid.num, {})(*inputs)[:, None]
+    image = _call(how.grid, kernel, shape, len(inputs), {})(*inputs)[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
 def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: Array, behind: Array):
     """As `compositor._backward`."""
-    kind = _kind(how, rule)
-    kernel = functools.partial(_backward_kernel, kind, _without_arrays(rule))
+    kernel = functools.partial(_backward_kernel, how, _without_arrays(rule))
     inputs = (*_inputs(how, splats, params, rule, lists), g[:, 0], behind[:, 0], jacobian.astype(splats.M.dtype))
     packed, table = inputs[2], inputs[4]
     zeros = (jnp.zeros_like(packed), jnp.zeros_like(table), jnp.zeros_like(tap))
     shapes = tuple(jax.ShapeDtypeStruct(zero.shape, zero.dtype) for zero in zeros)
     aliases = {len(inputs) + k: k for k in range(3)}
-    call = _call(kind, kernel, shapes, len(inputs) + 3, how.grid.num, aliases)
+    call = _call(how.grid, kernel, shapes, len(inputs) + 3, aliases)
     packed, table, d_tap = call(*inputs, *zeros)
-    d_splats = unpack_splats(packed, splats, kind.has_geometry)
+    d_splats = unpack_splats(packed, splats, how.has_geometry)
     return d_splats, table if params.shape[1] else jnp.zeros_like(params), d_tap
 
 

@@ -115,8 +115,8 @@ class TableWriter(Writer):
         by_tap = [d_values[k : k + columns] for k in range(0, len(d_values), columns)]
         with b.if_else(is_uniform) as (uniform, mixed):
             with uniform:
-                sums = [functools.reduce(self.add_up, same) for same in zip(*by_tap, strict=True)]
-                total = functools.reduce(self.add_up, self.transpose_back(sums))
+                sums = [functools.reduce(b.fadd, same) for same in zip(*by_tap, strict=True)]
+                total = functools.reduce(b.fadd, self.transpose_back(sums))
                 self.add_entry(b.extract_element(entries[0], INT(0)), total)
             with mixed:
                 for entry, vectors in zip(entries, by_tap, strict=True):
@@ -125,7 +125,4 @@ class TableWriter(Writer):
 
     def add_entry(self, id_: ir.Value, addend: ir.Value) -> None:
         base = self.entry("d_table", id_)
-        self.store(self.add_up(self.load(base, 0, addend.type), addend), base, 0)
-
-    def add_up(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        return self.b.fadd(x, y)
+        self.store(self.b.fadd(self.load(base, 0, addend.type), addend), base, 0)
