@@ -3,20 +3,21 @@
 Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would kill the gradient where it is needed.
 """
 
-import functools
-import math
-
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.kernels.choice import has_native
 from a2tg_jax.numerics import normalize, safe_divide
 
 SSIM_SIGMA = 1.5
 SSIM_RADIUS = 5
 SSIM_WINDOW = 2 * SSIM_RADIUS + 1
+_WEIGHTS = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
+SSIM_TAPS = tuple((_WEIGHTS / _WEIGHTS.sum()).tolist())
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
@@ -148,34 +149,36 @@ def _back_project(depth: Array, camera: Camera) -> Array:
     return (rays @ rotation) * depth[..., None] + camera.center[None, None]
 
 
+@jax.custom_vjp
 def _window_mean(images: Array) -> Array:
     """[C, H, W] → [C, H-10, W-10]: the mean under SSIM's window, at every place where it fits."""
+    if has_native():
+        from a2tg_jax.kernels import window
+
+        if images.shape[2] >= window.least_width(images.dtype, SSIM_WINDOW):
+            return window.window_mean(images, SSIM_TAPS)
     return _blur(_blur(images, 1), 2)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def _window_mean_forward(images: Array) -> tuple[Array, None]:
+    return _window_mean(images), None
+
+
+def _window_mean_backward(_: None, cotangent: Array) -> tuple[Array]:
+    # The window is symmetric: its transpose is the same mean of the padded cotangent.
+    pad = (2 * SSIM_RADIUS, 2 * SSIM_RADIUS)
+    return (_window_mean(jax.lax.optimization_barrier(jnp.pad(cotangent, ((0, 0), pad, pad)))),)
+
+
+_window_mean.defvjp(_window_mean_forward, _window_mean_backward)
+
+
 def _blur(x: Array, axis: int) -> Array:
     """The 11 Gaussian taps along one axis, as a sum of shifted slices (on a CPU far faster than a convolution)."""
-    weights = [math.exp(-0.5 * (tap / SSIM_SIGMA) ** 2) for tap in range(-SSIM_RADIUS, SSIM_RADIUS + 1)]
     size = x.shape[axis] - 2 * SSIM_RADIUS
     shifted = [jax.lax.slice_in_dim(x, tap, tap + size, axis=axis) for tap in range(SSIM_WINDOW)]
-    total = sum(weights)
-    blurred = shifted[SSIM_RADIUS] * (weights[SSIM_RADIUS] / total)
+    blurred = shifted[SSIM_RADIUS] * SSIM_TAPS[SSIM_RADIUS]
     for tap in range(SSIM_RADIUS):
-        blurred = blurred + (shifted[tap] + shifted[-1 - tap]) * (weights[tap] / total)
+        blurred = blurred + (shifted[tap] + shifted[-1 - tap]) * SSIM_TAPS[tap]
     # Without the barrier XLA fuses the two passes into one of 121 taps.
     return jax.lax.optimization_barrier(blurred)
-
-
-def _blur_forward(x: Array, axis: int) -> tuple[Array, None]:
-    return _blur(x, axis), None
-
-
-def _blur_backward(axis: int, _: None, cotangent: Array) -> tuple[Array]:
-    # The window is symmetric: its transpose is the same blur of the padded cotangent. Left to itself, autodiff pads
-    # and adds eleven arrays, which takes several times as long.
-    pad = [(2 * SSIM_RADIUS, 2 * SSIM_RADIUS) if i == axis else (0, 0) for i in range(cotangent.ndim)]
-    return (_blur(jax.lax.optimization_barrier(jnp.pad(cotangent, pad)), axis),)
-
-
-_blur.defvjp(_blur_forward, _blur_backward)

@@ -15,7 +15,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
 from a2tg_jax.geometry import homographies, screen_bounds
-from a2tg_jax.kernels import foreign, lanes, library, native
+from a2tg_jax.kernels import foreign, lanes, library, native, threads
 from a2tg_jax.kernels.writer import LONG, Writer
 from a2tg_jax.render import appearance_of, render_traced
 from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
@@ -105,8 +105,8 @@ def test_lists_are_those_of_xla(tile_size, dtype):
     assert full.overflow and full.starts[-1] == 0
 
 
-@pytest.mark.parametrize("threads", [2, 3])
-def test_threads_share_the_work_and_nothing_else(monkeypatch, threads):
+@pytest.mark.parametrize("num_threads", [2, 3])
+def test_threads_share_the_work_and_nothing_else(monkeypatch, num_threads):
     """Images are bit for bit those of one thread; gradients, summed by thread, are equal to rounding."""
     scene = draw_scene(3, num=60)
     gaussians, camera, textures = as_gaussians(scene, "float32"), as_camera(scene, "float32"), None
@@ -117,9 +117,9 @@ def test_threads_share_the_work_and_nothing_else(monkeypatch, threads):
         return jnp.sum(output.color**2) + jnp.sum(output.depth), output
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    monkeypatch.setattr(native, "num_threads", lambda: 1)
+    monkeypatch.setattr(threads, "num_threads", lambda: 1)
     (_, one), expected = differentiate(gaussians, textures)
-    monkeypatch.setattr(native, "num_threads", lambda: threads)
+    monkeypatch.setattr(threads, "num_threads", lambda: num_threads)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 10)
     (_, many), found = differentiate(gaussians, textures)
     np.testing.assert_array_equal(many.color, one.color)

@@ -7,6 +7,7 @@ import pytest
 from jax.test_util import check_grads
 from skimage.metrics import structural_similarity
 
+from a2tg_jax import losses
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import init_from_points
 from a2tg_jax.losses import (
@@ -156,3 +157,13 @@ def test_regularisers_see_live_rows_only():
     gradient = jax.grad(mean_scale)(gaussians, 5).log_scales
     assert (gradient[:5] > 0).all() and (gradient[5:] == 0).all()
     assert mean_opacity(gaussians, 0) == 0
+
+
+@pytest.mark.parametrize("shape", [(11, 18), (12, 26), (40, 51), (90, 333)])
+def test_ssim_and_its_gradient_are_the_same_without_native_loops(monkeypatch, x64, shape):
+    image, target = map(jnp.asarray, random_pair(*shape, 0.1))
+    native = jax.value_and_grad(ssim)(image, target)
+    monkeypatch.setattr(losses, "has_native", lambda: False)
+    plain = jax.value_and_grad(ssim)(image, target)
+    for a, b in zip(native, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-15)

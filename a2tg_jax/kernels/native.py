@@ -4,11 +4,9 @@ Tiles are dealt to threads in contiguous parts of about as many pairs each. Ever
 which are summed in order: results do not depend on timing, only, in the last bits, on the number of threads.
 """
 
-import concurrent.futures
 import functools
 import hashlib
 import itertools
-import os
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.geometry import ScreenBounds
-from a2tg_jax.kernels import foreign
+from a2tg_jax.kernels import foreign, threads
 from a2tg_jax.kernels.packing import pack_rows, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists, exceeds, outlines, tile_rectangles, total_pairs
 
@@ -28,18 +26,6 @@ _names: dict[str, Any] = {}
 """Whose loops each name stands for."""
 PAIRS_PER_THREAD = 2_000
 """Fewer pairs than this are not worth another thread."""
-
-
-def num_threads() -> int:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@functools.cache
-def _pool() -> concurrent.futures.ThreadPoolExecutor:
-    return concurrent.futures.ThreadPoolExecutor(num_threads(), thread_name_prefix="a2tg")
 
 
 def _kind(how, splats, rule):
@@ -165,7 +151,7 @@ def _forward_handler(run: Callable) -> foreign.Handler:
         def part(first: int, last: int, _: int) -> None:
             run(*pointers, first, last, *map(int, size), len(table))
 
-        _in_parts(part, _parts(starts))
+        threads.run_spans(part, _parts(starts))
 
     return handler
 
@@ -184,7 +170,7 @@ def _backward_handler(run: Callable) -> foreign.Handler:
             outputs = [total.ctypes.data for total in totals[index]]
             run(*given, *outputs, first, last, *map(int, size), len(table))
 
-        _in_parts(part, parts)
+        threads.run_spans(part, parts)
         for more in totals[1:]:
             for result, addend in zip(results, more, strict=True):
                 result += addend
@@ -192,25 +178,11 @@ def _backward_handler(run: Callable) -> foreign.Handler:
     return handler
 
 
-def _parts(starts: np.ndarray) -> list[tuple[int, int]]:
+def _parts(starts: np.ndarray) -> list[threads.Span]:
     """Ranges of tiles with about as many pairs (and tiles) each, one per thread that is worth starting."""
     num_tiles, num_pairs = len(starts) - 1, int(starts[-1])
-    count = max(1, min(num_threads(), num_pairs // PAIRS_PER_THREAD))
+    count = max(1, min(threads.num_threads(), num_pairs // PAIRS_PER_THREAD))
     work = starts.astype(np.int64) + np.arange(num_tiles + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
     borders = [0, *borders, num_tiles]
     return list(itertools.pairwise(borders))
-
-
-def _in_parts(part: Callable[[int, int, int], None], parts: list[tuple[int, int]]) -> None:
-    """part(first tile, last tile, index) for every part, each on a thread of its own."""
-    others: list[concurrent.futures.Future] = []
-    try:
-        for index, span in enumerate(parts[1:], start=1):
-            others.append(_pool().submit(part, *span, index))
-        part(*parts[0], 0)
-    finally:
-        # Whatever happens, nobody may write to XLA's buffers once they are given back.
-        concurrent.futures.wait(others)
-    for other in others:
-        other.result()
