@@ -1,11 +1,12 @@
 """Appearance rules: what a splat shows at (u, v). The compositor is given one and knows nothing else about it.
 
-A rule has a table of parameters [T, C], and a few integers per splat, its row. At (u, v), in standard deviations, it
-says which entries of the table it reads (`lookup`), and what these make visible there (`shade`):
+A rule has a table of parameters [T, C], of which each splat owns an image of one texel or more. At (u, v), in standard
+deviations, the rule says where that image is looked up (`texel`), and what the C numbers found there make visible
+(`shade`):
 
-    residual, factor = rule.shade(row, rule.params[rule.lookup(row, u, v)], u, v)
+    residual, factor = rule.shade(interpolated image at rule.texel(image, u, v), u, v)
 
-`lookup`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They may use nothing of the
+`texel`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They may use nothing of the
 rule but its static fields: everything else comes as an argument, and what is differentiated comes in `values`.
 """
 
@@ -16,8 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-Values = tuple[tuple[Array, ...], ...]
-"""For each index of a lookup the C numbers of that entry of the table."""
+from a2tg_jax.bilinear import Image
 
 
 class AppearanceRule(Protocol):
@@ -29,18 +29,19 @@ class AppearanceRule(Protocol):
         ...
 
     @property
-    def rows(self) -> tuple[Array, ...]:
-        """[N] int32 each: what the rule keeps of every splat."""
+    def images(self) -> Image | None:
+        """[N] each: the splats' images in the table. None where nothing of it is read."""
         ...
 
-    def lookup(self, row: tuple[Array, ...], u: Array, v: Array) -> tuple[Array, ...]:
-        """The entries of the table that are read at (u, v), int32; always equally many."""
+    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
+        """(x, y) where an image is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""
         ...
 
     def shade(
-        self, row: tuple[Array, ...], values: Values, u: Array, v: Array
+        self, values: tuple[Array, ...], u: Array, v: Array
     ) -> tuple[tuple[Array, Array, Array] | None, Array | None]:
-        """Colour residuals and the alpha factor at (u, v); None stands for 0 and for 1."""
+        """Colour residuals and the alpha factor at (u, v), given what the image shows there, C numbers; None stands
+        for 0 and for 1."""
         ...
 
     def falloff(self, rho: Array) -> Array:
@@ -67,13 +68,13 @@ class PlainAppearance:
         return jnp.zeros((1, 0), jnp.float32)
 
     @property
-    def rows(self) -> tuple[Array, ...]:
-        return ()
+    def images(self) -> None:
+        return None
 
-    def lookup(self, row, u, v):
-        return ()
+    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
+        raise NotImplementedError("plain splats have no images")
 
-    def shade(self, row, values, u, v):
+    def shade(self, values: tuple[Array, ...], u: Array, v: Array) -> tuple[None, None]:
         return None, None
 
     def falloff(self, rho: Array) -> Array:

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax import pixel
+from a2tg_jax import bilinear, pixel
 from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.bilinear import Image
 from a2tg_jax.kernels.choice import Compositor
 from a2tg_jax.numerics import pixel_sum, spread
 from a2tg_jax.tiles import TileGrid, TileLists
@@ -223,9 +224,9 @@ def _block_ids(ids: Array, at: Array) -> Array:
 
 
 def _gather(splats: Splats, rule: AppearanceRule, ids: Array):
-    """The splats [G, B, ...] of some ids [G, B], and the rule's rows of them."""
+    """The splats [G, B, ...] of some ids [G, B], and their images."""
     flat = ids.reshape(-1)
-    rows = jax.tree.map(lambda x: x[flat], (splats, rule.rows))
+    rows = jax.tree.map(lambda x: x[flat], (splats, rule.images))
     return jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
 
 
@@ -233,11 +234,12 @@ def _accumulate(totals, ids: Array, d_rows):
     """Adds the cotangents of one block a tile to the totals; those of the splats are packed in one row each."""
     flat = ids.reshape(-1)
     splats, params, tap = totals
-    d_splats, d_tap, entries, d_values = d_rows
+    d_splats, d_tap, d_texels = d_rows
     packed = jnp.concatenate([leaf.reshape(flat.shape[0], -1) for leaf in d_splats], axis=1)
     splats = splats.at[flat].add(packed)
-    if entries is not None:
-        params = params.at[entries.reshape(-1)].add(d_values.reshape(-1, params.shape[1]))
+    if d_texels is not None:
+        entries, addends = d_texels
+        params = params.at[entries.reshape(-1)].add(addends.reshape(-1, params.shape[1]))
     return splats, params, tap if d_tap is None else tap.at[flat].add(d_tap.reshape(flat.shape[0], -1))
 
 
@@ -264,25 +266,37 @@ def _hits(how: Compositing, splats: Splats, tile: _Tile) -> pixel.Hit:
     return pixel.intersect(planes, x, y, how.near_plane)
 
 
-def _entries(how: Compositing, rule, splats: Splats, row, tile: _Tile) -> Array | None:
-    """[taps, B, P] which entries of its table the rule reads; None where it reads none."""
-    hit = _hits(how, splats, tile)
-    found = rule.lookup(_columns(row), hit.u, hit.v)
-    return jnp.stack(found) if found else None
+class _Read(NamedTuple):
+    """What is read of the images of B splats at P pixels."""
+
+    image: Image
+    """[B, 1] each."""
+    taps: tuple[bilinear.Tap, ...]
+    """[B, P] each."""
+    sample: bilinear.Sample
+    """[B, P] each."""
 
 
-def _columns(row):
-    return jax.tree.map(lambda x: x[:, None], row)
+def _read(how: Compositing, rule, params: Array, splats: Splats, images: Image | None, tile: _Tile) -> _Read | None:
+    """None where the rule has no images."""
+    if images is None:
+        return None
+    hit, image = _hits(how, splats, tile), jax.tree.map(lambda x: x[:, None], images)
+    taps = bilinear.taps(image, *rule.texel(image, hit.u, hit.v))
+    texels = params[jnp.stack([tap.entry for tap in taps])]
+    sample = bilinear.interpolate(taps, tuple(tuple(jnp.moveaxis(texel, -1, 0)) for texel in texels))
+    return _Read(image, taps, sample)
 
 
-def _show(how: Compositing, rule, splats: Splats, row, values, at, tile: _Tile, log_tap=None) -> pixel.Shown:
-    """What a block shows at a tile's pixels, each [B, P]; entries past the end of the list show nothing.
+def _show(how: Compositing, rule, splats: Splats, read: _Read | None, values, at, tile: _Tile, log_tap=None):
+    """`pixel.Shown` of a block at a tile's pixels, each [B, P]; entries past the end of the list show nothing.
 
-    `values` [taps, B, P, C] is what the rule reads of its table, or None.
+    `values` are those of the sample, apart, to be differentiated.
     """
     hit, num = _hits(how, splats, tile), how.grid.tile_size**2
-    taps = () if values is None else tuple(tuple(jnp.moveaxis(value, -1, 0)) for value in values)
-    shown = pixel.show(rule, _split(splats, how.has_geometry, num), hit, _columns(row), taps, log_tap)
+    if read is not None:
+        values = pixel.values_at(rule, read.image, read.sample, hit, values)
+    shown = pixel.show(rule, _split(splats, how.has_geometry, num), hit, values, log_tap)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
@@ -291,17 +305,16 @@ def _block(how: Compositing, rule, params: Array, rows, at, tile: _Tile, light, 
     """Composites one block of B splats over one tile.
 
     Args:
-      rows: the block's splats, and the rule's rows of them.
+      rows: the block's splats, and their images.
       at: position of the block in the list; entries past the tile's end are left out.
       light: [P] transmittance before the block; is_live: [P] pixels that have not stopped.
 
     Returns:
       Channels added [D, P], and transmittance and live pixels after the block.
     """
-    splats, row = rows
-    entries = _entries(how, rule, splats, row, tile)
-    values = None if entries is None else params[entries]
-    shown = _show(how, rule, splats, row, values, at, tile)
+    splats, images = rows
+    read = _read(how, rule, params, splats, images, tile)
+    shown = _show(how, rule, splats, read, _values(read), at, tile)
 
     def add_splat(carry, alpha):
         weight, light, is_live = pixel.absorb(alpha, *carry)
@@ -324,13 +337,12 @@ def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, 
 
     `behind` [P] is g·(what this block and all behind it add) + g_T·T_final; g is [D, P].
     """
-    splats, row = rows
-    entries = _entries(how, rule, splats, row, tile)
-    values = None if entries is None else params[entries]
+    splats, images = rows
+    read = _read(how, rule, params, splats, images, tile)
     log_tap = jnp.zeros((BLOCK, light.shape[0]), light.dtype) if how.has_statistic else None
     shown, pull_back = jax.vjp(
-        lambda splats, values, log_tap: _show(how, rule, splats, row, values, at, tile, log_tap),
-        splats, values, log_tap,
+        lambda splats, values, log_tap: _show(how, rule, splats, read, values, at, tile, log_tap),
+        splats, _values(read), log_tap,
     )  # fmt: skip
     g = g[:, None]
     seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
@@ -343,7 +355,19 @@ def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, 
     d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(how.num_channels)))
     d_splats, d_values, d_log = pull_back(d_shown)
     d_tap = _statistic(how, jacobian, splats, tile, d_log, weights) if how.has_statistic else None
-    return *carry, (d_splats, d_tap, entries, d_values)
+    return *carry, (d_splats, d_tap, _d_texels(read, d_values))
+
+
+def _values(read: _Read | None) -> tuple[Array, ...]:
+    return () if read is None else read.sample.values
+
+
+def _d_texels(read: _Read | None, d_values: tuple[Array, ...]) -> tuple[Array, Array] | None:
+    """Entries of the table [taps, B, P], and what is added to their cotangents [taps, B, P, C]."""
+    if read is None:
+        return None
+    per_tap = [jnp.stack([tap.weight * d_value for d_value in d_values], axis=-1) for tap in read.taps]
+    return jnp.stack([tap.entry for tap in read.taps]), jnp.stack(per_tap)
 
 
 def _statistic(how: Compositing, jacobian, splats: Splats, tile: _Tile, d_log: Array, weights: Array) -> Array:

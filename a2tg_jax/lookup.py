@@ -1,6 +1,6 @@
 """The appearance rule of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
 
-All textures lie one after the other in a table [texels, 4], row by row; a splat's row is (offset, Tv, Tu).
+All textures lie one after the other in a table [texels, 4], row by row.
 """
 
 import dataclasses
@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Values, gaussian_cutoff
+from a2tg_jax.appearance import gaussian_cutoff
+from a2tg_jax.bilinear import Image
 from a2tg_jax.texture import AtlasLayout, Textures
 
 EXTENT = 3.0
@@ -46,28 +47,20 @@ class TexturedAppearance:
 
     params: Array
     """[texels, 4] all textures."""
-    rows: tuple[Array, Array, Array]
-    """[N] first texel of each splat, Tv and Tu."""
+    images: Image
+    """[N] each: where the textures lie, Tv × Tu."""
     peaks: Array
     """[N] the largest alpha factor of each splat; bounds only, without gradient."""
     options: TextureOptions = dataclasses.field(metadata={"static": True})
 
-    def lookup(self, row, u: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-        """The texels above left, above right, below left and below right of (u, v)."""
-        offset, height, width = row
-        left, top = (_cell(x) for x in self._texel_coordinates(row, u, v))
-        right, bottom = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
-        above, below = offset + top * width, offset + bottom * width
-        return above + left, above + right, below + left, below + right
-
-    def shade(self, row, values: Values, u: Array, v: Array):
+    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
         if not self.options.uv_gradient:
             u, v = jax.lax.stop_gradient((u, v))
-        x, y = self._texel_coordinates(row, u, v)
-        fx, fy = x - _cell(x).astype(x.dtype), y - _cell(y).astype(y.dtype)
-        above_left, above_right, below_left, below_right = [self._displayed(texel) for texel in values]
-        corners = zip(above_left, above_right, below_left, below_right, strict=True)
-        red, green, blue, alpha = (_mix(_mix(a, b, fx), _mix(c, d, fx), fy) for a, b, c, d in corners)
+        width, height = image.width.astype(u.dtype), image.height.astype(v.dtype)
+        return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
+
+    def shade(self, values: tuple[Array, ...], u: Array, v: Array):
+        red, green, blue, alpha = values
         if self.options.outside == "identity":
             is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
             red, green, blue = (jnp.where(is_inside, channel, 0.0) for channel in (red, green, blue))
@@ -82,18 +75,8 @@ class TexturedAppearance:
 
     @property
     def num_bytes(self) -> int:
-        _, height, width = self.rows
-        return 16 * int(np.sum(np.asarray(height, np.int64) * np.asarray(width, np.int64)))
-
-    def _texel_coordinates(self, row, u: Array, v: Array) -> tuple[Array, Array]:
-        _, height, width = row
-        size_u, size_v = width.astype(u.dtype), height.astype(v.dtype)
-        return texel_coordinates(u, size_u, self.options.uv), texel_coordinates(v, size_v, self.options.uv)
-
-    def _displayed(self, texel: tuple[Array, ...]) -> tuple[Array, ...]:
-        if self.options.rgb == "signed":
-            return texel
-        return (*(jnp.clip(channel, 0.0, 1.0) for channel in texel[:3]), texel[3])
+        heights, widths = (np.asarray(sizes, np.int64) for sizes in (self.images.height, self.images.width))
+        return 16 * int(np.sum(heights * widths))
 
 
 def textured_appearance(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedAppearance:
@@ -106,9 +89,12 @@ def textured_appearance(textures: Textures, layout: AtlasLayout, options: Textur
     peaks = jnp.stack([_padded_peaks(bucket, max(capacities)) for bucket in textures.buckets])
     peaks = jax.lax.stop_gradient(peaks[layout.bucket, layout.row])
     offsets = bucket_starts[layout.bucket] + layout.row * bucket_areas[layout.bucket]
+    texels = jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets])
+    if options.rgb == "unit":
+        texels = jnp.concatenate([jnp.clip(texels[:, :3], 0.0, 1.0), texels[:, 3:]], axis=1)
     return TexturedAppearance(
-        params=jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets]),
-        rows=(offsets, sizes[:, 0], sizes[:, 1]),
+        params=texels,
+        images=Image(offsets, sizes[:, 0], sizes[:, 1]),
         peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
         options=options,
     )
@@ -125,12 +111,3 @@ def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
     unit = (u * (1 / EXTENT) + 1) * 0.5
     x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
     return jnp.clip(x, 0.0, size - 1)
-
-
-def _cell(x: Array) -> Array:
-    """The texel left of, or above, a texel coordinate."""
-    return jnp.floor(x).astype(jnp.int32)
-
-
-def _mix(a: Array, b: Array, fraction: Array) -> Array:
-    return a + (b - a) * fraction

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.bilinear import Image, Sample, follow
 
 MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.99
@@ -114,18 +115,26 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float) -> Hit:
     return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth))
 
 
-def show(rule: AppearanceRule, splat: Splat, hit: Hit, row, values, log_tap: Array | None = None) -> Shown:
+def values_at(rule: AppearanceRule, image: Image | None, sample: Sample | None, hit: Hit, values: tuple[Array, ...]):
+    """The values of a sample, differentiable in themselves and in where the ray meets the splat."""
+    if image is None or sample is None:
+        return ()
+    return follow(sample._replace(values=values), *rule.texel(image, hit.u, hit.v))
+
+
+def show(
+    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], log_tap: Array | None = None
+) -> Shown:
     """α = min(0.99, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
 
     Args:
       rule: the appearance rule.
       splat: its homography is not read.
       hit: where the ray meets the splat.
-      row: what the rule keeps of the splat.
-      values: what the rule reads of its table at `rule.lookup(row, hit.u, hit.v)`.
+      values: what the splat's image shows there.
       log_tap: zero, added to the exponent of the falloff, to read the gradient there; or None.
     """
-    residual, factor = rule.shade(row, values, hit.u, hit.v)
+    residual, factor = rule.shade(values, hit.u, hit.v)
     a = splat.opacity * rule.falloff(hit.rho)
     a = a if factor is None else a * factor
     a = a if log_tap is None else a * jnp.exp(log_tap)
@@ -173,22 +182,22 @@ class Cotangents(NamedTuple):
     opacity: Array
     color: Triple
     normal: Triple | None
-    values: tuple
-    """Of what the rule read of its table."""
+    values: tuple[Array, ...]
+    """Of what the splat's image shows."""
     log_falloff: Array | None
     """∂L/∂(log of the falloff), where asked for."""
 
 
-def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, row, values, x, y, light, is_live):
+def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, light, is_live):
     """One splat at one pixel of the forward pass: what it adds to the channels, and light and liveness behind it."""
-    shown = show(rule, splat, intersect(planes, x, y, near_plane), row, values)
+    shown = show(rule, splat, intersect(planes, x, y, near_plane), values)
     weight, light, is_live = absorb(shown.alpha, light, is_live)
     return tuple(weight * channel for channel in shown.channels), light, is_live
 
 
 def composite_vjp(
-    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, row, values, x, y, light, is_live, behind, g,
-    has_log: bool,
+    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, image: Image | None, sample: Sample | None,
+    x, y, light, is_live, behind, g, has_log: bool,
 ):  # fmt: skip
     """One splat at one pixel of the backward pass; `behind` and `g` as in `absorb_vjp`, g channel by channel.
 
@@ -199,9 +208,11 @@ def composite_vjp(
 
     def of_floats(planes, opacity, color, normal, values, log_tap):
         hit = intersect(planes, x, y, near_plane)
-        return show(rule, Splat(splat.M, opacity, color, normal), hit, row, values, log_tap)
+        values = values_at(rule, image, sample, hit, values)
+        return show(rule, Splat(splat.M, opacity, color, normal), hit, values, log_tap)
 
     log_tap = jnp.zeros_like(light) if has_log else None
+    values = () if sample is None else sample.values
     floats = planes, splat.opacity, splat.color, splat.normal, values, log_tap
     shown, pull_back = jax.vjp(of_floats, *floats)
     seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))

@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"config", "numerics", "startup"},
+    {"config", "numerics", "startup", "bilinear"},
     {"gaussians", "cameras", "sh"},
     {"geometry"},
     {"texture", "tiles", "appearance", "data"},

@@ -14,6 +14,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
+from a2tg_jax.bilinear import Image
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import foreign, lanes, library, native, threads
 from a2tg_jax.kernels.writer import LONG, Writer
@@ -145,14 +146,14 @@ class HalvesAppearance:
     sharpness: float = dataclasses.field(metadata={"static": True})
 
     @property
-    def rows(self):
-        return (self.first,)
+    def images(self):
+        return Image(self.first, jnp.ones_like(self.first), jnp.full_like(self.first, 2))
 
-    def lookup(self, row, u, v):
-        return (row[0] + (u > 0).astype(jnp.int32),)
+    def texel(self, image, u, v):
+        return (u > 0).astype(u.dtype), jnp.zeros_like(v)
 
-    def shade(self, row, values, u, v):
-        ((a, b, c),) = values
+    def shade(self, values, u, v):
+        a, b, c = values
         return (a, b * u, c), None
 
     def falloff(self, rho):
@@ -241,7 +242,7 @@ def test_a_rule_defined_anew_is_compiled_anew():
         @jax.tree_util.register_dataclass
         @dataclasses.dataclass(frozen=True)
         class Anew(PlainAppearance):
-            def shade(self, row, values, u, v):
+            def shade(self, values, u, v):
                 return (residual * jnp.ones_like(u),) * 3, None
 
         return render_appearance(gaussians, camera, Anew()).color

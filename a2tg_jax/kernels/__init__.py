@@ -1,6 +1,7 @@
 """Accelerated compositors behind the same function, made from the element-wise functions in `pixel`.
 
 `choice` says which one runs where. On CPUs, native loops: `functions` are what is applied, `lanes` translates it to
-LLVM vector code, `loops` and `lists` put that into loops (with `writer` and `table`), `library` compiles, `foreign`
-lets XLA call the result, and `native` is what the renderer uses. On GPUs, `pallas`. `packing` is common to both.
+LLVM vector code, `loops` and `lists` put that into loops (with `writer` and `texels`), `library` compiles, `foreign`
+lets XLA call the result, on `threads`, and `native` is what the renderer uses. On GPUs, `pallas`. `packing` is common
+to both. `window` is SSIM's, made in the same way.
 """

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import pixel
+from a2tg_jax.bilinear import Image, Sample
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.lanes import trace
 from a2tg_jax.kernels.packing import num_numbers
@@ -21,10 +22,8 @@ class Kind:
     """The tree structure of an appearance rule, with its static fields."""
     rule_class: type
     """Its class, which equality of tree structures disregards."""
-    num_rows: int
-    """Integers that the rule keeps of a splat."""
     num_columns: int
-    """C, numbers in an entry of its table."""
+    """C, numbers in an entry of its table; 0 where it has no images."""
     dtype: str
     tile_size: int
     near_plane: float
@@ -57,10 +56,13 @@ class Functions:
     def __init__(self, kind: Kind):
         rule = jax.tree.unflatten(kind.rule, [None] * kind.rule.num_leaves)
         number: Any = jax.ShapeDtypeStruct((), kind.dtype)
-        integer, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), jnp.bool_)
+        integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
+        flag = jax.ShapeDtypeStruct((), jnp.bool_)
         triple, near_plane = (number,) * 3, kind.near_plane
         splat = pixel.Splat((triple,) * 3, number, triple, triple if kind.has_geometry else None)
-        row = (integer,) * kind.num_rows
+        values = (number,) * kind.num_columns
+        image = Image(integer, integer, integer) if values else None
+        sample = Sample(values, values, values) if values else None
 
         self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
@@ -71,28 +73,27 @@ class Functions:
 
         self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
 
-        def reach(planes, row, x, y):
+        def reach(planes, image, x, y):
             hit = pixel.intersect(planes, x, y, near_plane)
-            return hit.rho, rule.lookup(row, hit.u, hit.v)
+            return hit.rho, () if image is None else rule.texel(image, hit.u, hit.v)
 
-        self.reach, structure = trace(reach, planes, row, number, number)
-        self.num_taps = structure.num_leaves - 1
+        self.reach, _ = trace(reach, planes, image, number, number)
 
-        def forward(planes, splat, row, values, x, y, light, is_live, channels):
-            at_pixel = planes, splat, row, values, x, y, light, is_live
+        def forward(planes, splat, values, x, y, light, is_live, channels):
+            at_pixel = planes, splat, values, x, y, light, is_live
             added, light, is_live = pixel.composite(rule, near_plane, *at_pixel)
             return light, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
 
-        def backward(planes, splat, row, values, x, y, light, is_live, behind, g, center, jacobian):
-            at_pixel = planes, splat, row, values, x, y, light, is_live, behind, g
+        def backward(planes, splat, image, sample, x, y, light, is_live, behind, g, center, jacobian):
+            at_pixel = planes, splat, image, sample, x, y, light, is_live, behind, g
             state, weight, d = pixel.composite_vjp(rule, near_plane, *at_pixel, kind.has_statistic)
             tap = ()
             if kind.has_statistic:
                 tap = pixel.absolute_gradient(splat.M, x, y, *center, d.log_falloff, jacobian, near_plane)
             return state, weight > 0, d.values, (d.planes, d.opacity, d.color, d.normal, tap)
 
-        values = ((number,) * kind.num_columns,) * self.num_taps
-        at_pixel = planes, splat, row, values, number, number, number, flag
+        at_pixel = number, number, number, flag
         channels = (number,) * kind.num_channels
-        self.forward, _ = trace(forward, *at_pixel, channels)
-        self.backward, _ = trace(backward, *at_pixel, number, channels, (number, number), (triple,) * 3)
+        self.forward, _ = trace(forward, planes, splat, values, *at_pixel, channels)
+        last = number, channels, (number, number), (triple,) * 3
+        self.backward, _ = trace(backward, planes, splat, image, sample, *at_pixel, *last)

@@ -88,6 +88,23 @@ class Lanes:
         function = self.builder.module.globals.get(name) or ir.Function(self.builder.module, function_type, name)
         return self.builder.call(function, [zero, value], fastmath=("reassoc", "nsz", "contract"))
 
+    def smallest(self, value: ir.Value) -> ir.Value:
+        """The smallest of the lanes, which are numbers."""
+        return self.fold(value, self.smaller)
+
+    def largest(self, value: ir.Value) -> ir.Value:
+        """The largest of the lanes, which are numbers."""
+        return self.fold(value, self.larger)
+
+    def fold(self, value: ir.Value, combine: Callable[[ir.Value, ir.Value], ir.Value], to: int = 1) -> ir.Value:
+        """Combines the halves of a vector until `to` lanes are left; one lane is a scalar."""
+        b, width = self.builder, self.width
+        while width > to:
+            width //= 2
+            masks = (ir.Constant(ir.VectorType(INT, width), list(range(first, first + width))) for first in (0, width))
+            value = combine(*(b.shuffle_vector(value, value, mask) for mask in masks))
+        return b.extract_element(value, INT(0)) if isinstance(value.type, ir.VectorType) and to == 1 else value
+
     def any(self, mask: ir.Value) -> ir.Value:
         """Whether a lane of a mask is set."""
         if self.width == 1:

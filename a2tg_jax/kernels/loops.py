@@ -3,11 +3,11 @@
 One call composites the tiles `first` to `last`. Every splat of a tile's list is prepared once (scalar code), then
 applied to the tile's pixels, L at a time (vector code). Where no pixel of the L can be reached, they are passed over.
 
-    forward(ids, starts, splats, rows, table, image; first, last, columns, width, height, entries)
-    backward(ids, starts, splats, rows, table, g, behind, jacobian, d_splats, d_table, d_tap; the same)
+    forward(ids, starts, splats, images, table, result; first, last, columns, width, height)
+    backward(ids, starts, splats, images, table, g, behind, jacobian, d_splats, d_table, d_tap; the same)
 
-Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), rows [N, I], table [entries, C],
-image [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], behind [tiles, P], jacobian [3, 3];
+Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), images [N, 3], table [entries, C],
+result [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], behind [tiles, P], jacobian [3, 3];
 d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to.
 """
 
@@ -23,14 +23,26 @@ from llvmlite import ir
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.functions import Functions, Kind
 from a2tg_jax.kernels.lanes import BOOL, INT, Lanes
-from a2tg_jax.kernels.table import TableWriter
+from a2tg_jax.kernels.texels import NativeImage, TexelWriter
 from a2tg_jax.kernels.writer import LONG
 
-INTEGERS = ("first", "last", "columns", "width", "height", "entries")
-FORWARD = ("ids", "starts", "splats", "rows", "table", "image")
-BACKWARD = ("ids", "starts", "splats", "rows", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap")
+INTEGERS = ("first", "last", "columns", "width", "height")
+FORWARD = ("ids", "starts", "splats", "images", "table", "result")
+BACKWARD = ("ids", "starts", "splats", "images", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap")
 CUTOFF_SLACK = 1e-3
 """Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
+
+
+def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
+    """The pixels of a tile, counted row by row, as vectors take them: each takes a block of L where such blocks fill
+    the tile, because a compact block sees fewer splats and fewer texels than a row does."""
+    height = 1 << (lanes.bit_length() - 1) // 2
+    width = lanes // height
+    pixels = np.arange(tile_size**2).reshape(tile_size, tile_size)
+    if tile_size % height or tile_size % width:
+        return pixels.reshape(-1)
+    blocks = pixels.reshape(tile_size // height, height, tile_size // width, width)
+    return np.moveaxis(blocks, 2, 1).reshape(-1)
 
 
 class _LoadedSplat(NamedTuple):
@@ -42,12 +54,13 @@ class _LoadedSplat(NamedTuple):
     """In every lane, as all that follows."""
     spread: list[ir.Value]
     """The numbers."""
-    row: list[ir.Value]
+    image: NativeImage | None
+    spread_image: list[ir.Value]
     limit: ir.Value
     """Squared distance within which a pixel is looked at."""
 
 
-class _Compositing(TableWriter):
+class _Compositing(TexelWriter):
     """What both passes share."""
 
     def __init__(self, kind: Kind, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
@@ -56,17 +69,18 @@ class _Compositing(TableWriter):
         self.lanes, self.scalars = Lanes(self.b, kind.lanes), Lanes(self.b, 1)
         self.reals = self.lanes.vector(self.real)
         self.integers = self.lanes.vector(INT)
-        pixels = np.zeros((2, kind.num_vectors * kind.lanes))
-        pixels[:, : kind.tile_size**2] = np.mgrid[: kind.tile_size, : kind.tile_size].reshape(2, -1)
-        pixels[:, : kind.tile_size**2] -= (kind.tile_size - 1) / 2
+        order = pixel_order(kind.tile_size, kind.lanes)
+        y, x = np.stack(np.divmod(order, kind.tile_size)) - (kind.tile_size - 1) / 2
         # Lanes past the last pixel lie outside of every image.
-        pixels[:, kind.tile_size**2 :] = 1e9
+        past = np.full(-len(order) % kind.lanes, 1e9)
         self.light = self.variable(self.reals, kind.num_vectors)
         self.live = self.variable(self.integers, kind.num_vectors)
-        self.pixel_y, self.pixel_x = (self._table(f"{name}.{k}", row) for k, row in zip("yx", pixels, strict=True))
+        self.pixel_x = self._table(f"{name}.x", self.real, [*x, *past])
+        self.pixel_y = self._table(f"{name}.y", self.real, [*y, *past])
+        self.order = self._table(f"{name}.order", INT, order)
 
-    def _table(self, name: str, numbers) -> ir.Value:
-        array = ir.Constant(ir.ArrayType(self.real, len(numbers)), [float(number) for number in numbers])
+    def _table(self, name: str, type_: ir.Type, numbers) -> ir.Value:
+        array = ir.Constant(ir.ArrayType(type_, len(numbers)), np.asarray(numbers).tolist())
         table = ir.GlobalVariable(self.b.module, array.type, name)
         table.initializer, table.global_constant, table.align = array, True, library.vector_bytes()
         table.type = ir.PointerType()
@@ -107,6 +121,10 @@ class _Compositing(TableWriter):
             inside.append(b.fcmp_ordered("<", at, limit))
         return b.zext(b.and_(*inside), self.integers)
 
+    def pixel(self, k: ir.Value, channel: int) -> ir.Value:
+        """Where the pixel that is lane k of a tile lies among a tile's numbers [channels, P]."""
+        return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.kind.tile_size**2))
+
     def begin_tile(self, tile_x: ir.Value, tile_y: ir.Value) -> None:
         """Full light everywhere; live are the pixels inside the image."""
         with self.all_vectors() as (k, _):
@@ -118,23 +136,25 @@ class _Compositing(TableWriter):
         *numbers, cutoff = self.splat_numbers(id_)
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], tile_x, tile_y])
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
-        spread = self.spread(planes), self.spread(numbers), self.spread(self.row_numbers(id_))
-        return _LoadedSplat(numbers, *spread, self.lanes.splat(limit))
+        image = self.image_numbers(id_)
+        spread = self.spread(planes), self.spread(numbers)
+        as_longs = NativeImage(*map(self.long, image)) if image else None
+        return _LoadedSplat(numbers, *spread, as_longs, self.spread(image), self.lanes.splat(limit))
 
     def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
-        """Calls composite(k, x, y, taps, is_live) for every vector k of the tile's pixels that the splat may reach;
-        returns whether a pixel of the tile is still live."""
+        """Calls composite(k, x, y, texel, is_live) for every vector k of the tile's pixels that the splat may reach,
+        and that looks at this (x, y) of its image; returns whether a pixel of the tile is still live."""
         b, lanes = self.b, self.lanes
         none = lanes.constant(0, INT)
         any_live = self.variable(self.integers)
         b.store(none, any_live)
         with self.all_vectors() as (k, _):
             x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
-            rho, *taps = lanes.emit(self.functions.reach, [*splat.planes, *splat.row, x, y])
+            rho, *texel = lanes.emit(self.functions.reach, [*splat.planes, *splat.spread_image, x, y])
             is_live = b.icmp_signed("!=", self.load(self.live, k, self.integers), none)
             is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, splat.limit))
             with b.if_then(lanes.any(is_reached)):
-                composite(k, x, y, taps, is_live)
+                composite(k, x, y, texel, is_live)
             now = self.load(self.live, k, self.integers)
             b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
         return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), none))
@@ -143,9 +163,9 @@ class _Compositing(TableWriter):
         base = self.at(self.arguments["splats"], self.times(id_, self.kind.num_floats), self.real)
         return [self.load(base, k, self.real) for k in range(self.kind.num_floats)]
 
-    def row_numbers(self, id_: ir.Value) -> list[ir.Value]:
-        base = self.at(self.arguments["rows"], self.times(id_, self.kind.num_rows), INT)
-        return [self.load(base, k, INT) for k in range(self.kind.num_rows)]
+    def image_numbers(self, id_: ir.Value) -> list[ir.Value]:
+        base = self.at(self.arguments["images"], self.times(id_, 3), INT)
+        return [self.load(base, k, INT) for k in range(3)] if self.num_columns else []
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
         return [self.lanes.splat(number) for number in numbers]
@@ -171,11 +191,10 @@ class _Forward(_Compositing):
         """Adds one splat to a tile; returns whether a pixel is still live."""
         splat = self.load_splat(id_, tile_x, tile_y)
 
-        def composite(k, x, y, taps, is_live):
-            entries = self.entries(taps)
-            values = self.gather(entries, self.is_uniform(entries) if entries else None)
+        def composite(k, x, y, texel, is_live):
+            values = self.sample(splat.image, *texel, has_slopes=False) if splat.image else []
             state = [self.load(self.light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
-            at_pixel = [*splat.planes, *splat.spread, *splat.row, *values, x, y, *state]
+            at_pixel = [*splat.planes, *splat.spread, *values, x, y, *state]
             after, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
             self.store(after, self.light, k)
             self.store(self.b.zext(still_live, self.integers), self.live, k)
@@ -186,10 +205,10 @@ class _Forward(_Compositing):
 
     def write_tile(self, tile: ir.Value, arrays: Sequence[ir.Value]) -> None:
         num_pixels = self.kind.tile_size**2
-        base = self.at(self.arguments["image"], self.times(tile, num_pixels * len(arrays)), self.real)
+        base = self.at(self.arguments["result"], self.times(tile, num_pixels * len(arrays)), self.real)
         for index, array in enumerate(arrays):
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
-                self.store(self.load(array, k, self.real), base, self.b.add(k, LONG(index * num_pixels)))
+                self.store(self.load(array, k, self.real), base, self.pixel(k, index))
 
 
 class _Backward(_Compositing):
@@ -197,6 +216,9 @@ class _Backward(_Compositing):
 
     def write(self) -> None:
         behind, *g = (self.variable(self.reals, self.kind.num_vectors) for _ in range(1 + self.kind.num_channels))
+        self.sums = self.variable(self.reals, self.num_sums)
+        for k in range(self.num_sums):
+            self.store(self.lanes.constant(0.0, self.real), self.sums, k)
 
         def tile(tile, tile_x, tile_y):
             self.begin_tile(tile_x, tile_y)
@@ -213,7 +235,7 @@ class _Backward(_Compositing):
             with self.loop(LONG(num_pixels), LONG(self.kind.num_vectors * self.kind.lanes)) as (k, _):
                 self.store(self.real(0.0), array, k)
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
-                self.store(self.load(base, self.b.add(k, LONG(index * num_pixels)), self.real), array, k)
+                self.store(self.load(base, self.pixel(k, index), self.real), array, k)
 
     def splat(self, tile_x, tile_y, behind, g, id_) -> ir.Value:
         """Adds the cotangents of one splat in a tile; returns whether a pixel is still live."""
@@ -224,23 +246,19 @@ class _Backward(_Compositing):
         any_contributes = self.variable(BOOL)
         b.store(BOOL(0), any_contributes)
         num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.has_statistic else 0)
-        totals = [self.variable(self.reals) for _ in range(num_sums)]
-        for total in totals:
-            b.store(zero, total)
+        totals = self.zeros(num_sums)
 
-        def composite(k, x, y, taps, is_live):
-            entries = self.entries(taps)
-            is_uniform = self.is_uniform(entries) if entries else None
-            values = self.gather(entries, is_uniform)
+        def composite(k, x, y, texel, is_live):
+            sample = self.sample(splat.image, *texel, has_slopes=True) if splat.image else []
             state = [self.load(self.light, k, self.reals), is_live, self.load(behind, k, self.reals)]
             cotangents = [self.load(channel, k, self.reals) for channel in g]
-            at_pixel = [*splat.planes, *splat.spread, *splat.row, *values, x, y]
+            at_pixel = [*splat.planes, *splat.spread, *splat.spread_image, *sample, x, y]
             at_pixel += [*state, *cotangents, *tile_center, *jacobian]
             after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
             self.store(after, self.light, k)
             self.store(b.zext(still_live, self.integers), self.live, k)
             self.store(left, behind, k)
-            d_values, sums = rest[: len(values)], rest[len(values) :]
+            d_values, sums = rest[: self.num_columns], rest[self.num_columns :]
             if kind.has_statistic:
                 sums.append(lanes.constant(1.0, self.real))
             # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
@@ -249,11 +267,14 @@ class _Backward(_Compositing):
                 b.store(BOOL(1), any_contributes)
                 for total, value in zip(totals, sums, strict=True):
                     b.store(b.fadd(b.load(total, typ=self.reals), chosen(value)), total)
-                self.scatter(entries, is_uniform, [chosen(value) for value in d_values])
+                if splat.image:
+                    self.add_to_texels(splat.image, *texel, [chosen(value) for value in d_values])
 
         is_live = self.reached_vectors(splat, composite)
         with b.if_then(b.load(any_contributes, typ=BOOL)):
             self.add_totals(id_, splat.numbers, tile_x, tile_y, totals)
+            if splat.image:
+                self.finish_texels(splat.image)
         return is_live
 
     def add_totals(self, id_, numbers, tile_x, tile_y, totals) -> None:

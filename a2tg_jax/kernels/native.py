@@ -18,7 +18,7 @@ from jax import Array
 
 from a2tg_jax.geometry import ScreenBounds
 from a2tg_jax.kernels import foreign, threads
-from a2tg_jax.kernels.packing import pack_rows, pack_splats, unpack_splats
+from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists, exceeds, outlines, tile_rectangles, total_pairs
 
 _LOCK = threading.RLock()
@@ -34,8 +34,7 @@ def _kind(how, splats, rule):
     return Kind(
         rule=jax.tree.structure(rule),
         rule_class=type(rule),
-        num_rows=len(rule.rows),
-        num_columns=rule.params.shape[1],
+        num_columns=0 if rule.images is None else rule.params.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
         tile_size=how.grid.tile_size,
         near_plane=how.near_plane,
@@ -123,10 +122,10 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
-    """ids, starts, splats, rows, table, and (columns, width, height)."""
+    """ids, starts, splats, images, table, and (columns, width, height)."""
     packed = pack_splats(splats, kind.has_geometry, rule.cutoff(splats.opacities)).astype(kind.dtype)
     size = jnp.asarray([how.grid.columns, how.grid.width, how.grid.height], jnp.int32)
-    return lists.ids, lists.starts, packed, pack_rows(rule), params.astype(kind.dtype), size
+    return lists.ids, lists.starts, packed, pack_images(rule), params.astype(kind.dtype), size
 
 
 def _registered(kind, which: str, make_handler: Callable) -> str:
@@ -145,11 +144,11 @@ def _registered(kind, which: str, make_handler: Callable) -> str:
 def _forward_handler(run: Callable) -> foreign.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size = arguments
-        starts, table = inputs[1], inputs[4]
+        starts = inputs[1]
         pointers = [array.ctypes.data for array in (*inputs, results[0])]
 
         def part(first: int, last: int, _: int) -> None:
-            run(*pointers, first, last, *map(int, size), len(table))
+            run(*pointers, first, last, *map(int, size))
 
         threads.run_spans(part, _parts(starts))
 
@@ -159,7 +158,7 @@ def _forward_handler(run: Callable) -> foreign.Handler:
 def _backward_handler(run: Callable) -> foreign.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size, g, behind, jacobian = arguments
-        starts, table = inputs[1], inputs[4]
+        starts = inputs[1]
         parts = _parts(starts)
         totals = [results, *([np.zeros_like(result) for result in results] for _ in parts[1:])]
         for result in results:
@@ -168,7 +167,7 @@ def _backward_handler(run: Callable) -> foreign.Handler:
 
         def part(first: int, last: int, index: int) -> None:
             outputs = [total.ctypes.data for total in totals[index]]
-            run(*given, *outputs, first, last, *map(int, size), len(table))
+            run(*given, *outputs, first, last, *map(int, size))
 
         threads.run_spans(part, parts)
         for more in totals[1:]:

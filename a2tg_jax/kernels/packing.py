@@ -1,4 +1,4 @@
-"""The splats, the rule's rows and its table as plain arrays, as kernels read them; and their cotangents back again."""
+"""The splats, their images and the table as plain arrays, as kernels read them; and their cotangents back again."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -26,6 +26,8 @@ def unpack_splats(packed: Array, like, has_geometry: bool):
     )
 
 
-def pack_rows(rule, least_columns: int = 0) -> Array:
-    """[N, I] int32 what the rule keeps of every splat; a rule that keeps nothing gives one row of `least_columns`."""
-    return jnp.stack(rule.rows, axis=1).astype(jnp.int32) if rule.rows else jnp.zeros((1, least_columns), jnp.int32)
+def pack_images(rule, least_columns: int = 0) -> Array:
+    """[N, 3] int32 `bilinear.Image` of every splat; a rule without images gives one row of `least_columns`."""
+    if rule.images is None:
+        return jnp.zeros((1, least_columns), jnp.int32)
+    return jnp.stack(rule.images, axis=1).astype(jnp.int32)

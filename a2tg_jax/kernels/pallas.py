@@ -13,9 +13,10 @@ import numpy as np
 from jax import Array
 from jax.experimental import pallas as pl
 
-from a2tg_jax import pixel
+from a2tg_jax import bilinear, pixel
+from a2tg_jax.bilinear import Image
 from a2tg_jax.kernels.choice import triton
-from a2tg_jax.kernels.packing import num_numbers, pack_rows, pack_splats, unpack_splats
+from a2tg_jax.kernels.packing import num_numbers, pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid
 
 IS_COMPILED_AHEAD = False
@@ -57,12 +58,24 @@ def _splat(splats, id_, has_geometry: bool) -> pixel.Splat:
     return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal)  # type: ignore[arg-type]
 
 
-def _row(rows, id_) -> tuple[Array, ...]:
-    return tuple(rows[id_, k] for k in range(rows.shape[1]))
+class _Read(NamedTuple):
+    """What the pixels of a tile see of an image; [P] each."""
+
+    image: Image
+    """Scalars."""
+    taps: tuple[bilinear.Tap, ...]
+    sample: bilinear.Sample
 
 
-def _values(table, entries) -> Any:
-    return tuple(tuple(table[entry, column] for column in range(table.shape[1])) for entry in entries)
+def _read(how, rule, images, table, id_, planes, tile: _Tile) -> _Read | None:
+    """None where the rule has no images: there is then but one column, of nothing."""
+    if images.shape[1] < len(Image._fields):
+        return None
+    hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane)
+    image = Image(*(images[id_, k] for k in range(len(Image._fields))))
+    taps = bilinear.taps(image, *rule.texel(image, hit.u, hit.v))
+    texels = tuple(tuple(table[tap.entry, column] for column in range(table.shape[1])) for tap in taps)
+    return _Read(image, taps, bilinear.interpolate(taps, texels))
 
 
 def _is_unfinished(tile: _Tile, carry) -> Array:
@@ -70,17 +83,17 @@ def _is_unfinished(tile: _Tile, carry) -> Array:
     return (at < tile.last) & (jnp.max(live) > 0)
 
 
-def _forward_kernel(how, rule, ids, starts, splats, rows, table, image):
+def _forward_kernel(how, rule, ids, starts, splats, images, table, result):
     tile = _tile(how.grid, starts, splats.dtype)
 
     def add_splat(carry):
         at, light, live, channels = carry
         id_ = ids[at]
-        splat, row = _splat(splats, id_, how.has_geometry), _row(rows, id_)
+        splat = _splat(splats, id_, how.has_geometry)
         planes = pixel.planes_of(splat.M, tile.center_x, tile.center_y)
-        hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane)
-        values = _values(table, rule.lookup(row, hit.u, hit.v))
-        at_pixel = planes, splat, row, values, tile.x, tile.y, light, live > 0
+        read = _read(how, rule, images, table, id_, planes, tile)
+        values = () if read is None else read.sample.values
+        at_pixel = planes, splat, values, tile.x, tile.y, light, live > 0
         added, light, is_live = pixel.composite(rule, how.near_plane, *at_pixel)
         channels = tuple(total + more for total, more in zip(channels, added, strict=True))
         return at + 1, light, is_live.astype(jnp.int32), channels
@@ -89,11 +102,11 @@ def _forward_kernel(how, rule, ids, starts, splats, rows, table, image):
     carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), (dark,) * how.num_channels)
     _, light, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tile), add_splat, carry)
     for k, channel in enumerate((*channels, light)):
-        image[pl.program_id(0), k, :] = channel
+        result[pl.program_id(0), k, :] = channel
 
 
 def _backward_kernel(
-    how, rule, ids, starts, splats, rows, table, g, behind, jacobian, *zeros_and_results
+    how, rule, ids, starts, splats, images, table, g, behind, jacobian, *zeros_and_results
 ):  # fmt: skip
     d_splats, d_table, d_tap = zeros_and_results[3:]
     tile = _tile(how.grid, starts, splats.dtype)
@@ -104,13 +117,13 @@ def _backward_kernel(
     def add_splat(carry):
         at, light, live, behind = carry
         id_ = ids[at]
-        splat, row = _splat(splats, id_, how.has_geometry), _row(rows, id_)
+        splat = _splat(splats, id_, how.has_geometry)
         planes, to_M = jax.vjp(lambda M: pixel.planes_of(M, tile.center_x, tile.center_y), splat.M)
-        hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane)
-        entries = rule.lookup(row, hit.u, hit.v)
+        read = _read(how, rule, images, table, id_, planes, tile)
+        image, sample = (None, None) if read is None else (read.image, read.sample)
         # A number per pixel, so that each pixel has a cotangent of its own.
         spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
-        at_pixel = spread(planes), spread(splat), row, _values(table, entries), tile.x, tile.y, light, live > 0
+        at_pixel = spread(planes), spread(splat), image, sample, tile.x, tile.y, light, live > 0
         (light, is_live, behind), weight, d = pixel.composite_vjp(
             rule, how.near_plane, *at_pixel, behind, cotangents, how.has_statistic
         )
@@ -120,9 +133,8 @@ def _backward_kernel(
         d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal))
         for k, number in enumerate(jax.tree.leaves((to_M(d_planes), *others))):
             _add(d_splats, (id_, k), number)
-        for entry, columns in zip(entries, d.values, strict=True):
-            for column, value in enumerate(columns):
-                _add_all(d_table, entry, column, jnp.where(contributes, value, jnp.zeros_like(value)))
+        if read is not None:
+            _add_texels(d_table, read, [jnp.where(contributes, value, jnp.zeros_like(value)) for value in d.values])
         if how.has_statistic:
             center = tile.center_x, tile.center_y
             absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d.log_falloff, axes, how.near_plane)
@@ -148,6 +160,22 @@ def _add(total, place: tuple[Array, int], number: Array) -> None:
         total[row, column] += number
     else:
         _triton().atomic_add(total, (row, jnp.int32(column)), number)
+
+
+def _add_texels(d_table, read: _Read, d_values: list[Array]) -> None:
+    """Adds the cotangents of C values [P] to the texels that they were read from."""
+
+    def add_sums() -> None:
+        for column, d_value in enumerate(d_values):
+            _add(d_table, (read.image.first, column), jnp.sum(d_value))
+
+    def add_each() -> None:
+        for tap in read.taps:
+            for column, d_value in enumerate(d_values):
+                _add_all(d_table, tap.entry, column, tap.weight * d_value)
+
+    # All pixels would add to one and the same texel, one after the other.
+    jax.lax.cond(read.image.height * read.image.width == 1, add_sums, add_each)
 
 
 def _add_all(total, rows: Array, column: int, numbers: Array) -> None:
@@ -183,10 +211,10 @@ def _call(grid: TileGrid, kernel, shapes, num_inputs: int, aliases: dict[int, in
 
 
 def _inputs(how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
-    """ids, starts, splats, rows and table; without columns or rows there is one that is not read."""
+    """ids, starts, splats, images and table; without images or columns there is one that is not read."""
     packed = pack_splats(splats, how.has_geometry)
     table = params if params.shape[1] else jnp.zeros((1, 1), packed.dtype)
-    return lists.ids, lists.starts, packed, pack_rows(rule, least_columns=1), table
+    return lists.ids, lists.starts, packed, pack_images(rule, least_columns=1), table
 
 
 def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:

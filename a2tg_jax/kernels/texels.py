@@ -1,0 +1,234 @@
+"""Reading the images of splats from vector code, and adding to their cotangents, without gathers.
+
+Every texel that a vector of L neighbouring pixels may see is loaded once, for all lanes, which weigh it by how near
+they are: what `bilinear` says with four taps is the same sum. Images of up to 4×4 are visited whole, by code that is
+unrolled along a row; of larger ones the texels between the least and the largest coordinate of the lanes.
+"""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from llvmlite import ir
+
+from a2tg_jax.kernels.lanes import FLAGS, INT, Lanes
+from a2tg_jax.kernels.writer import LONG, Writer
+
+SMALL_WIDTHS = (1, 2, 4)
+"""Images of these widths, and up to the largest of them high, are small."""
+SMALL_HEIGHT = max(SMALL_WIDTHS)
+
+
+class NativeImage(NamedTuple):
+    """`bilinear.Image` as 64-bit scalars."""
+
+    first: ir.Value
+    height: ir.Value
+    width: ir.Value
+
+
+class Line(NamedTuple):
+    """A row or a column of texels."""
+
+    index: ir.Value
+    weight: ir.Value
+    """max(0, 1 − |distance|) in each lane."""
+    slope: ir.Value | None
+    """Its derivative within the cell; None where it is zero or nobody asks."""
+
+
+class TexelWriter(Writer):
+    """A function whose buffers "table" and "d_table" are [entries, C]; x and y are texel coordinates of L lanes."""
+
+    lanes: Lanes
+    reals: ir.Type
+    num_columns: int
+    sums: ir.Value
+    """Cotangents of the texels of a small image per lane, `num_sums`; zero before a splat."""
+
+    @property
+    def num_sums(self) -> int:
+        return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
+
+    def sample(self, image: NativeImage, x: ir.Value, y: ir.Value, has_slopes: bool) -> list[ir.Value]:
+        """C values; and C slopes along x and C along y, where asked for."""
+        count = self.num_columns
+        num_slopes = count if has_slopes else 0
+        values, along_x, along_y = (self.zeros(num) for num in (count, num_slopes, num_slopes))
+        for width in self.cases(image):
+            with self.rows(image, width, y, has_slopes) as row:
+                in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
+
+                def add_texel(column: Line, row=row, in_row=in_row, in_row_along_x=in_row_along_x) -> None:
+                    texel = self.texel("table", image, column, row)
+                    numbers = [self.lanes.splat(self.load(texel, k, self.real)) for k in range(count)]
+                    self.accumulate(in_row, column.weight, numbers)
+                    self.accumulate(in_row_along_x, column.slope, numbers)
+
+                self.each_column(image, width, x, has_slopes, add_texel)
+                numbers = self.loads(in_row)
+                self.accumulate(values, row.weight, numbers)
+                self.accumulate(along_y, row.slope, numbers)
+                self.accumulate(along_x, row.weight, self.loads(in_row_along_x))
+        return self.loads([*values, *along_x, *along_y])
+
+    def add_to_texels(self, image: NativeImage, x: ir.Value, y: ir.Value, d_values: Sequence[ir.Value]) -> None:
+        """Adds the cotangents of C values, which are zero in lanes that do not count; `finish_texels` completes it."""
+        for width in self.cases(image):
+            with self.rows(image, width, y, False) as row:
+                in_row = [self.product(row.weight, d_value) for d_value in d_values]
+
+                def add_texel(column: Line, width=width, row=row, in_row=in_row) -> None:
+                    addends = [self.product(column.weight, d_value) for d_value in in_row]
+                    if width is None:
+                        self.add_sums(self.texel("d_table", image, column, row), addends)
+                        return
+                    place = self.b.add(self.times(row.index, width), column.index)
+                    for k, addend in enumerate(addends):
+                        index = self.b.add(self.times(place, self.num_columns), LONG(k))
+                        self.store(self.b.fadd(self.load(self.sums, index, self.reals), addend), self.sums, index)
+
+                self.each_column(image, width, x, False, add_texel)
+
+    def finish_texels(self, image: NativeImage) -> None:
+        """Adds what the lanes have summed of a small image to the cotangents of the table."""
+        b, zero = self.b, self.lanes.constant(0.0, self.real)
+        num = b.select(b.icmp_signed(">", self.small_width(image), LONG(0)), b.mul(image.height, image.width), LONG(0))
+        with self.loop(LONG(0), num) as (place, _):
+            base = self.at(self.sums, self.times(place, self.num_columns), self.reals)
+            addends = [self.load(base, k, self.reals) for k in range(self.num_columns)]
+            for k in range(self.num_columns):
+                self.store(zero, base, k)
+            self.add_sums(self.entry("d_table", b.add(image.first, place)), addends)
+
+    def small_width(self, image: NativeImage) -> ir.Value:
+        """The width of a small image; 0 for a large one."""
+        b = self.b
+        is_width = [b.icmp_signed("==", image.width, LONG(width)) for width in SMALL_WIDTHS]
+        is_low = b.icmp_signed("<=", image.height, LONG(SMALL_HEIGHT))
+        return b.select(b.and_(is_low, functools.reduce(b.or_, is_width)), image.width, LONG(0))
+
+    def cases(self, image: NativeImage) -> Iterator[int | None]:
+        """Branches, which the caller fills: one per width of a small image, and one (None) for all that are large."""
+        b = self.b
+        large, end = b.append_basic_block("large"), b.append_basic_block("end")
+        switch = b.switch(self.small_width(image), large)
+        for width in (*SMALL_WIDTHS, None):
+            block = large if width is None else b.append_basic_block(f"width{width}")
+            if width is not None:
+                switch.add_case(LONG(width), block)
+            b.position_at_end(block)
+            yield width
+            b.branch(end)
+        b.position_at_end(end)
+
+    @contextlib.contextmanager
+    def rows(self, image: NativeImage, width: int | None, y: ir.Value, has_slope: bool) -> Iterator[Line]:
+        """A loop over the rows that may be seen; all of them, where the width is that of a small image."""
+        span = self.seen(y, image.height) if width is None else (LONG(0), image.height)
+        with self.loop(*span) as (index, _):
+            yield self.line(index, y, image.height, has_slope)
+
+    def each_column(
+        self, image: NativeImage, width: int | None, x: ir.Value, has_slope: bool, visit: Callable[[Line], None]
+    ) -> None:
+        """Calls `visit` for the columns that may be seen: in a loop, or unrolled for a small image."""
+        if width is None:
+            with self.loop(*self.seen(x, image.width)) as (index, _):
+                visit(self.line(index, x, image.width, has_slope))
+        elif width == 1:
+            visit(Line(LONG(0), self.lanes.constant(1.0, self.real), None))
+        else:
+            for index in range(width):
+                visit(self.line(LONG(index), x, LONG(width), has_slope))
+
+    def seen(self, places: ir.Value, size: ir.Value) -> tuple[ir.Value, ir.Value]:
+        """The first texel along an axis that a lane sees, and the one after the last."""
+        return tuple(  # type: ignore[return-value]
+            # Whatever a lane holds, nothing outside of the image is read.
+            self.clamp(self.b.add(self.b.fptosi(place, LONG), LONG(more)), size)
+            for place, more in ((self.lanes.smallest(places), 0), (self.lanes.largest(places), 2))
+        )
+
+    def clamp(self, index: ir.Value, most: ir.Value) -> ir.Value:
+        """An index held in [0, most]."""
+        index = self.b.select(self.b.icmp_signed("<", index, LONG(0)), LONG(0), index)
+        return self.b.select(self.b.icmp_signed(">", index, most), most, index)
+
+    def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
+        """One of `size` texels along an axis, seen from `places`."""
+        b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
+        distance = b.fsub(places, self.lanes.splat(b.sitofp(index, self.real)))
+        weight = self.lanes.larger(b.fsub(number(1.0), self.lanes.intrinsic("fabs", [distance])), number(0.0))
+        if not has_slope:
+            return Line(index, weight, None)
+        # The last texel goes on: nothing changes beyond it.
+        is_last = b.icmp_signed("==", index, b.sub(size, LONG(1)))
+        falling = self.lanes.splat(b.select(is_last, self.real(0.0), self.real(-1.0)))
+        slope = b.select(b.fcmp_ordered("<", distance, number(0.0)), number(1.0), falling)
+        is_in_cell = b.fcmp_ordered("<", distance, number(1.0)), b.fcmp_ordered(">=", distance, number(-1.0))
+        return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
+
+    def texel(self, name: str, image: NativeImage, column: Line, row: Line) -> ir.Value:
+        """The address of a texel."""
+        place = self.b.add(self.b.mul(row.index, image.width), column.index)
+        return self.entry(name, self.b.add(image.first, place))
+
+    def entry(self, name: str, index: ir.Value) -> ir.Value:
+        """The address of an entry of the table, or of its cotangents."""
+        return self.at(self.arguments[name], self.times(index, self.num_columns), self.real)
+
+    def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
+        """Adds the sums over lanes of C vectors to an entry."""
+        sums = self.sums_over_lanes(vectors)
+        self.store(self.b.fadd(self.load(entry, 0, sums.type), sums), entry, 0)
+
+    def product(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        return self.b.fmul(x, y, flags=FLAGS)
+
+    def accumulate(self, totals: Sequence[ir.Value], weight: ir.Value | None, numbers: Sequence[ir.Value]) -> None:
+        """totals += weight·numbers; a weight of None is zero."""
+        if weight is None:
+            return
+        for total, number in zip(totals, numbers, strict=True):
+            before = self.b.load(total, typ=self.reals)
+            self.b.store(self.b.fadd(before, self.product(weight, number), flags=FLAGS), total)
+
+    def zeros(self, num: int) -> list[ir.Value]:
+        """Variables, one vector each, set to zero here."""
+        rooms = [self.variable(self.reals) for _ in range(num)]
+        for room in rooms:
+            self.b.store(self.lanes.constant(0.0, self.real), room)
+        return rooms
+
+    def loads(self, rooms: Sequence[ir.Value]) -> list[ir.Value]:
+        return [self.b.load(room, typ=self.reals) for room in rooms]
+
+    def sums_over_lanes(self, vectors: Sequence[ir.Value]) -> ir.Value:
+        """C vectors of L as one vector of the C sums."""
+        if len(vectors) == 4 and self.lanes.width % 4 == 0:
+            total = functools.reduce(self.b.fadd, self.transpose_quarters(vectors))
+            return self.lanes.fold(total, self.b.fadd, 4)
+        sums = ir.Constant(ir.VectorType(self.real, len(vectors)), ir.Undefined)
+        for k, vector in enumerate(vectors):
+            sums = self.b.insert_element(sums, self.lanes.sum(vector), INT(k))
+        return sums
+
+    def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
+        """Four vectors, every four lanes of them transposed as a 4×4 matrix."""
+        low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
+        high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
+        first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
+        pairs = (low01, low23, first), (low01, low23, second), (high01, high23, first), (high01, high23, second)
+        return [self.shuffle(*pair) for pair in pairs]
+
+    def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
+        """The pattern in every four lanes; numbers are lanes of x, strings of y."""
+        width = self.lanes.width
+        mask = [
+            quarter + (width + int(lane) if isinstance(lane, str) else lane)
+            for quarter in range(0, width, 4)
+            for lane in pattern
+        ]
+        return self.b.shuffle_vector(x, y, ir.Constant(ir.VectorType(INT, width), mask))
