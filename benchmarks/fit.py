@@ -22,7 +22,7 @@ def fit_growth(cases: Iterable[dict]) -> list[dict]:
 
 def is_fitted(case: dict) -> bool:
     """Whether a case counts."""
-    is_plain = case["case"] == "render" and case.get("textures", "none") == "none"
+    is_plain = case["case"] in ("render", "trained") and case.get("textures", "none") == "none"
     return is_plain and {"threads", "composited_pairs"} <= case.keys() and not {"compositor", "tile_size"} & case.keys()
 
 

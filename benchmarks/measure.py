@@ -25,6 +25,7 @@ def main() -> None:
         "stages": stages.measure_stages,
         "limit": limit.measure_limit,
         "training": training.measure_training,
+        "trained": training.measure_trained,
     }
     figures = measures[case["case"]](case)
     figures["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

@@ -48,13 +48,13 @@ def run(case: Mapping[str, Any], command: Sequence[str], environment: Mapping[st
 
 
 def line(figures: Mapping[str, Any]) -> str:
-    """A case as one line of a table."""
+    """A case as one line of a table; the views that it rendered, each on a line below it."""
     words = []
     for name, value in figures.items():
         if isinstance(value, dict):
             words.append(f"{name} {value['ms']:.1f}")
         elif isinstance(value, float):
             words.append(f"{name} {value:.4g}")
-        else:
+        elif name != "renders":
             words.append(f"{name} {value}")
-    return "  ".join(words)
+    return "\n    ".join(["  ".join(words), *(line(view) for view in figures.get("renders", []))])

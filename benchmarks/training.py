@@ -1,4 +1,4 @@
-"""Training steps on a real scene."""
+"""Training steps on a real scene, and views of what was trained."""
 
 import dataclasses
 import pathlib
@@ -6,6 +6,8 @@ import pathlib
 import numpy as np
 
 import a2tg_jax
+from a2tg_jax.cameras import resize_camera
+from benchmarks.rendering import measure_view
 
 
 def measure_training(case: dict) -> dict:
@@ -24,6 +26,20 @@ def measure_training(case: dict) -> dict:
         "untextured_ms": late_step_ms(untextured.history),
         "textured_ms": late_step_ms(textured.history),
     }
+
+
+def measure_trained(case: dict) -> dict:
+    """A test view after short training, at several sizes, without and with the textures."""
+    scene, config = load_case(case)
+    result = a2tg_jax.fit(scene, config, progress=False)
+    camera, settings = scene.test[0].camera, a2tg_jax.render_settings(config)
+    renders = []
+    for factor in case["factors"]:
+        view = resize_camera(camera, factor * camera.width, factor * camera.height)
+        for kind, textures, layout in (("none", None, None), ("trained", result.textures, result.layout)):
+            figures = measure_view(result.gaussians, view, textures, layout, settings)
+            renders.append({"width": view.width, "height": view.height, "textures": kind, **figures})
+    return {"scene": scene.name, "num": result.gaussians.num, "renders": renders}
 
 
 def load_case(case: dict) -> tuple[a2tg_jax.Scene, a2tg_jax.TrainConfig]:
