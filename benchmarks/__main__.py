@@ -3,6 +3,7 @@
     python -m benchmarks --out benchmarks/results/cpu.json                     # everything: most of an hour
     python -m benchmarks --only render --largest 10000                         # a part of it
     python -m benchmarks --scene SCENES/herz_jesus_p25 --mitsuba python3       # with a real scene and Mitsuba 3
+    python -m benchmarks --only others --other 'name=./program --fast'         # another program on the same workload
 
 Every case runs in a process of its own, one after the other.
 """
@@ -14,10 +15,16 @@ import json
 import os
 import pathlib
 import platform
+import shlex
 import subprocess
 
 from benchmarks.fit import fit_growth
 from benchmarks.sections import SECTIONS
+
+OTHER_HELP = """a program to measure beside this library, may be repeated. COMMAND gets one more argument, a case such
+as {"num": 10000, "width": 320, "height": 240, "threads": 1}, and prints a last line such as
+{"forward": {"ms": 20.1}, "both": {"ms": 43.2}}: milliseconds of a forward pass, and of one with its gradients, of the
+Gaussians, the camera and the image to compare with that benchmarks/arrays.py makes"""
 
 
 def main() -> None:
@@ -41,10 +48,20 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--largest", type=int, default=1_000_000, help="leave out workloads of more Gaussians")
     parser.add_argument("--scene", type=pathlib.Path, help="a real scene of photographs, to train and to render")
     parser.add_argument("--mitsuba", metavar="PYTHON", help="a Python with Mitsuba 3 installed, to measure beside it")
+    parser.add_argument("--other", metavar="NAME=COMMAND", type=named_command, action="append", help=OTHER_HELP)
+    parser.set_defaults(other=[])
     args = parser.parse_args()
     if args.scene is not None and not args.scene.exists():
         parser.error(f"--scene: there is no {args.scene}")
     return args
+
+
+def named_command(text: str) -> tuple[str, list[str]]:
+    """NAME=COMMAND taken apart."""
+    name, _, command = text.partition("=")
+    if not name or not command:
+        raise argparse.ArgumentTypeError(f"wanted NAME=COMMAND; got {text!r}")
+    return name, shlex.split(command)
 
 
 def machine() -> dict:

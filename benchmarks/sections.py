@@ -104,13 +104,16 @@ def trained_section(args: argparse.Namespace) -> list[dict]:
 
 
 def others_section(args: argparse.Namespace) -> list[dict]:
-    """Mitsuba 3's Gaussian primitives on the same workload, one thread, beside this library."""
-    if args.mitsuba is None:
+    """Other programs on the same workload, one thread, beside this library."""
+    programs = dict(args.other)
+    if args.mitsuba is not None:
+        programs["mitsuba"] = [args.mitsuba, "-m", "benchmarks.mitsuba"]
+    if not programs:
         return []
     found = []
     for case in (random_case(num, size, threads=1) for num, size in TYPICAL if num <= args.largest):
         found.append(measure(case))
-        found.append(measure({**case, "case": "mitsuba"}, [args.mitsuba, "-m", "benchmarks.mitsuba"]))
+        found += [measure({**case, "case": name}, command) for name, command in programs.items()]
     return found
 
 
