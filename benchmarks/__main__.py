@@ -4,6 +4,7 @@
     python -m benchmarks --only render --largest 10000                         # a part of it
     python -m benchmarks --scene SCENES/herz_jesus_p25 --mitsuba python3       # with a real scene and Mitsuba 3
     python -m benchmarks --only others --other 'name=./program --fast'         # another program on the same workload
+    python -m benchmarks --only gpu --gsplat python3                           # on a GPU, beside gsplat
 
 Every case runs in a process of its own, one after the other.
 """
@@ -19,7 +20,7 @@ import shlex
 import subprocess
 
 from benchmarks.fit import fit_growth
-from benchmarks.sections import SECTIONS
+from benchmarks.sections import SECTIONS, device
 
 OTHER_HELP = """a program to measure beside this library, may be repeated. COMMAND gets one more argument, a case such
 as {"num": 10000, "width": 320, "height": 240, "threads": 1}, and prints a last line such as
@@ -48,6 +49,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--largest", type=int, default=1_000_000, help="leave out workloads of more Gaussians")
     parser.add_argument("--scene", type=pathlib.Path, help="a real scene of photographs, to train and to render")
     parser.add_argument("--mitsuba", metavar="PYTHON", help="a Python with Mitsuba 3 installed, to measure beside it")
+    parser.add_argument("--gsplat", metavar="PYTHON", help="a Python with gsplat, to measure beside it on a GPU")
     parser.add_argument("--other", metavar="NAME=COMMAND", type=named_command, action="append", help=OTHER_HELP)
     parser.set_defaults(other=[])
     args = parser.parse_args()
@@ -76,6 +78,7 @@ def machine() -> dict:
     return {
         "processor": processor,
         "cores": os.cpu_count(),
+        "device": device(),
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in names},
         "commit": commit.stdout.strip(),

@@ -16,6 +16,8 @@ def main() -> None:
     case = json.loads(sys.argv[1])
     if case.get("threads"):
         os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[: case["threads"]]))
+    import jax
+
     import a2tg_jax
     from benchmarks import limit, rendering, stages, training
 
@@ -29,6 +31,9 @@ def main() -> None:
     }
     figures = measures[case["case"]](case)
     figures["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    on_device = jax.local_devices()[0].memory_stats()
+    if on_device and "peak_bytes_in_use" in on_device:
+        figures["device_peak_mb"] = on_device["peak_bytes_in_use"] / 1e6
     print(json.dumps(figures))
 
 

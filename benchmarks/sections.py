@@ -1,7 +1,10 @@
 """The cases of each section of the report."""
 
 import argparse
+import functools
 import os
+import subprocess
+import sys
 import tempfile
 
 from benchmarks.runner import measure, measure_all
@@ -117,9 +120,35 @@ def others_section(args: argparse.Namespace) -> list[dict]:
     return found
 
 
+def gpu_section(args: argparse.Namespace) -> list[dict]:
+    """Large scenes on a GPU, beside gsplat; nothing where JAX has none."""
+    if not device().startswith("gpu"):
+        return []
+    found = []
+    for num in (100_000, 500_000, LARGEST):
+        cases = [
+            random_case(num, FULL_SIZE, textures=kind, tile_size=tile_size)
+            for kind in ("none", "mixed")
+            for tile_size in (8, 16)
+        ]
+        found += measure_all(cases, args.largest)
+        if args.gsplat is not None and num <= args.largest:
+            command = [args.gsplat, "-m", "benchmarks.gsplat"]
+            found.append(measure({**random_case(num, FULL_SIZE), "case": "gsplat"}, command))
+    return found
+
+
 def random_case(num: int, size: tuple[int, int], **more: str | int) -> dict:
     """The random workload of so many Gaussians at an image size."""
     return {"case": "render", "num": num, "width": size[0], "height": size[1], **more}
+
+
+@functools.cache
+def device() -> str:
+    """JAX's default device, as a process of its own sees it: this one must leave a GPU's memory to the cases."""
+    program = "import jax; device = jax.devices()[0]; print(device.platform, device.device_kind)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
 
 
 SECTIONS = {
@@ -132,4 +161,5 @@ SECTIONS = {
     "training": training_section,
     "trained": trained_section,
     "others": others_section,
+    "gpu": gpu_section,
 }
