@@ -1,30 +1,42 @@
 """How time grows: a + b·(Gaussians) + c·(pairs of a splat and a pixel), fitted to measured cases."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 
-def fit_growth(cases: list[dict]) -> list[dict]:
-    """Least squares of the relative error, per number of threads, of untextured forward and forward + backward."""
+def fit_growth(cases: Iterable[dict]) -> list[dict]:
+    """Least squares of the relative error, per number of threads, of forward and of forward + backward.
+
+    Of all the cases, whichever section they are from, those count that this library rendered without textures, on a
+    stated number of threads and with its own choice of compositor and tile size.
+    """
+    chosen = [case for case in cases if is_fitted(case)]
     found = []
-    for threads in sorted({case["threads"] for case in cases if "threads" in case}):
-        chosen = [case for case in cases if case.get("threads") == threads and case.get("textures") == "none"]
-        chosen = [case for case in chosen if "failed" not in case]
-        if len(chosen) < 4:
-            continue
-        for which in ("forward", "both"):
-            times = np.array([case[which]["ms"] for case in chosen])
-            columns = [[1.0, case["num"], case["composited_pairs"]] for case in chosen]
-            weighted = np.array(columns) / times[:, None]
-            coefficients = np.linalg.lstsq(weighted, np.ones(len(times)), rcond=None)[0]
-            error = np.abs(weighted @ coefficients - 1)
-            found.append(
-                {
-                    "threads": threads,
-                    "which": which,
-                    "ms": float(coefficients[0]),
-                    "ns_per_gaussian": float(coefficients[1]) * 1e6,
-                    "ns_per_composited_pair": float(coefficients[2]) * 1e6,
-                    "largest_relative_error": float(error.max()),
-                }
-            )
+    for threads in sorted({case["threads"] for case in chosen}):
+        of_threads = [case for case in chosen if case["threads"] == threads]
+        if len(of_threads) >= 4:
+            found += [{"threads": threads, **fit(of_threads, which)} for which in ("forward", "both")]
     return found
+
+
+def is_fitted(case: dict) -> bool:
+    """Whether a case counts."""
+    is_plain = case["case"] in ("render", "trained") and case.get("textures", "none") == "none"
+    return is_plain and {"threads", "composited_pairs"} <= case.keys() and not {"compositor", "tile_size"} & case.keys()
+
+
+def fit(cases: list[dict], which: str) -> dict:
+    """The coefficients for one kind of pass."""
+    times = np.array([case[which]["ms"] for case in cases])
+    columns = np.array([[1.0, case["num"], case["composited_pairs"]] for case in cases])
+    weighted = columns / times[:, None]
+    coefficients = np.linalg.lstsq(weighted, np.ones(len(times)), rcond=None)[0]
+    return {
+        "which": which,
+        "num_cases": len(cases),
+        "ms": float(coefficients[0]),
+        "ns_per_gaussian": float(coefficients[1]) * 1e6,
+        "ns_per_composited_pair": float(coefficients[2]) * 1e6,
+        "largest_relative_error": float(np.abs(weighted @ coefficients - 1).max()),
+    }

@@ -10,24 +10,26 @@ import json
 import math
 import os
 import sys
-import time
 
 import numpy as np
+
+from benchmarks.arrays import random_image, random_splats
+from benchmarks.timing import timed
 
 
 def main() -> None:
     case = json.loads(sys.argv[1])
     if case.get("threads"):
         os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[: case["threads"]]))
-    import drjit as dr
-    import mitsuba as mi
+    import drjit as dr  # type: ignore[import-not-found]
+    import mitsuba as mi  # type: ignore[import-not-found]
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(case.get("threads") or os.cpu_count())
     scene = load_scene(mi, case["num"], case["width"], case["height"])
     params = mi.traverse(scene)
     keys = [key for key in params.keys() if key.endswith(("data", "sh_coeffs", "opacities"))]  # noqa: SIM118
-    target = mi.TensorXf(np.random.default_rng(3).uniform(size=(case["height"], case["width"], 3)).astype(np.float32))
+    target = mi.TensorXf(random_image(case["width"], case["height"]))
 
     def forward():
         with dr.suspend_grad():
@@ -42,18 +44,15 @@ def main() -> None:
         dr.eval([dr.grad(params[key]) for key in keys])
         dr.sync_thread()
 
-    figures = {"forward": timed(forward), "both": timed(both)}
-    print(json.dumps({"case": "mitsuba", "mitsuba": mi.__version__, **case, **figures}))
+    figures = {"forward": timed(forward, least_runs=3), "both": timed(both, least_runs=3)}
+    print(json.dumps({"version": mi.__version__, **figures}))
 
 
 def load_scene(mi, num: int, width: int, height: int):
-    """The workload of `benchmarks.workload.random_scene`, drawn by the same generator."""
-    rng = np.random.default_rng(0)
-    opacities = rng.uniform(0.1, 0.9, num)
-    means = rng.uniform(-0.5, 0.5, (num, 3))
-    quats = rng.normal(size=(num, 4))
-    scales = np.exp(rng.uniform(np.log(0.005), np.log(0.03), (num, 2)))
-    sh = rng.normal(size=(num, 16, 3)) * 0.2
+    """The workload of `benchmarks.arrays`."""
+    splats = random_splats(num)
+    quats = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
+    scales = np.concatenate([splats.scales, splats.scales.min(axis=1, keepdims=True) / 10], axis=1)
     tensor = lambda x: mi.TensorXf(np.ascontiguousarray(x, np.float32))  # noqa: E731
     camera = {
         "type": "perspective",
@@ -64,26 +63,14 @@ def load_scene(mi, num: int, width: int, height: int):
     }
     ellipsoids = {
         "type": "ellipsoids",
-        "centers": tensor(means),
-        "scales": tensor(np.concatenate([scales, scales.min(axis=1, keepdims=True) / 10], axis=1)),
-        "quaternions": tensor(np.roll(quats / np.linalg.norm(quats, axis=1, keepdims=True), -1, axis=1)),
-        "opacities": tensor(opacities[:, None]),
-        "sh_coeffs": tensor(sh.reshape(num, 48)),
+        "centers": tensor(splats.means),
+        "scales": tensor(scales),
+        "quaternions": tensor(np.roll(quats, -1, axis=1)),
+        "opacities": tensor(splats.opacities[:, None]),
+        "sh_coeffs": tensor(splats.sh.reshape(num, 48)),
     }
     integrator = {"type": "volprim_rf_basic", "max_depth": -1}
     return mi.load_dict({"type": "scene", "integrator": integrator, "camera": camera, "splats": ellipsoids})
-
-
-def timed(function) -> dict[str, float]:
-    """Seconds of the first call, and the median and least milliseconds of the following ones."""
-    start = time.perf_counter()
-    function()
-    first, times = time.perf_counter() - start, []
-    while len(times) < 3 or (sum(times) < 2.0 and len(times) < 20):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return {"first_s": first, "ms": float(np.median(times)) * 1e3, "least_ms": min(times) * 1e3}
 
 
 if __name__ == "__main__":

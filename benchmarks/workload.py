@@ -1,31 +1,26 @@
-"""What is measured: the random workload, textures for it, and trained scenes."""
+"""What is measured: the random workload as this library's arrays, and textures for it."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax
+from benchmarks.arrays import camera_matrices, random_splats
 
-TEXTURE_KINDS = ("none", "mixed", "4x4", "16x16")
 
-
-def random_scene(num: int, width: int, height: int, seed: int = 0) -> tuple[a2tg_jax.Gaussians, a2tg_jax.Camera]:
-    """Means uniform in a unit cube seen from 1.5 away, scales log-uniform in [0.005, 0.03], opacities uniform in
-    [0.1, 0.9], SH degree 3, focal length 0.8 times the width."""
-    rng = np.random.default_rng(seed)
-    opacities = rng.uniform(0.1, 0.9, num)
-    gaussians = a2tg_jax.Gaussians(
-        means=rng.uniform(-0.5, 0.5, (num, 3)),
-        quats=rng.normal(size=(num, 4)),
-        log_scales=rng.uniform(np.log(0.005), np.log(0.03), (num, 2)),
-        logit_opacities=np.log(opacities / (1 - opacities)),
-        sh=rng.normal(size=(num, 16, 3)) * 0.2,
-    )
-    viewmat = np.eye(4)
-    viewmat[2, 3] = 1.5
-    K = np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
+def random_scene(num: int, width: int, height: int) -> tuple[a2tg_jax.Gaussians, a2tg_jax.Camera]:
+    """The Gaussians and the camera of `benchmarks.arrays`."""
+    splats = random_splats(num)
+    viewmat, K = camera_matrices(width, height)
     as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    return jax.tree.map(as_float, gaussians), a2tg_jax.Camera(as_float(viewmat), as_float(K), width, height)
+    gaussians = a2tg_jax.Gaussians(
+        means=as_float(splats.means),
+        quats=as_float(splats.quats),
+        log_scales=as_float(np.log(splats.scales)),
+        logit_opacities=as_float(np.log(splats.opacities / (1 - splats.opacities))),
+        sh=as_float(splats.sh),
+    )
+    return gaussians, a2tg_jax.Camera(as_float(viewmat), as_float(K), width, height)
 
 
 def random_textures(num: int, kind: str, seed: int = 1):

@@ -1,0 +1,59 @@
+"""Where the time of a training step goes, on the random workload."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+import a2tg_jax
+from a2tg_jax.compositor import Compositing, composite
+from a2tg_jax.kernels import native
+from a2tg_jax.optim import adam_init, adam_update
+from a2tg_jax.render import _project, appearance_of
+from a2tg_jax.tiles import TileGrid
+from benchmarks import timing
+from benchmarks.workload import random_scene, random_textures
+
+timed = functools.partial(timing.timed, wait=jax.block_until_ready)
+
+
+def measure_stages(case: dict) -> dict:
+    """Each stage apart."""
+    num, width, height = case["num"], case["width"], case["height"]
+    gaussians, camera = random_scene(num, width, height)
+    textures, layout = random_textures(num, case.get("textures", "none"))
+    settings = a2tg_jax.plan_render(gaussians, camera, textures, layout)
+    capacity = settings.capacity or 0
+    rule, grid = appearance_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
+    project = jax.jit(lambda gaussians: _project(gaussians, camera, rule, settings, 3, None))
+    splats, bounds = project(gaussians)
+    depths = splats.M[:, 2, 2]
+    find_lists = jax.jit(lambda bounds, depths: native.tile_lists(bounds, depths, grid, capacity))
+    lists = find_lists(bounds, depths)
+    how = Compositing(grid, settings.near_plane, False, False, "native", 1)
+    jacobian, tap = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
+
+    def colors(splats, rule):
+        return composite(how, splats, rule, lists, jacobian, tap)[0]
+
+    def all_of_it(splats, rule):
+        _, pull_back = jax.vjp(colors, splats, rule)
+        return pull_back(jnp.ones((3, height, width)))
+
+    def project_gradient(gaussians):
+        splats, pull_back = jax.vjp(lambda gaussians: project(gaussians)[0], gaussians)
+        return pull_back(splats)
+
+    image, target = (jax.random.uniform(jax.random.key(k), (height, width, 3)) for k in (0, 1))
+    moments = adam_init(gaussians)
+    adam = jax.jit(lambda gaussians, moments: adam_update(gaussians, gaussians, moments, 1e-3))
+    return {
+        "projection": timed(project, gaussians),
+        "projection, forward and backward": timed(jax.jit(project_gradient), gaussians),
+        "tile lists": timed(find_lists, bounds, depths),
+        "compositing": timed(jax.jit(colors), splats, rule),
+        "compositing, forward and backward": timed(jax.jit(all_of_it), splats, rule),
+        "loss, value and gradient": timed(jax.jit(jax.value_and_grad(a2tg_jax.photometric_loss)), image, target),
+        "Adam": timed(adam, gaussians, moments),
+        "evaluated_pairs": float(lists.starts[-1]) * settings.tile_size**2,
+    }

@@ -1,0 +1,30 @@
+"""How long a call takes. Needs nothing but numpy, so that other programs are timed by the same rule."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+
+def timed(
+    function: Callable, *args: Any, wait: Callable[[Any], Any] = lambda result: result, least_runs: int = 5
+) -> dict[str, float]:
+    """Seconds of the first call, and the median and least milliseconds of the following ones.
+
+    Args:
+      function: called with `args`.
+      wait: called with its result; returns when that is there.
+      least_runs: after the first call; more, up to 40, while they take less than a second together.
+    """
+
+    def seconds() -> float:
+        start = time.perf_counter()
+        wait(function(*args))
+        return time.perf_counter() - start
+
+    first = seconds()
+    times: list[float] = []
+    while len(times) < least_runs or (sum(times) < 1.0 and len(times) < 40):
+        times.append(seconds())
+    return {"first_s": first, "ms": float(np.median(times)) * 1e3, "least_ms": min(times) * 1e3}
