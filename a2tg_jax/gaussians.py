@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial import cKDTree
 
-from a2tg_jax.numerics import normalize
+from a2tg_jax.numerics import safe_divide, safe_sqrt
 
 FLOATS_PER_GAUSSIAN = 58
 INITIAL_OPACITY = 0.1
@@ -54,17 +54,22 @@ class Gaussians:
         return jax.tree.map(lambda x: x[rows], self)
 
 
+def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
+    """The columns of the rotation of a quaternion (w, x, y, z), which is normalised first; element-wise."""
+    w, x, y, z = quat
+    norm = safe_sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = (safe_divide(number, norm) for number in quat)
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
 def rotation_matrices(quats: Array) -> Array:
     """Rotation matrices [..., 3, 3] of the quaternions [..., 4] (wxyz), which are normalised first."""
-    w, x, y, z = jnp.moveaxis(normalize(quats), -1, 0)
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
+    columns = rotation_columns(tuple(jnp.moveaxis(quats, -1, 0)))
+    return jnp.stack([jnp.stack(column, -1) for column in columns], -1)
 
 
 def logit(p: Array) -> Array:

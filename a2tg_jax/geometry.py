@@ -4,6 +4,7 @@ M [3, 3] takes (u, v, 1), in standard deviations of the splat, to homogeneous pi
 matrix, M = K·[Rc·R₀·s_x | Rc·R₁·s_y | Rc·μ + t]. Its last row gives the depth. N splats, rows M₀, M₁, M₂.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.gaussians import Gaussians, rotation_columns
 
 POLYGON_SIDES = 8
 BOUND_SLACK = 1e-2
@@ -20,108 +21,121 @@ BOUND_SLACK = 1e-2
 
 def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     """M [N, 3, 3] of each splat, and its normals [N, 3] in the world, turned to face the camera."""
-    rotations = rotation_matrices(gaussians.quats)
-    to_camera, offset = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    scales = gaussians.scales
-    columns = [
-        rotations[:, :, 0] * scales[:, 0:1] @ to_camera.T,
-        rotations[:, :, 1] * scales[:, 1:2] @ to_camera.T,
-        gaussians.means @ to_camera.T + offset[None, :],
-    ]
-    local_to_camera = jnp.stack(columns, axis=-1)
-    normals = rotations[:, :, 2]
-    towards_camera = jnp.sum(normals * (camera.center[None, :] - gaussians.means), axis=-1, keepdims=True)
-    return jnp.einsum("ij,njk->nik", camera.K, local_to_camera), jnp.where(towards_camera < 0, -normals, normals)
+    # Number by number: CPUs vectorise over N, and hardly over axes of 2 and 3.
+    x_axis, y_axis, normal = rotation_columns(tuple(gaussians.quats[:, k] for k in range(4)))
+    mean = tuple(gaussians.means[:, k] for k in range(3))
+    scale_x, scale_y = gaussians.scales[:, 0], gaussians.scales[:, 1]
+    to_pixels = camera.K @ camera.viewmat[:3]
+
+    def row(i: int) -> list[Array]:
+        u, v, w = (sum(to_pixels[i, k] * axis[k] for k in range(3)) for axis in (x_axis, y_axis, mean))
+        return [scale_x * u, scale_y * v, w + to_pixels[i, 3]]
+
+    M = jnp.stack([number for i in range(3) for number in row(i)], axis=1).reshape(-1, 3, 3)
+    towards_camera = sum(normal[k] * (camera.center[k] - mean[k]) for k in range(3))
+    return M, jnp.stack([jnp.where(towards_camera < 0, -number, number) for number in normal], axis=1)
+
+
+class Outline(NamedTuple):
+    """What a splat can show lies in an ellipse, or in a circle around its mean: the low-pass filter's reach."""
+
+    ellipse_x: Array
+    """Centre of the ellipse, in pixels."""
+    ellipse_y: Array
+    xx: Array
+    """The matrix S = [[xx, xy], [xy, yy]] with (x − e)ᵀS⁻¹(x − e) <= 1 inside the ellipse."""
+    xy: Array
+    yy: Array
+    mean_x: Array
+    """Centre of the circle: the projected mean."""
+    mean_y: Array
+    radius: Array
+    """Of the circle."""
+    is_clipped: Array
+    """The disc reaches behind the near plane: this is no outline, only the box holds."""
 
 
 class ScreenBounds(NamedTuple):
-    """Where N splats can reach 1/255, in pixels, conservatively."""
+    """Where splats can reach 1/255, in pixels, conservatively; [N] each."""
 
-    lower: Array
-    """[N, 2] smallest x and y."""
-    upper: Array
-    """[N, 2] largest x and y; below `lower` where the splat is invisible."""
-    means2d: Array
-    """[N, 2] projected means c."""
-    ellipse_center: Array
-    """[N, 2] centre of the outline's ellipse."""
-    ellipse: Array
-    """[N, 3] (xx, xy, yy) of the matrix S with (x − e)ᵀS⁻¹(x − e) <= 1 inside the outline."""
-    low_pass_radius: Array
-    """[N] radius around c of the low-pass filter's reach."""
-    is_clipped: Array
-    """[N] the disc reaches behind the near plane: the outline is no ellipse, only the box holds."""
+    left: Array
+    top: Array
+    right: Array
+    """Less than `left` where the splat is invisible, as `bottom` is then less than `top`."""
+    bottom: Array
+    outline: Outline
 
 
 def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
     """Bounds of the discs u² + v² <= cutoff seen on the screen, joined with the low-pass filter's reach.
-
-    Computed with M shifted to the projected mean, which keeps float32 exact to a fraction of a pixel.
 
     Args:
       M: [N, 3, 3] homographies.
       cutoff: [N] r² = 2·ln(255·o·max T_A); a splat with r² <= 0 shows nowhere.
       near_plane: depths below it are not hit.
     """
-    is_visible = (M[:, 2, 2] >= near_plane) & (cutoff > 0)
-    depths = jnp.where(is_visible, M[:, 2, 2], 1.0)
-    means2d = M[:, :2, 2] / depths[:, None]
-    r2 = jnp.where(is_visible, cutoff, 0.0)
-    tilt = M[:, 2, :2]
-    axes = M[:, :2, :2] - means2d[:, :, None] * tilt[:, None, :]
-    is_clipped = is_visible & (depths - jnp.sqrt(r2 * jnp.sum(tilt * tilt, -1)) < near_plane)
+    # Number by number: CPUs vectorise over N, and hardly over axes of 2 and 3.
+    rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
+    return _bounds_of_one(rows, cutoff, near_plane)
 
-    scale = jnp.where(is_clipped, 0.0, r2 / jnp.where(is_clipped, 1.0, depths**2 - r2 * jnp.sum(tilt * tilt, -1)))
-    shift = -scale[:, None] * jnp.sum(axes * tilt[:, None, :], -1)
-    gram = jnp.stack(
-        [
-            jnp.sum(axes[:, 0] * axes[:, 0], -1),
-            jnp.sum(axes[:, 0] * axes[:, 1], -1),
-            jnp.sum(axes[:, 1] * axes[:, 1], -1),
-        ],
-        -1,
-    )
-    outer = jnp.stack([shift[:, 0] ** 2, shift[:, 0] * shift[:, 1], shift[:, 1] ** 2], -1)
-    slack = jnp.asarray([BOUND_SLACK, 0.0, BOUND_SLACK], M.dtype)
-    ellipse = (outer + scale[:, None] * gram) * (1 + 1e-4) + slack[None, :]
-    center = means2d + shift
-    half = jnp.sqrt(ellipse[:, ::2])
-    clipped_lower, clipped_upper = _clipped_box(M, means2d, r2, near_plane)
-    lower = jnp.where(is_clipped[:, None], clipped_lower, center - half)
-    upper = jnp.where(is_clipped[:, None], clipped_upper, center + half)
+
+def _bounds_of_one(M, cutoff: Array, near_plane: float) -> ScreenBounds:
+    """Element-wise; M is shifted to the projected mean, which keeps float32 exact to a fraction of a pixel."""
+    last_u, last_v, depth = M[2]
+    is_visible = (depth >= near_plane) & (cutoff > 0)
+    depth = jnp.where(is_visible, depth, 1.0)
+    r2 = jnp.where(is_visible, cutoff, 0.0)
+    mean_x, mean_y = M[0][2] / depth, M[1][2] / depth
+    x_u, x_v = M[0][0] - mean_x * last_u, M[0][1] - mean_x * last_v
+    y_u, y_v = M[1][0] - mean_y * last_u, M[1][1] - mean_y * last_v
+    spread2 = r2 * (last_u * last_u + last_v * last_v)
+    is_clipped = is_visible & (depth - jnp.sqrt(spread2) < near_plane)
+
+    scale = jnp.where(is_clipped, 0.0, r2 / jnp.where(is_clipped, 1.0, depth * depth - spread2))
+    shift_x, shift_y = -scale * (x_u * last_u + x_v * last_v), -scale * (y_u * last_u + y_v * last_v)
+    ellipse_x, ellipse_y = mean_x + shift_x, mean_y + shift_y
+    xx = (shift_x * shift_x + scale * (x_u * x_u + x_v * x_v)) * (1 + 1e-4) + BOUND_SLACK
+    xy = (shift_x * shift_y + scale * (x_u * y_u + x_v * y_v)) * (1 + 1e-4)
+    yy = (shift_y * shift_y + scale * (y_u * y_u + y_v * y_v)) * (1 + 1e-4) + BOUND_SLACK
+    half_x, half_y = jnp.sqrt(xx), jnp.sqrt(yy)
+    box = ellipse_x - half_x, ellipse_y - half_y, ellipse_x + half_x, ellipse_y + half_y
+    clipped_box = _clipped_box(M, mean_x, mean_y, r2, near_plane)
+    left, top, right, bottom = (jnp.where(is_clipped, a, b) for a, b in zip(clipped_box, box, strict=True))
 
     radius = jnp.sqrt(r2 / 2 + BOUND_SLACK)
-    lower = jnp.minimum(lower, means2d - radius[:, None])
-    upper = jnp.maximum(upper, means2d + radius[:, None])
-    nowhere = jnp.asarray([[-1.0]], M.dtype)
     return ScreenBounds(
-        lower=jnp.where(is_visible[:, None], lower, -nowhere),
-        upper=jnp.where(is_visible[:, None], upper, nowhere),
-        means2d=means2d,
-        ellipse_center=center,
-        ellipse=ellipse,
-        low_pass_radius=radius,
-        is_clipped=is_clipped,
+        left=jnp.where(is_visible, jnp.minimum(left, mean_x - radius), 1.0),
+        top=jnp.where(is_visible, jnp.minimum(top, mean_y - radius), 1.0),
+        right=jnp.where(is_visible, jnp.maximum(right, mean_x + radius), -1.0),
+        bottom=jnp.where(is_visible, jnp.maximum(bottom, mean_y + radius), -1.0),
+        outline=Outline(ellipse_x, ellipse_y, xx, xy, yy, mean_x, mean_y, radius, is_clipped),
     )
 
 
-def _clipped_box(M: Array, means2d: Array, r2: Array, near_plane: float) -> tuple[Array, Array]:
-    """Bounding boxes of the polygon around each disc, cut at the near plane: lower and upper corners [N, 2]."""
+def _clipped_box(M, mean_x: Array, mean_y: Array, r2: Array, near_plane: float) -> tuple[Array, Array, Array, Array]:
+    """Left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise."""
     angles = np.arange(POLYGON_SIDES) * (2 * np.pi / POLYGON_SIDES)
-    unit = np.stack([np.cos(angles), np.sin(angles)], -1) / np.cos(np.pi / POLYGON_SIDES)
-    corners = jnp.sqrt(r2)[:, None, None] * jnp.asarray(unit, M.dtype)[None]
-    corners = jnp.concatenate([corners, jnp.ones_like(corners[..., :1])], -1)
-    points = jnp.einsum("nij,npj->npi", M, corners)
-    following = jnp.roll(points, -1, axis=1)
-    rise = following[..., 2] - points[..., 2]
-    crosses = (points[..., 2] < near_plane) != (following[..., 2] < near_plane)
-    fraction = jnp.where(crosses, (near_plane - points[..., 2]) / jnp.where(crosses, rise, 1.0), 0.0)
-    cuts = points + fraction[..., None] * (following - points)
-    candidates = jnp.concatenate([points, cuts], 1)
-    is_valid = jnp.concatenate([points[..., 2] >= near_plane, crosses], 1)
-    depths = jnp.where(is_valid, jnp.maximum(candidates[..., 2], near_plane), 1.0)
-    pixels = candidates[..., :2] / depths[..., None]
-    lower = jnp.min(jnp.where(is_valid[..., None], pixels, means2d[:, None]), axis=1)
-    upper = jnp.max(jnp.where(is_valid[..., None], pixels, means2d[:, None]), axis=1)
-    margin = 1e-3 * (upper - lower) + BOUND_SLACK
-    return lower - margin, upper + margin
+    reach = jnp.sqrt(r2) / math.cos(math.pi / POLYGON_SIDES)
+    points = []
+    for cosine, sine in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True):
+        u, v = reach * cosine, reach * sine
+        points.append(tuple(row[0] * u + row[1] * v + row[2] for row in M))
+
+    box = mean_x, mean_y, mean_x, mean_y
+
+    def joined(box, is_valid, point):
+        x, y, depth = point
+        depth = jnp.where(is_valid, jnp.maximum(depth, near_plane), 1.0)
+        x, y = jnp.where(is_valid, x / depth, mean_x), jnp.where(is_valid, y / depth, mean_y)
+        return jnp.minimum(box[0], x), jnp.minimum(box[1], y), jnp.maximum(box[2], x), jnp.maximum(box[3], y)
+
+    for point, following in zip(points, points[1:] + points[:1], strict=True):
+        is_before = point[2] >= near_plane
+        box = joined(box, is_before, point)
+        crosses = is_before != (following[2] >= near_plane)
+        fraction = jnp.where(crosses, (near_plane - point[2]) / jnp.where(crosses, following[2] - point[2], 1.0), 0.0)
+        cut = tuple(a + fraction * (b - a) for a, b in zip(point, following, strict=True))
+        box = joined(box, crosses, cut)
+    left, top, right, bottom = box
+    margin_x, margin_y = 1e-3 * (right - left) + BOUND_SLACK, 1e-3 * (bottom - top) + BOUND_SLACK
+    return left - margin_x, top - margin_y, right + margin_x, bottom + margin_y

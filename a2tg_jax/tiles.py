@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.geometry import ScreenBounds
+from a2tg_jax.geometry import Outline, ScreenBounds
 
 
 class TileGrid(NamedTuple):
@@ -57,14 +57,19 @@ class Rectangles(NamedTuple):
 
 def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
     """The tiles that each splat's box covers."""
-    limits = jnp.asarray([grid.width, grid.height], jnp.int32)
+    x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
+    y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
+    columns = jnp.where(rows > 0, columns, 0)
+    return Rectangles(x0, y0, columns, columns * rows)
+
+
+def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
+    """First tile along an axis with a pixel centre in [low, high], and how many tiles there are."""
     as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
-    first = jnp.clip(as_pixels(jnp.ceil(bounds.lower - 0.5)), 0, limits[None, :])
-    last = jnp.minimum(as_pixels(jnp.floor(bounds.upper - 0.5)), limits[None, :] - 1)
-    is_empty = jnp.any(last < first, axis=-1)
-    begin, end = first // grid.tile_size, last // grid.tile_size + 1
-    extent = jnp.where(is_empty[:, None], 0, end - begin)
-    return Rectangles(begin[:, 0], begin[:, 1], extent[:, 0], extent[:, 0] * extent[:, 1])
+    first = jnp.clip(as_pixels(jnp.ceil(low - 0.5)), 0, size)
+    last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), size - 1)
+    begin = first // tile_size
+    return begin, jnp.where(last < first, 0, last // tile_size + 1 - begin)
 
 
 def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
@@ -84,26 +89,6 @@ def exceeds(total: Array, capacity: int) -> Array:
     return total + jnp.floor(total * 2.0**-20) > capacity
 
 
-class Outline(NamedTuple):
-    """Where one splat (or an array of them) can show on the screen, number by number: see `ScreenBounds`."""
-
-    center_x: Array
-    center_y: Array
-    xx: Array
-    xy: Array
-    yy: Array
-    mean_x: Array
-    mean_y: Array
-    radius: Array
-    is_clipped: Array
-
-
-def outlines(bounds: ScreenBounds) -> Outline:
-    """The outlines of N splats, each entry [N]."""
-    numbers = jnp.concatenate([bounds.ellipse_center, bounds.ellipse, bounds.means2d], axis=1)
-    return Outline._make([*jnp.moveaxis(numbers, 1, 0), bounds.low_pass_radius, bounds.is_clipped])
-
-
 def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:
     """Whether an outline reaches a pixel centre of the tile whose first pixel is (x0, y0); element-wise."""
 
@@ -111,7 +96,7 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
         left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
         return left, left + (tile_size - 1), top, top + (tile_size - 1)
 
-    left, right, top, bottom = distance_to_box(outline.center_x, outline.center_y)
+    left, right, top, bottom = distance_to_box(outline.ellipse_x, outline.ellipse_y)
     xx, xy, yy = outline.xx, outline.xy, outline.yy
     # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
     x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
@@ -151,8 +136,8 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     x = rectangles.x0[rank] + local % columns
     y = rectangles.y0[rank] + local // columns
     ids = order[rank].astype(jnp.int32)
-    dtype = bounds.lower.dtype
-    per_pair = jax.tree.map(lambda leaf: leaf[ids], outlines(bounds))
+    dtype = bounds.left.dtype
+    per_pair = jax.tree.map(lambda leaf: leaf[ids], bounds.outline)
     tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
     is_kept = (position < ends[-1]) & outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)

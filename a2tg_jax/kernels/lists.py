@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 from llvmlite import ir
 
+from a2tg_jax.geometry import Outline
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.lanes import INT, Lanes, trace
 from a2tg_jax.kernels.writer import LONG, Writer
-from a2tg_jax.tiles import Outline, outline_touches
+from a2tg_jax.tiles import outline_touches
 
 FIND = ("order", "rectangles", "outlines", "counts", "tiles", "splats")
 PLACE = ("tiles", "splats", "cursors", "ids")
@@ -33,9 +34,8 @@ class _Find(Writer):
         self.tile_size = tile_size
         number: Any = jax.ShapeDtypeStruct((), dtype)
         flag: Any = jax.ShapeDtypeStruct((), jnp.bool_)
-        outline = Outline._make([number] * (NUM_NUMBERS - 1) + [flag])
         touches = functools.partial(outline_touches, tile_size=tile_size)
-        self.touches, _ = trace(touches, outline, number, number)
+        self.touches, _ = trace(touches, Outline._make([number] * (NUM_NUMBERS - 1) + [flag]), number, number)
 
     def write(self) -> None:
         b, given = self.b, self.arguments

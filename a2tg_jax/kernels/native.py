@@ -19,7 +19,7 @@ from jax import Array
 from a2tg_jax.geometry import ScreenBounds
 from a2tg_jax.kernels import foreign, threads
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
-from a2tg_jax.tiles import TileGrid, TileLists, exceeds, outlines, tile_rectangles, total_pairs
+from a2tg_jax.tiles import TileGrid, TileLists, exceeds, tile_rectangles, total_pairs
 
 _LOCK = threading.RLock()
 _names: dict[str, Any] = {}
@@ -79,8 +79,8 @@ def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: in
     total = total_pairs(counts)
     overflow = exceeds(total, capacity)
     rectangles = jnp.stack([x0, y0, columns, jnp.where(overflow, 0, counts)], axis=1)
-    dtype = bounds.lower.dtype
-    outline = jnp.stack([entry.astype(dtype) for entry in outlines(bounds)], axis=1)
+    dtype = bounds.left.dtype
+    outline = jnp.stack([number.astype(dtype) for number in bounds.outline], axis=1)
     name = f"a2tg_lists_{dtype}_{grid.tile_size}"
     with _LOCK:
         foreign.register(name, functools.partial(_list_handler, list_loops(str(dtype), grid.tile_size)))
