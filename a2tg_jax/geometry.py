@@ -74,13 +74,19 @@ def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
       cutoff: [N] r² = 2·ln(255·o·max T_A); a splat with r² <= 0 shows nowhere.
       near_plane: depths below it are not hit.
     """
-    # Number by number: CPUs vectorise over N, and hardly over axes of 2 and 3.
     rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
-    return _bounds_of_one(rows, cutoff, near_plane)
+    bounds = unclipped_bounds(rows, cutoff, near_plane)
+    clipped = clipped_box(rows, bounds.outline, cutoff, near_plane)
+    is_clipped = bounds.outline.is_clipped
+    left, top, right, bottom = (jnp.where(is_clipped, a, b) for a, b in zip(clipped, bounds[:4], strict=True))
+    return ScreenBounds(left, top, right, bottom, bounds.outline)
 
 
-def _bounds_of_one(M, cutoff: Array, near_plane: float) -> ScreenBounds:
-    """Element-wise; M is shifted to the projected mean, which keeps float32 exact to a fraction of a pixel."""
+def unclipped_bounds(M, cutoff: Array, near_plane: float) -> ScreenBounds:
+    """As `screen_bounds`, of rows M[i][k]; element-wise. Where the outline is clipped the box means nothing.
+
+    M is shifted to the projected mean, which keeps float32 exact to a fraction of a pixel.
+    """
     last_u, last_v, depth = M[2]
     is_visible = (depth >= near_plane) & (cutoff > 0)
     depth = jnp.where(is_visible, depth, 1.0)
@@ -97,30 +103,29 @@ def _bounds_of_one(M, cutoff: Array, near_plane: float) -> ScreenBounds:
     xx = (shift_x * shift_x + scale * (x_u * x_u + x_v * x_v)) * (1 + 1e-4) + BOUND_SLACK
     xy = (shift_x * shift_y + scale * (x_u * y_u + x_v * y_v)) * (1 + 1e-4)
     yy = (shift_y * shift_y + scale * (y_u * y_u + y_v * y_v)) * (1 + 1e-4) + BOUND_SLACK
-    half_x, half_y = jnp.sqrt(xx), jnp.sqrt(yy)
-    box = ellipse_x - half_x, ellipse_y - half_y, ellipse_x + half_x, ellipse_y + half_y
-    clipped_box = _clipped_box(M, mean_x, mean_y, r2, near_plane)
-    left, top, right, bottom = (jnp.where(is_clipped, a, b) for a, b in zip(clipped_box, box, strict=True))
-
-    radius = jnp.sqrt(r2 / 2 + BOUND_SLACK)
+    half_x, half_y, radius = jnp.sqrt(xx), jnp.sqrt(yy), jnp.sqrt(r2 / 2 + BOUND_SLACK)
     return ScreenBounds(
-        left=jnp.where(is_visible, jnp.minimum(left, mean_x - radius), 1.0),
-        top=jnp.where(is_visible, jnp.minimum(top, mean_y - radius), 1.0),
-        right=jnp.where(is_visible, jnp.maximum(right, mean_x + radius), -1.0),
-        bottom=jnp.where(is_visible, jnp.maximum(bottom, mean_y + radius), -1.0),
+        left=jnp.where(is_visible, jnp.minimum(ellipse_x - half_x, mean_x - radius), 1.0),
+        top=jnp.where(is_visible, jnp.minimum(ellipse_y - half_y, mean_y - radius), 1.0),
+        right=jnp.where(is_visible, jnp.maximum(ellipse_x + half_x, mean_x + radius), -1.0),
+        bottom=jnp.where(is_visible, jnp.maximum(ellipse_y + half_y, mean_y + radius), -1.0),
         outline=Outline(ellipse_x, ellipse_y, xx, xy, yy, mean_x, mean_y, radius, is_clipped),
     )
 
 
-def _clipped_box(M, mean_x: Array, mean_y: Array, r2: Array, near_plane: float) -> tuple[Array, Array, Array, Array]:
-    """Left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise."""
+def clipped_box(M, outline: Outline, cutoff: Array, near_plane: float) -> tuple[Array, Array, Array, Array]:
+    """Left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise.
+
+    It means something where the outline is clipped.
+    """
     angles = np.arange(POLYGON_SIDES) * (2 * np.pi / POLYGON_SIDES)
-    reach = jnp.sqrt(r2) / math.cos(math.pi / POLYGON_SIDES)
+    reach = jnp.sqrt(jnp.maximum(cutoff, 0.0)) / math.cos(math.pi / POLYGON_SIDES)
     points = []
     for cosine, sine in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True):
         u, v = reach * cosine, reach * sine
         points.append(tuple(row[0] * u + row[1] * v + row[2] for row in M))
 
+    mean_x, mean_y, radius = outline.mean_x, outline.mean_y, outline.radius
     box = mean_x, mean_y, mean_x, mean_y
 
     def joined(box, is_valid, point):
@@ -138,4 +143,9 @@ def _clipped_box(M, mean_x: Array, mean_y: Array, r2: Array, near_plane: float) 
         box = joined(box, crosses, cut)
     left, top, right, bottom = box
     margin_x, margin_y = 1e-3 * (right - left) + BOUND_SLACK, 1e-3 * (bottom - top) + BOUND_SLACK
-    return left - margin_x, top - margin_y, right + margin_x, bottom + margin_y
+    return (
+        jnp.minimum(left - margin_x, mean_x - radius),
+        jnp.minimum(top - margin_y, mean_y - radius),
+        jnp.maximum(right + margin_x, mean_x + radius),
+        jnp.maximum(bottom + margin_y, mean_y + radius),
+    )

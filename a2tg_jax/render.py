@@ -18,7 +18,7 @@ from a2tg_jax.appearance import AppearanceRule, PlainAppearance
 from a2tg_jax.cameras import Camera
 from a2tg_jax.compositor import Compositing, Splats, composite
 from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.geometry import ScreenBounds, homographies, screen_bounds
+from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose
 from a2tg_jax.lookup import TextureOptions, textured_appearance
@@ -143,10 +143,11 @@ def render_traced(
     """
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     degree = settings.sh_degree if sh_degree is None else sh_degree
-    splats, bounds = _project(gaussians, camera, rule, settings, degree, num_live)
+    splats, cutoff = _project(gaussians, camera, rule, settings, degree, num_live)
     compositor = choose(settings.compositor, settings.tile_size)
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
-    lists = list_tiles(bounds, jax.lax.stop_gradient(splats.M[:, 2, 2]), grid, settings.capacity or 0)
+    M = jax.lax.stop_gradient(splats.M)
+    lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     how = Compositing(
         grid=grid,
         near_plane=settings.near_plane,
@@ -257,15 +258,15 @@ def _tile_batch(settings: RenderSettings) -> int:
     return settings.tile_batch
 
 
-def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, ScreenBounds]:
+def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
+    """The splats, and the squared distance within which each shows; not positive where it shows nowhere."""
     M, normals = homographies(gaussians, camera)
     opacities = gaussians.opacities
-    cutoff = rule.cutoff(opacities)
+    is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)
     if num_live is not None:
-        cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
-    bounds = screen_bounds(*jax.lax.stop_gradient((M, cutoff)), settings.near_plane)
+        is_drawn &= jnp.arange(gaussians.num) < num_live
+    cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
     # Rows that are drawn nowhere may hold anything; a finite stand-in keeps 0 · inf out of the gradients.
-    is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)[:, None, None]
-    M = jnp.where(is_drawn, M, jnp.eye(3, dtype=M.dtype)[None])
+    M = jnp.where(is_drawn[:, None, None], M, jnp.eye(3, dtype=M.dtype)[None])
     colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
-    return Splats(M, colors, opacities, normals), bounds
+    return Splats(M, colors, opacities, normals), cutoff

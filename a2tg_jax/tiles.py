@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.geometry import Outline, ScreenBounds
+from a2tg_jax.geometry import Outline, ScreenBounds, screen_bounds
 
 
 class TileGrid(NamedTuple):
@@ -59,17 +59,19 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
     """The tiles that each splat's box covers."""
     x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
     y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
-    columns = jnp.where(rows > 0, columns, 0)
+    columns = jnp.where(rows > 0, columns, jnp.int32(0))
     return Rectangles(x0, y0, columns, columns * rows)
 
 
 def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
     """First tile along an axis with a pixel centre in [low, high], and how many tiles there are."""
     as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
-    first = jnp.clip(as_pixels(jnp.ceil(low - 0.5)), 0, size)
-    last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), size - 1)
-    begin = first // tile_size
-    return begin, jnp.where(last < first, 0, last // tile_size + 1 - begin)
+    nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
+    first = jnp.maximum(as_pixels(jnp.ceil(low - 0.5)), nothing)
+    last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), last_pixel)
+    # Not //, which does more for negative numbers; there are none but a `last` of -1, less than `first`.
+    begin, end = jax.lax.div(first, side), jax.lax.div(last, side) + 1
+    return begin, jnp.where(last < first, nothing, end - begin)
 
 
 def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
@@ -113,15 +115,15 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
     return is_in_ellipse | (nearest <= outline.radius**2) | outline.is_clipped
 
 
-def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: int) -> TileLists:
+def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
     """Lists of the splats that touch each tile, ordered by depth, ties by index.
 
     Args:
-      bounds: of N splats.
-      depths: [N] of the means.
+      M, cutoff, near_plane: of N splats, as for `geometry.screen_bounds`.
       grid: the tiles.
       capacity: how many pairs there is room for, before the outline test; `overflow` tells when it did not suffice.
     """
+    bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
     rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid))
     total = total_pairs(rectangles.counts)

@@ -26,10 +26,9 @@ def measure_stages(case: dict) -> dict:
     capacity = settings.capacity or 0
     rule, grid = appearance_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
     project = jax.jit(lambda gaussians: _project(gaussians, camera, rule, settings, 3, None))
-    splats, bounds = project(gaussians)
-    depths = splats.M[:, 2, 2]
-    find_lists = jax.jit(lambda bounds, depths: native.tile_lists(bounds, depths, grid, capacity))
-    lists = find_lists(bounds, depths)
+    splats, cutoff = project(gaussians)
+    find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
+    lists = find_lists(splats.M, cutoff)
     how = Compositing(grid, settings.near_plane, False, False, "native", 1)
     jacobian, tap = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 
@@ -50,7 +49,7 @@ def measure_stages(case: dict) -> dict:
     return {
         "projection": timed(project, gaussians),
         "projection, forward and backward": timed(jax.jit(project_gradient), gaussians),
-        "tile lists": timed(find_lists, bounds, depths),
+        "tile lists": timed(find_lists, splats.M, cutoff),
         "compositing": timed(jax.jit(colors), splats, rule),
         "compositing, forward and backward": timed(jax.jit(all_of_it), splats, rule),
         "loss, value and gradient": timed(jax.jit(jax.value_and_grad(a2tg_jax.photometric_loss)), image, target),

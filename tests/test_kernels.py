@@ -15,7 +15,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
 from a2tg_jax.bilinear import Image
-from a2tg_jax.geometry import homographies, screen_bounds
+from a2tg_jax.geometry import homographies
 from a2tg_jax.kernels import foreign, lanes, library, native, threads
 from a2tg_jax.kernels.writer import LONG, Writer
 from a2tg_jax.render import appearance_of, render_traced
@@ -91,18 +91,17 @@ def test_lists_are_those_of_xla(tile_size, dtype):
     gaussians, camera = as_gaussians(scene, dtype), as_camera(scene, dtype)
     M, _ = homographies(gaussians, camera)
     # Equal depths, to see ties in order of the index.
-    depths = jnp.round(M[:, 2, 2], 1)
-    bounds = screen_bounds(M, gaussian_cutoff(gaussians.opacities), 0.2)
+    splats = M.at[:, 2, 2].set(jnp.round(M[:, 2, 2], 1)), gaussian_cutoff(gaussians.opacities), 0.2
     grid = TileGrid(scene.width, scene.height, tile_size)
-    ours = jax.jit(lambda: native.tile_lists(bounds, depths, grid, 20_000))()
-    expected = jax.jit(lambda: tile_lists(bounds, depths, grid, 20_000))()
+    ours = jax.jit(lambda: native.tile_lists(*splats, grid, 20_000))()
+    expected = jax.jit(lambda: tile_lists(*splats, grid, 20_000))()
     np.testing.assert_array_equal(ours.starts, expected.starts)
     num_pairs = int(ours.starts[-1])
     assert num_pairs > 500
     np.testing.assert_array_equal(ours.ids[:num_pairs], expected.ids[:num_pairs])
     assert ours.num_pairs == expected.num_pairs and not ours.overflow
 
-    full = jax.jit(lambda: native.tile_lists(bounds, depths, grid, 100))()
+    full = jax.jit(lambda: native.tile_lists(*splats, grid, 100))()
     assert full.overflow and full.starts[-1] == 0
 
 

@@ -304,6 +304,7 @@ PRIMITIVES: dict[str, Callable[[Lanes, list[ir.Value], Any], ir.Value]] = {
     "abs": _absolute,
     "sign": _sign,
     "floor": _intrinsic("floor"),
+    "ceil": _intrinsic("ceil"),
     "exp": lambda lanes, operands, _: lanes.exp(operands[0]),
     "log": _intrinsic("log"),
     "sqrt": _intrinsic("sqrt"),

@@ -1,31 +1,86 @@
 """Native loops that list the splats of each tile: a counting sort, in time proportional to the pairs.
 
+    bound(M, cutoff, outlines, rectangles; first, last, width, height)
     find(order, rectangles, outlines, counts, tiles, splats; num_splats, columns)
     place(tiles, splats, cursors, ids; num_pairs)
 
-`find` goes through the splats in the given order, front to back, and writes down every pair whose outline touches its
-tile; `place` moves them tile by tile, in the same order. Buffers: order [M], rectangles [N, 4] (x0, y0, columns,
-count), outlines [N, 9], counts [tiles]; tiles and splats [capacity]; ids [capacity]; cursors [tiles], where each tile's
-list begins, and in the end where it ends.
+`bound` writes the outlines of the splats `first` to `last`, and which tiles their boxes cover. `find` goes through the
+splats in the given order, front to back, and writes down every pair whose outline touches its tile; `place` moves them
+tile by tile, in the same order.
+
+Buffers: M [N, 9], cutoff [N], outlines [N, 9], rectangles [N, 4] (x0, y0, columns, count); order [splats], counts
+[tiles]; tiles and splats [pairs]; ids [capacity]; cursors [tiles], where each tile's list begins, and in the end where
+it ends.
 """
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from llvmlite import ir
 
-from a2tg_jax.geometry import Outline
+from a2tg_jax.geometry import Outline, ScreenBounds, clipped_box, unclipped_bounds
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.lanes import INT, Lanes, trace
 from a2tg_jax.kernels.writer import LONG, Writer
-from a2tg_jax.tiles import outline_touches
+from a2tg_jax.tiles import TileGrid, outline_touches, tile_rectangles
 
+BOUND = ("M", "cutoff", "outlines", "rectangles")
 FIND = ("order", "rectangles", "outlines", "counts", "tiles", "splats")
 PLACE = ("tiles", "splats", "cursors", "ids")
 NUM_NUMBERS = len(Outline._fields)
+
+
+def _example_outline(dtype: str) -> Outline:
+    number: Any = jax.ShapeDtypeStruct((), dtype)
+    flag: Any = jax.ShapeDtypeStruct((), jnp.bool_)
+    return Outline._make([number] * (NUM_NUMBERS - 1) + [flag])
+
+
+class _Bound(Writer):
+    def __init__(self, module: ir.Module, name: str, dtype: str, tile_size: int, near_plane: float):
+        super().__init__(module, name, BOUND, ("first", "last", "width", "height"), dtype)
+        number: Any = jax.ShapeDtypeStruct((), dtype)
+        integer = jax.ShapeDtypeStruct((), jnp.int32)
+        M = ((number,) * 3,) * 3
+        outline = _example_outline(dtype)
+        self.bounds, _ = trace(functools.partial(unclipped_bounds, near_plane=near_plane), M, number)
+        self.clipped, _ = trace(functools.partial(clipped_box, near_plane=near_plane), M, outline, number)
+
+        def rectangle(bounds, width, height):
+            return tile_rectangles(bounds, TileGrid(width, height, tile_size))
+
+        bounds = ScreenBounds(number, number, number, number, outline)
+        self.rectangle, _ = trace(rectangle, bounds, integer, integer)
+
+    def write(self) -> None:
+        b, given, scalars = self.b, self.arguments, Lanes(self.b, 1)
+        rooms = [self.variable(self.real) for _ in range(4)]
+        with self.loop(self.long(given["first"]), self.long(given["last"])) as (id_, _):
+            base = self.at(given["M"], self.times(id_, 9), self.real)
+            M = [self.load(base, k, self.real) for k in range(9)]
+            cutoff = self.load(given["cutoff"], id_, self.real)
+            bounds = scalars.emit(self.bounds, [*M, cutoff])
+            box, outline = bounds[:4], bounds[4:]
+            for number, room in zip(box, rooms, strict=True):
+                b.store(number, room)
+            with b.if_then(outline[-1]):
+                for number, room in zip(scalars.emit(self.clipped, [*M, *outline, cutoff]), rooms, strict=True):
+                    b.store(number, room)
+            box = [b.load(room, typ=self.real) for room in rooms]
+            rectangle = scalars.emit(self.rectangle, [*box, *outline, given["width"], given["height"]])
+            self.store_all(rectangle, self.at(given["rectangles"], self.times(id_, 4), INT))
+            outline[-1] = b.uitofp(outline[-1], self.real)
+            self.store_all(outline, self.at(given["outlines"], self.times(id_, NUM_NUMBERS), self.real))
+        b.ret_void()
+
+    def store_all(self, values: Sequence[ir.Value], base: ir.Value) -> None:
+        for k, value in enumerate(values):
+            self.store(value, base, k)
 
 
 class _Find(Writer):
@@ -33,9 +88,8 @@ class _Find(Writer):
         super().__init__(module, name, FIND, ("num_splats", "columns"), dtype)
         self.tile_size = tile_size
         number: Any = jax.ShapeDtypeStruct((), dtype)
-        flag: Any = jax.ShapeDtypeStruct((), jnp.bool_)
         touches = functools.partial(outline_touches, tile_size=tile_size)
-        self.touches, _ = trace(touches, Outline._make([number] * (NUM_NUMBERS - 1) + [flag]), number, number)
+        self.touches, _ = trace(touches, _example_outline(dtype), number, number)
 
     def write(self) -> None:
         b, given = self.b, self.arguments
@@ -92,19 +146,26 @@ class _Place(Writer):
 class ListLoops:
     """Compiled loops; each releases the GIL."""
 
+    bound: Any
     find: Any
     place: Any
+    num_outline: int = NUM_NUMBERS
+
+
+_numbers = itertools.count()
 
 
 @functools.cache
-def list_loops(dtype: str, tile_size: int) -> ListLoops:
-    """The loops for outlines of a dtype and tiles of a size, compiled at the first call."""
-    module = ir.Module("lists")
-    find, place = f"find_{dtype}_{tile_size}", f"place_{dtype}_{tile_size}"
+def list_loops(dtype: str, tile_size: int, near_plane: float) -> ListLoops:
+    """The loops for homographies of a dtype and tiles of a size, compiled at the first call."""
+    module, tag = ir.Module("lists"), next(_numbers)
+    bound, find, place = f"bound_{tag}", f"find_{tag}", f"place_{tag}"
+    _Bound(module, bound, dtype, tile_size, near_plane).write()
     _Find(module, find, dtype, tile_size).write()
     _Place(module, place).write()
     addresses = library.compile_module(module)
     return ListLoops(
+        bound=library.as_function(addresses[bound], len(BOUND), 4),
         find=library.as_function(addresses[find], len(FIND), 2),
         place=library.as_function(addresses[place], len(PLACE), 1),
     )

@@ -16,16 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.geometry import ScreenBounds
 from a2tg_jax.kernels import foreign, threads
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
-from a2tg_jax.tiles import TileGrid, TileLists, exceeds, tile_rectangles, total_pairs
+from a2tg_jax.tiles import TileGrid, TileLists
 
 _LOCK = threading.RLock()
 _names: dict[str, Any] = {}
 """Whose loops each name stands for."""
-PAIRS_PER_THREAD = 2_000
-"""Fewer pairs than this are not worth another thread."""
+PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
+"""Fewer than these are not worth another thread."""
 
 
 def _kind(how, splats, rule):
@@ -71,42 +70,48 @@ def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: A
     return d_splats, d_params.astype(params.dtype), d_tap
 
 
-def tile_lists(bounds: ScreenBounds, depths: Array, grid: TileGrid, capacity: int) -> TileLists:
+def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
     """As `tiles.tile_lists`."""
     from a2tg_jax.kernels.lists import list_loops
 
-    x0, y0, columns, counts = tile_rectangles(bounds, grid)
-    total = total_pairs(counts)
-    overflow = exceeds(total, capacity)
-    rectangles = jnp.stack([x0, y0, columns, jnp.where(overflow, 0, counts)], axis=1)
-    dtype = bounds.left.dtype
-    outline = jnp.stack([number.astype(dtype) for number in bounds.outline], axis=1)
-    name = f"a2tg_lists_{dtype}_{grid.tile_size}"
+    dtype = str(M.dtype)
+    name = f"a2tg_lists_{dtype}_{grid.tile_size}_{near_plane}"
     with _LOCK:
-        foreign.register(name, functools.partial(_list_handler, list_loops(str(dtype), grid.tile_size)))
-    shapes = jax.ShapeDtypeStruct((capacity,), jnp.int32), jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32)
+        foreign.register(name, functools.partial(_list_handler, list_loops(dtype, grid.tile_size, near_plane)))
+    shapes = (
+        jax.ShapeDtypeStruct((capacity,), jnp.int32),
+        jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+        jax.ShapeDtypeStruct((), jnp.bool_),
+    )
+    size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    ids, starts = call(depths, rectangles, outline, jnp.asarray([grid.columns], jnp.int32))
-    return TileLists(ids, starts, total, overflow)
+    return TileLists(*call(M, cutoff.astype(M.dtype), size))
 
 
 def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
-    depths, rectangles, outline, columns = arguments
-    ids, starts = results
-    order = _depth_order(depths, np.flatnonzero(rectangles[:, 3]))
-    capacity = max(1, int(rectangles[:, 3].sum(dtype=np.int64)))
-    counts, tiles, splats = (np.zeros(len(starts), np.int32), *np.empty((2, capacity), np.int32))
+    M, cutoff, size = arguments
+    ids, starts, total, overflow = results
+    columns, width, height = map(int, size)
+    num = len(cutoff)
+    outlines, rectangles = np.empty((num, loops.num_outline), M.dtype), np.empty((num, 4), np.int32)
     address = lambda *arrays: [array.ctypes.data for array in arrays]  # noqa: E731
-    loops.find(*address(order, rectangles, outline, counts, tiles, splats), len(order), int(columns[0]))
-    starts[0] = 0
+
+    def bound(first: int, last: int, _: int) -> None:
+        loops.bound(*address(M, cutoff, outlines, rectangles), first, last, width, height)
+
+    threads.run_spans(bound, threads.even_spans(num, SPLATS_PER_THREAD))
+    room = int(rectangles[:, 3].sum(dtype=np.int64))
+    total[...], overflow[...] = room, room > len(ids)
+    starts[:], ids[:] = 0, 0
+    if overflow:
+        return
+    order = _depth_order(M[:, 2, 2], np.flatnonzero(rectangles[:, 3]))
+    counts, (tiles, splats) = np.zeros(len(starts), np.int32), np.empty((2, max(1, room)), np.int32)
+    loops.find(*address(order, rectangles, outlines, counts, tiles, splats), len(order), columns)
     np.cumsum(counts[:-1], out=starts[1:])
-    num_pairs, cursors = int(starts[-1]), starts[:-1].copy()
-    if num_pairs > len(ids):
-        raise ValueError(
-            f"there are {num_pairs} pairs of a splat and a tile, but room for {len(ids)}: raise the capacity"
-        )
-    loops.place(*address(tiles, splats, cursors, ids), num_pairs)
-    ids[num_pairs:] = 0
+    cursors = starts[:-1].copy()
+    loops.place(*address(tiles, splats, cursors, ids), int(starts[-1]))
 
 
 def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
