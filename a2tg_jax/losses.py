@@ -63,14 +63,23 @@ def ssim(image: Array, target: Array) -> Array:
             f"{image.shape[0]}: use larger images or ssim_weight=0"
         )
     x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
+    if has_native():
+        from a2tg_jax.kernels import windows
+
+        if x.dtype == y.dtype and x.shape[2] >= windows.least_width(x.dtype, SSIM_WINDOW):
+            return windows.mean_score(windows.Score(_similarity, SSIM_TAPS), x, y)
     # The target's own mean is blurred apart, so that no gradient is computed for it. The two second moments enter
     # SSIM only through their sum: four blurs instead of five.
     mean_x, mean_squares, mean_product = jnp.split(_window_mean(jnp.concatenate([x, x * x + y * y, x * y])), 3)
-    mean_y = _window_mean(y)
+    return jnp.mean(_similarity(mean_x, _window_mean(y), mean_squares, mean_product))
+
+
+def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:
+    """SSIM of a window, from its means of x, y, x² + y² and x·y; element-wise."""
     means_product, means_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     luminance = (2 * means_product + SSIM_C1) / (means_squares + SSIM_C1)
     structure = (2 * (mean_product - means_product) + SSIM_C2) / (mean_squares - means_squares + SSIM_C2)
-    return jnp.mean(luminance * structure)
+    return luminance * structure
 
 
 def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera) -> Array:
@@ -152,11 +161,6 @@ def _back_project(depth: Array, camera: Camera) -> Array:
 @jax.custom_vjp
 def _window_mean(images: Array) -> Array:
     """[C, H, W] → [C, H-10, W-10]: the mean under SSIM's window, at every place where it fits."""
-    if has_native():
-        from a2tg_jax.kernels import window
-
-        if images.shape[2] >= window.least_width(images.dtype, SSIM_WINDOW):
-            return window.window_mean(images, SSIM_TAPS)
     return _blur(_blur(images, 1), 2)
 
 

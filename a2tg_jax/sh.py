@@ -55,4 +55,5 @@ def sh_colors(sh: Array, means: Array, center: Array, degree) -> Array:
     """
     directions = normalize(means - center[None, :])
     basis = jnp.where(degree_mask(degree)[None, :], sh_basis(directions), 0.0)
-    return jnp.maximum(jnp.einsum("nl,nlc->nc", basis, sh) + 0.5, 0.0)
+    # A sum, which CPUs do several times faster than many small matrix products.
+    return jnp.maximum(jnp.sum(basis[:, :, None] * sh, axis=1) + 0.5, 0.0)

@@ -3,5 +3,5 @@
 `choice` says which one runs where. On CPUs, native loops: `functions` are what is applied, `lanes` translates it to
 LLVM vector code, `loops` and `lists` put that into loops (with `writer` and `texels`), `library` compiles, `foreign`
 lets XLA call the result, on `threads`, and `native` is what the renderer uses. On GPUs, `pallas`. `packing` is common
-to both. `window` is SSIM's, made in the same way.
+to both. `windows` is for SSIM, made in the same way.
 """
