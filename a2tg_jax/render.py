@@ -142,12 +142,7 @@ def render_traced(
       tap: [N, 4] zeros, at which the gradient is the absolute positional gradient (`compositor.composite`).
     """
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    degree = settings.sh_degree if sh_degree is None else sh_degree
-    splats, cutoff = _project(gaussians, camera, rule, settings, degree, num_live)
     compositor = choose(settings.compositor, settings.tile_size)
-    list_tiles = native.tile_lists if compositor == "native" else tile_lists
-    M = jax.lax.stop_gradient(splats.M)
-    lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     how = Compositing(
         grid=grid,
         near_plane=settings.near_plane,
@@ -156,6 +151,16 @@ def render_traced(
         compositor=compositor,
         tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
     )
+    if gaussians.num == 0:
+        dtype = background.dtype
+        channels = jnp.zeros((how.num_channels, grid.height, grid.width), dtype)
+        transmittance = jnp.ones((grid.height, grid.width), dtype)
+        return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros(())
+    degree = settings.sh_degree if sh_degree is None else sh_degree
+    splats, cutoff = _project(gaussians, camera, rule, settings, degree, num_live)
+    list_tiles = native.tile_lists if compositor == "native" else tile_lists
+    M = jax.lax.stop_gradient(splats.M)
+    lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
     channels, transmittance = composite(how, splats, rule, lists, jacobian, tap)
@@ -200,13 +205,15 @@ def capacity_for(pairs: int) -> int:
 def appearance_of(
     gaussians: Gaussians, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
 ) -> AppearanceRule:
-    """The rule for textures, or plain 2DGS where there are none."""
+    """The rule for textures, or plain 2DGS where there are none, or no Gaussians."""
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is None or layout is None:
         return PlainAppearance()
     if layout.num != gaussians.num:
         raise ValueError(f"layout is of {layout.num} textures, but there are {gaussians.num} gaussians")
+    if gaussians.num == 0:
+        return PlainAppearance()
     return textured_appearance(textures, layout, settings.texture)
 
 

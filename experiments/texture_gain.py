@@ -59,7 +59,7 @@ def run_one(scene, num: int, seed: int, args: argparse.Namespace) -> dict:
         "textured": a2tg_jax.fit_stage2(scene, first.gaussians, config, progress=False),
     }
     name = f"{scene.name}-{num}-{seed}"
-    row = {phase: measure(scene, result, f"{name}-{phase}", args) for phase, result in results.items()}
+    row: dict = {phase: measure(scene, result, f"{name}-{phase}", args) for phase, result in results.items()}
     row["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     return row
 

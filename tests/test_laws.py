@@ -26,6 +26,7 @@ from a2tg_jax import (
     RenderOutput,
     RenderSettings,
     allocate_textures,
+    init_from_points,
     parameter_bytes,
     plan_render,
     render_image,
@@ -238,3 +239,20 @@ def test_a_rule_reports_the_bytes_of_its_textures():
     rule = appearance_of(gaussians, textures, layout, RenderSettings())
     assert rule.num_bytes == parameter_bytes(gaussians, layout) - 232 * gaussians.num
     assert appearance_of(gaussians, None, None, RenderSettings()).num_bytes == 0
+
+
+@pytest.mark.parametrize("compositor", ["native", "xla"])
+@pytest.mark.parametrize("has_textures", [False, True])
+def test_no_gaussians_show_the_background(compositor, has_textures):
+    nothing = init_from_points([[0, 0, 1], [0, 0, 2]], np.zeros((2, 3)))[:0]
+    textures = allocate_textures(np.zeros((0, 2), np.int64)) if has_textures else (None, None)
+    camera = Camera(jnp.eye(4), jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 17, 13)
+    settings = RenderSettings(compositor=compositor)
+
+    def draw(gaussians):
+        return render_image(gaussians, camera, *textures, background=(0.1, 0.2, 0.3), settings=settings)
+
+    output = draw(nothing)
+    np.testing.assert_array_equal(output.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (13, 17, 3)))
+    assert not output.alpha.any() and not output.overflow
+    assert jax.grad(lambda gaussians: draw(gaussians).color.sum())(nothing).sh.shape == (0, 16, 3)

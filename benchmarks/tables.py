@@ -1,0 +1,191 @@
+"""The tables of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
+
+    python -m benchmarks.tables benchmarks/results/cpu.json docs/performance.md
+
+replaces what stands between `<!-- NAME -->` and `<!-- end -->` in the document by the table of that name.
+"""
+
+import json
+import pathlib
+import re
+import sys
+from collections.abc import Iterable, Sequence
+
+TEXTURES = {"none": "none", "mixed": "mixed", "4x4": "all 4×4", "16x16": "all 16×16"}
+STAGES = (
+    "tile lists",
+    "projection, forward and backward",
+    "compositing",
+    "compositing, forward and backward",
+    "loss, value and gradient",
+    "Adam",
+)
+
+
+def main() -> None:
+    report, document = json.loads(pathlib.Path(sys.argv[1]).read_text()), pathlib.Path(sys.argv[2])
+    text = document.read_text()
+    for name, make in TABLES.items():
+        parts = re.split(f"(?<=<!-- {name} -->\n)(?:.*?)(?=<!-- end -->)", text, flags=re.DOTALL)
+        if len(parts) != 2:
+            sys.exit(f"{document} has no place for the table {name!r}: <!-- {name} --> and, below, <!-- end -->")
+        text = make(report).join(parts)
+    document.write_text(text)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def ms(figure: dict) -> str:
+    """A time in milliseconds, two or three digits of it."""
+    value = figure["ms"]
+    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+
+
+def size(case: dict) -> str:
+    return f"{case['width']}×{case['height']}"
+
+
+def measured(cases: Iterable[dict]) -> list[dict]:
+    return [case for case in cases if "failed" not in case]
+
+
+def pairs_of_threads(cases: Iterable[dict]) -> list[dict[int, dict]]:
+    """Cases that differ in nothing but the threads, by threads."""
+    groups: dict[tuple, dict[int, dict]] = {}
+    for case in measured(cases):
+        key = (case["width"], case["num"], case["textures"])
+        groups.setdefault(key, {})[case["threads"]] = case
+    return list(groups.values())
+
+
+def machine(report: dict) -> str:
+    found = report["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    return (
+        f"Figures of {found['date']}, commit {found['commit']}: {found['processor']}, {found['cores']} cores; "
+        f"Python {found['python']}, {versions}.\n"
+    )
+
+
+def render(report: dict) -> str:
+    most = report["machine"]["cores"]
+    head = ["N", "image", "textures"]
+    head += [f"{which}, {threads} thr." for threads in ("1", str(most)) for which in ("forward", "+ backward")]
+    rows = []
+    for by_threads in pairs_of_threads([*report["render"], *report["pixels"]]):
+        case = by_threads[most]
+        columns = [by_threads.get(threads) for threads in (1, most)]
+        times = [ms(one[which]) if one else "–" for one in columns for which in ("forward", "both")]
+        pairs = case["composited_pairs"]
+        alone = by_threads.get(1)
+        per_pair = f"{alone['both']['ms'] * 1e6 / pairs:.0f}" if alone else "–"
+        name = TEXTURES[case["textures"]]
+        rows.append([f"{case['num']:,}", size(case), name, *times, f"{pairs / 1e6:.1f}", per_pair])
+    return table([*head, "composited", "ns per pair"], rows)
+
+
+def growth(report: dict) -> str:
+    head = ["threads", "pass", "a, ms", "b, ns per Gaussian", "c, ns per pair", "cases", "largest error of the fit"]
+    names = {"forward": "forward", "both": "forward + backward"}
+    rows = [
+        [
+            str(fit["threads"]),
+            names[fit["which"]],
+            f"{fit['ms']:.1f}",
+            f"{fit['ns_per_gaussian']:.0f}",
+            f"{fit['ns_per_composited_pair']:.1f}",
+            str(fit["num_cases"]),
+            f"{100 * fit['largest_relative_error']:.0f} %",
+        ]
+        for fit in report["growth"]
+    ]
+    return table(head, rows)
+
+
+def stages(report: dict) -> str:
+    cases = measured(report["stages"])
+    head = [f"{c['num'] // 1000}k, {TEXTURES[c['textures']]}, {c['threads']} thr." for c in cases]
+    return table(["stage", *head], ([name, *(ms(case[name]) for case in cases)] for name in STAGES))
+
+
+def limit(report: dict) -> str:
+    head = ["N", "image", "threads", "evaluated", "limit forward", "ratio", "limit forward + backward", "ratio"]
+    least = {
+        (which, case["threads"]): case["limit"]["ms"] / case["pairs"]
+        for which, cases in report["limit"].items()
+        for case in cases
+    }
+    evaluated = {(c["num"], c["width"]): c["evaluated_pairs"] for c in measured(report["stages"])}
+    rows = []
+    for case in measured(report["render"]):
+        pairs = evaluated.get((case["num"], case["width"]))
+        if pairs is None or case["textures"] != "none":
+            continue
+        row = [f"{case['num']:,}", size(case), str(case["threads"]), f"{pairs / 1e6:.1f}"]
+        for which in ("forward", "both"):
+            best = least[which, case["threads"]] * pairs
+            row += [ms({"ms": best}), f"{case[which]['ms'] / best:.1f}"]
+        rows.append(row)
+    return table(head, rows)
+
+
+def others(report: dict) -> str:
+    names = {"render": "this library", "mitsuba": "Mitsuba 3 `volprim_rf_basic`"}
+    rows = (
+        [names.get(c["case"], c["case"]), f"{c['num']:,}", size(c), ms(c["forward"]), ms(c["both"])]
+        for c in measured(report["others"])
+    )
+    return table(["program", "N", "image", "forward", "forward + backward"], rows)
+
+
+def compositors(report: dict) -> str:
+    rows = []
+    for case in measured(report["compositors"]):
+        name = "XLA" if case.get("compositor") == "xla" else f"native, tiles of {case['tile_size']}"
+        rows.append([TEXTURES[case["textures"]], name, ms(case["forward"]), ms(case["both"])])
+    return table(["textures", "compositor", "forward", "forward + backward"], rows)
+
+
+def full_size(report: dict) -> str:
+    rows = (
+        [f"{c['num']:,}", size(c), TEXTURES[c["textures"]], ms(c["forward"]), ms(c["both"]), f"{c['peak_mb']:.0f}"]
+        for c in measured(report["full_size"])
+    )
+    return table(["N", "image", "textures", "forward", "forward + backward", "peak memory, MB"], rows)
+
+
+def training(report: dict) -> str:
+    head = ["image", "Gaussians", "stage 1", "stage 2, untextured", "stage 2, textured", "peak memory, MB", "again"]
+    cases = measured(report["training"])
+    warm = {(c["downscale"], c["num"]): c for c in cases if c["cache"] == "warm"}
+    rows = []
+    for case in cases:
+        again = warm.get((case["downscale"], case["num"]))
+        if case["cache"] == "cold" and again:
+            steps = [ms({"ms": again[name]}) for name in ("stage1_ms", "untextured_ms", "textured_ms")]
+            width, height = case["image"]
+            peaks = [f"{one['peak_mb']:.0f}" for one in (case, again)]
+            rows.append([f"{width}×{height}", f"{case['num_live']:,}", *steps, *peaks])
+    return table(head, rows)
+
+
+def trained(report: dict) -> str:
+    rows = []
+    for case in measured(report["trained"]):
+        pairs = f"{case['composited_pairs'] / 1e6:.1f}"
+        name = TEXTURES.get(case["textures"], case["textures"])
+        rows.append([size(case), name, ms(case["forward"]), ms(case["both"]), pairs])
+    return table(["image", "textures", "forward", "forward + backward", "composited"], rows)
+
+
+TABLES = {
+    function.__name__: function
+    for function in (machine, render, growth, stages, limit, others, compositors, full_size, training, trained)
+}
+
+if __name__ == "__main__":
+    main()
