@@ -25,7 +25,7 @@ class AppearanceRule(Protocol):
 
     @property
     def params(self) -> Array:
-        """[T, C] the differentiable parameters; T >= 1."""
+        """[T, C] the differentiable parameters; T >= 1, and C >= 1 where there are images."""
         ...
 
     @property

@@ -42,8 +42,11 @@ class Sample(NamedTuple):
 
 def taps(image: Image, x: Array, y: Array) -> tuple[Tap, ...]:
     """The texels above left, above right, below left and below right of (x, y)."""
-    left, top = (jnp.floor(place).astype(jnp.int32) for place in (x, y))
-    right, bottom = jnp.minimum(left + 1, image.width - 1), jnp.minimum(top + 1, image.height - 1)
+    right_most, bottom_most = image.width - 1, image.height - 1
+    # Whatever x and y are, nothing outside of the image is read.
+    left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
+    top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
+    right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
     above, below = image.first + top * image.width, image.first + bottom * image.width
     fx, fy = x - left.astype(x.dtype), y - top.astype(y.dtype)
     gx, gy = 1 - fx, 1 - fy

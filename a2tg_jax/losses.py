@@ -66,7 +66,8 @@ def ssim(image: Array, target: Array) -> Array:
     if has_native():
         from a2tg_jax.kernels import windows
 
-        if x.dtype == y.dtype and x.shape[2] >= windows.least_width(x.dtype, SSIM_WINDOW):
+        is_supported = x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64)
+        if is_supported and x.shape[2] >= windows.least_width(x.dtype, SSIM_WINDOW):
             return windows.mean_score(windows.Score(_similarity, SSIM_TAPS), x, y)
     # The target's own mean is blurred apart, so that no gradient is computed for it. The two second moments enter
     # SSIM only through their sum: four blurs instead of five.

@@ -37,7 +37,7 @@ class RenderSettings:
     tile_size: int = 8
     """Side of a tile in pixels; the image does not depend on it."""
     near_plane: float = 0.2
-    """Splats and hits nearer than this do not show."""
+    """Splats and hits nearer than this do not show; positive."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
@@ -48,6 +48,10 @@ class RenderSettings:
     """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had."""
     tile_batch: int | None = None
     """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
+
+    def __post_init__(self) -> None:
+        if not self.near_plane > 0:
+            raise ValueError(f"near_plane must be positive; got {self.near_plane}")
 
     @staticmethod
     def official() -> "RenderSettings":
@@ -155,9 +159,9 @@ def render_traced(
         dtype = background.dtype
         channels = jnp.zeros((how.num_channels, grid.height, grid.width), dtype)
         transmittance = jnp.ones((grid.height, grid.width), dtype)
-        return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros(())
+        return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
-    splats, cutoff = _project(gaussians, camera, rule, settings, degree, num_live)
+    splats, cutoff = project_gaussians(gaussians, camera, rule, settings, degree, num_live)
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
     M = jax.lax.stop_gradient(splats.M)
     lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
@@ -265,8 +269,8 @@ def _tile_batch(settings: RenderSettings) -> int:
     return settings.tile_batch
 
 
-def _project(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
-    """The splats, and the squared distance within which each shows; not positive where it shows nowhere."""
+def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
+    """The N splats, and [N] the squared distance within which each shows; not positive where it shows nowhere."""
     M, normals = homographies(gaussians, camera)
     opacities = gaussians.opacities
     is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)

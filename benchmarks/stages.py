@@ -9,7 +9,7 @@ import a2tg_jax
 from a2tg_jax.compositor import Compositing, composite
 from a2tg_jax.kernels import native
 from a2tg_jax.optim import adam_init, adam_update
-from a2tg_jax.render import _project, appearance_of
+from a2tg_jax.render import appearance_of, project_gaussians
 from a2tg_jax.tiles import TileGrid
 from benchmarks import timing
 from benchmarks.workload import random_scene, random_textures
@@ -25,7 +25,7 @@ def measure_stages(case: dict) -> dict:
     settings = a2tg_jax.plan_render(gaussians, camera, textures, layout)
     capacity = settings.capacity or 0
     rule, grid = appearance_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
-    project = jax.jit(lambda gaussians: _project(gaussians, camera, rule, settings, 3, None))
+    project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, rule, settings, 3, None))
     splats, cutoff = project(gaussians)
     find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)

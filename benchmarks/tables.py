@@ -9,7 +9,7 @@ import json
 import pathlib
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 TEXTURES = {"none": "none", "mixed": "mixed", "4x4": "all 4×4", "16x16": "all 16×16"}
 STAGES = (
@@ -25,7 +25,11 @@ STAGES = (
 def main() -> None:
     report, document = json.loads(pathlib.Path(sys.argv[1]).read_text()), pathlib.Path(sys.argv[2])
     text = document.read_text()
-    for name, make in TABLES.items():
+    for name, (make, sections) in TABLES.items():
+        missing = [section for section in sections if not report.get(section)]
+        if missing:
+            print(f"the table {name!r} stays as it is: {sys.argv[1]} has no {' and no '.join(missing)}")
+            continue
         parts = re.split(f"(?<=<!-- {name} -->\n)(?:.*?)(?=<!-- end -->)", text, flags=re.DOTALL)
         if len(parts) != 2:
             sys.exit(f"{document} has no place for the table {name!r}: <!-- {name} --> and, below, <!-- end -->")
@@ -58,7 +62,7 @@ def pairs_of_threads(cases: Iterable[dict]) -> list[dict[int, dict]]:
     groups: dict[tuple, dict[int, dict]] = {}
     for case in measured(cases):
         key = (case["width"], case["num"], case["textures"])
-        groups.setdefault(key, {})[case["threads"]] = case
+        groups.setdefault(key, {}).setdefault(case["threads"], case)
     return list(groups.values())
 
 
@@ -77,7 +81,7 @@ def render(report: dict) -> str:
     head += [f"{which}, {threads} thr." for threads in ("1", str(most)) for which in ("forward", "+ backward")]
     rows = []
     for by_threads in pairs_of_threads([*report["render"], *report["pixels"]]):
-        case = by_threads[most]
+        case = next(iter(by_threads.values()))
         columns = [by_threads.get(threads) for threads in (1, most)]
         times = [ms(one[which]) if one else "–" for one in columns for which in ("forward", "both")]
         pairs = case["composited_pairs"]
@@ -182,10 +186,19 @@ def trained(report: dict) -> str:
     return table(["image", "textures", "forward", "forward + backward", "composited"], rows)
 
 
-TABLES = {
-    function.__name__: function
-    for function in (machine, render, growth, stages, limit, others, compositors, full_size, training, trained)
+TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
+    "machine": (machine, ("machine",)),
+    "render": (render, ("render", "pixels")),
+    "growth": (growth, ("growth",)),
+    "stages": (stages, ("stages",)),
+    "limit": (limit, ("limit", "render", "stages")),
+    "others": (others, ("others",)),
+    "compositors": (compositors, ("compositors",)),
+    "full_size": (full_size, ("full_size",)),
+    "training": (training, ("training",)),
+    "trained": (trained, ("trained",)),
 }
+"""Each with the sections of the report that it needs."""
 
 if __name__ == "__main__":
     main()

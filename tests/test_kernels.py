@@ -76,17 +76,19 @@ def test_an_error_in_a_handler_reaches_the_caller(capsys):
     def handler(arguments, results):
         raise ValueError(f"refused {arguments[0].tolist()}")
 
-    foreign.register("a2tg_test_error", handler)
+    name = foreign.registered("test error", None, lambda: handler)
     x = jnp.arange(3, dtype=jnp.float32)
     with pytest.raises(Exception, match=r"refused \[0\.0, 1\.0, 2\.0\]"):
-        jax.block_until_ready(jax.ffi.ffi_call("a2tg_test_error", jax.ShapeDtypeStruct((3,), jnp.float32))(x))
+        jax.block_until_ready(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))(x))
     assert "ValueError: refused" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("tile_size", [8, 16])
-def test_lists_are_those_of_xla(tile_size, dtype):
+def test_lists_are_those_of_xla(monkeypatch, tile_size, dtype):
+    monkeypatch.setattr(native, "SPLATS_PER_THREAD", 100)
+    monkeypatch.setattr(threads, "num_threads", lambda: 2)
     scene = draw_scene(4, num=300)
     gaussians, camera = as_gaussians(scene, dtype), as_camera(scene, dtype)
     M, _ = homographies(gaussians, camera)

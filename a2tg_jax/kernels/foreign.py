@@ -1,8 +1,10 @@
 """Functions on numpy arrays that XLA calls on the CPU, through its foreign function interface (xla/ffi/api/c_api.h)."""
 
 import ctypes
+import hashlib
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Hashable
 
 import jax
 import numpy as np
@@ -78,16 +80,27 @@ class _CallFrame(ctypes.Structure):
 
 
 _Entry = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_CallFrame))
-_entries: dict[str, object] = {}
+_LOCK = threading.RLock()
+_entries: dict[str, tuple[Hashable, object]] = {}
 
 
-def register(name: str, handler: Handler) -> None:
-    """Makes `jax.ffi.ffi_call(name, …)` call `handler` on the CPU; a name that is registered already stays as it is."""
-    if name in _entries:
-        return
-    _entries[name] = entry = _Entry(lambda frame: _enter(frame.contents, handler))
-    address = ctypes.cast(entry, ctypes.c_void_p).value
-    jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
+def registered(description: str, key: Hashable, make_handler: Callable[[], Handler]) -> str:
+    """The name by which `jax.ffi.ffi_call` calls, on the CPU, the handler for a key.
+
+    It is the same in every process for the same description, for XLA's compilation cache; but where another key has the
+    same description, such as a function that was defined anew, it is another one.
+    """
+    name = f"a2tg_{hashlib.sha256(description.encode()).hexdigest()[:20]}"
+    with _LOCK:
+        while name in _entries and _entries[name][0] != key:
+            name += "_"
+        if name not in _entries:
+            handler = make_handler()
+            entry = _Entry(lambda frame: _enter(frame.contents, handler))
+            _entries[name] = key, entry
+            address = ctypes.cast(entry, ctypes.c_void_p).value
+            jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
+    return name
 
 
 def _capsule(address: int | None):

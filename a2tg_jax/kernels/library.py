@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import itertools
 import threading
 
 import llvmlite.binding as llvm
@@ -31,6 +32,14 @@ def vector_bytes() -> int:
     if features.get("avx512f"):
         return 64
     return 32 if features.get("avx") else 16
+
+
+_numbers = itertools.count()
+
+
+def unique(name: str) -> str:
+    """A name for a function that no other function has: all modules share one space of names."""
+    return f"{name}_{next(_numbers)}"
 
 
 def compile_module(module: ir.Module) -> dict[str, int]:

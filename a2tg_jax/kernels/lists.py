@@ -4,9 +4,9 @@
     find(order, rectangles, outlines, counts, tiles, splats; num_splats, columns)
     place(tiles, splats, cursors, ids; num_pairs)
 
-`bound` writes the outlines of the splats `first` to `last`, and which tiles their boxes cover. `find` goes through the
-splats in the given order, front to back, and writes down every pair whose outline touches its tile; `place` moves them
-tile by tile, in the same order.
+`bound` writes the outlines of the splats from `first` up to `last`, and which tiles their boxes cover. `find` goes
+through the splats in the given order, front to back, and writes down every pair whose outline touches its tile; `place`
+moves them tile by tile, in the same order.
 
 Buffers: M [N, 9], cutoff [N], outlines [N, 9], rectangles [N, 4] (x0, y0, columns, count); order [splats], counts
 [tiles]; tiles and splats [pairs]; ids [capacity]; cursors [tiles], where each tile's list begins, and in the end where
@@ -15,7 +15,6 @@ it ends.
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -152,14 +151,11 @@ class ListLoops:
     num_outline: int = NUM_NUMBERS
 
 
-_numbers = itertools.count()
-
-
 @functools.cache
 def list_loops(dtype: str, tile_size: int, near_plane: float) -> ListLoops:
     """The loops for homographies of a dtype and tiles of a size, compiled at the first call."""
-    module, tag = ir.Module("lists"), next(_numbers)
-    bound, find, place = f"bound_{tag}", f"find_{tag}", f"place_{tag}"
+    module = ir.Module("lists")
+    bound, find, place = (library.unique(name) for name in ("bound", "find", "place"))
     _Bound(module, bound, dtype, tile_size, near_plane).write()
     _Find(module, find, dtype, tile_size).write()
     _Place(module, place).write()

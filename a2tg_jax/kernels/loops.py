@@ -1,7 +1,8 @@
 """Native loops over tiles, splats and pixels, around the functions of `pixel`.
 
-One call composites the tiles `first` to `last`. Every splat of a tile's list is prepared once (scalar code), then
-applied to the tile's pixels, L at a time (vector code). Where no pixel of the L can be reached, they are passed over.
+One call composites the tiles from `first` up to `last`. Every splat of a tile's list is prepared once (scalar code),
+then applied to the tile's pixels, L at a time (vector code). Where no pixel of the L can be reached, they are passed
+over.
 
     forward(ids, starts, splats, images, table, result; first, last, columns, width, height)
     backward(ids, starts, splats, images, table, g, behind, jacobian, d_splats, d_table, d_tap; the same)
@@ -13,7 +14,6 @@ d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to.
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from llvmlite import ir
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.functions import Functions, Kind
 from a2tg_jax.kernels.lanes import BOOL, INT, Lanes
-from a2tg_jax.kernels.texels import NativeImage, TexelWriter
+from a2tg_jax.kernels.texels import NativeImage, Place, TexelWriter
 from a2tg_jax.kernels.writer import LONG
 
 INTEGERS = ("first", "last", "columns", "width", "height")
@@ -142,8 +142,8 @@ class _Compositing(TexelWriter):
         return _LoadedSplat(numbers, *spread, as_longs, self.spread(image), self.lanes.splat(limit))
 
     def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
-        """Calls composite(k, x, y, texel, is_live) for every vector k of the tile's pixels that the splat may reach,
-        and that looks at this (x, y) of its image; returns whether a pixel of the tile is still live."""
+        """Calls composite(k, x, y, place, is_live) for every vector k of the tile's pixels that the splat may reach,
+        and that looks at this place of its image; returns whether a pixel of the tile is still live."""
         b, lanes = self.b, self.lanes
         none = lanes.constant(0, INT)
         any_live = self.variable(self.integers)
@@ -154,7 +154,7 @@ class _Compositing(TexelWriter):
             is_live = b.icmp_signed("!=", self.load(self.live, k, self.integers), none)
             is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, splat.limit))
             with b.if_then(lanes.any(is_reached)):
-                composite(k, x, y, texel, is_live)
+                composite(k, x, y, Place(texel[0], texel[1], is_reached) if texel else None, is_live)
             now = self.load(self.live, k, self.integers)
             b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
         return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), none))
@@ -191,8 +191,8 @@ class _Forward(_Compositing):
         """Adds one splat to a tile; returns whether a pixel is still live."""
         splat = self.load_splat(id_, tile_x, tile_y)
 
-        def composite(k, x, y, texel, is_live):
-            values = self.sample(splat.image, *texel, has_slopes=False) if splat.image else []
+        def composite(k, x, y, place, is_live):
+            values = self.sample(splat.image, place, has_slopes=False) if splat.image else []
             state = [self.load(self.light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
             at_pixel = [*splat.planes, *splat.spread, *values, x, y, *state]
             after, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
@@ -248,8 +248,8 @@ class _Backward(_Compositing):
         num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.has_statistic else 0)
         totals = self.zeros(num_sums)
 
-        def composite(k, x, y, texel, is_live):
-            sample = self.sample(splat.image, *texel, has_slopes=True) if splat.image else []
+        def composite(k, x, y, place, is_live):
+            sample = self.sample(splat.image, place, has_slopes=True) if splat.image else []
             state = [self.load(self.light, k, self.reals), is_live, self.load(behind, k, self.reals)]
             cotangents = [self.load(channel, k, self.reals) for channel in g]
             at_pixel = [*splat.planes, *splat.spread, *splat.spread_image, *sample, x, y]
@@ -268,7 +268,7 @@ class _Backward(_Compositing):
                 for total, value in zip(totals, sums, strict=True):
                     b.store(b.fadd(b.load(total, typ=self.reals), chosen(value)), total)
                 if splat.image:
-                    self.add_to_texels(splat.image, *texel, [chosen(value) for value in d_values])
+                    self.add_to_texels(splat.image, place, [chosen(value) for value in d_values])
 
         is_live = self.reached_vectors(splat, composite)
         with b.if_then(b.load(any_contributes, typ=BOOL)):
@@ -294,9 +294,6 @@ class _Backward(_Compositing):
             self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
 
 
-_numbers = itertools.count()
-
-
 @dataclasses.dataclass(frozen=True)
 class Loops:
     """Compiled loops; each releases the GIL."""
@@ -310,8 +307,7 @@ def loops(kind: Kind) -> Loops:
     """The loops of a kind, compiled at the first call."""
     functions = Functions(kind)
     module = ir.Module("loops")
-    tag = next(_numbers)
-    forward, backward = f"forward_{tag}", f"backward_{tag}"
+    forward, backward = (library.unique(name) for name in ("forward", "backward"))
     _Forward(kind, functions, module, forward, FORWARD).write()
     _Backward(kind, functions, module, backward, BACKWARD).write()
     addresses = library.compile_module(module)

@@ -1,13 +1,11 @@
-"""Compositing by native loops on CPUs: what `compositor` does with XLA, faster, on all cores.
+"""Tile lists and compositing by native loops on CPUs: what `tiles` and `compositor` do with XLA, faster, on all cores.
 
 Tiles are dealt to threads in contiguous parts of about as many pairs each. Every thread adds to cotangents of its own,
 which are summed in order: results do not depend on timing, only, in the last bits, on the number of threads.
 """
 
 import functools
-import hashlib
 import itertools
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -20,9 +18,6 @@ from a2tg_jax.kernels import foreign, threads
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists
 
-_LOCK = threading.RLock()
-_names: dict[str, Any] = {}
-"""Whose loops each name stands for."""
 PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
 """Fewer than these are not worth another thread."""
 
@@ -74,10 +69,10 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     """As `tiles.tile_lists`."""
     from a2tg_jax.kernels.lists import list_loops
 
-    dtype = str(M.dtype)
-    name = f"a2tg_lists_{dtype}_{grid.tile_size}_{near_plane}"
-    with _LOCK:
-        foreign.register(name, functools.partial(_list_handler, list_loops(dtype, grid.tile_size, near_plane)))
+    key = str(M.dtype), grid.tile_size, near_plane
+    name = foreign.registered(
+        f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_loops(*key))
+    )
     shapes = (
         jax.ShapeDtypeStruct((capacity,), jnp.int32),
         jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32),
@@ -133,17 +128,11 @@ def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
     return lists.ids, lists.starts, packed, pack_images(rule), params.astype(kind.dtype), size
 
 
-def _registered(kind, which: str, make_handler: Callable) -> str:
-    """The name under which XLA knows the loops of a kind; the same in every process, for its compilation cache, but
-    another one for another rule that looks the same, such as one that was defined anew."""
+def _registered(kind, which: str, make_handler: Callable[[Any], foreign.Handler]) -> str:
+    """The name under which XLA knows the loops of a kind."""
     from a2tg_jax.kernels.loops import loops
 
-    name = f"a2tg_{which}_{hashlib.sha256(repr(kind).encode()).hexdigest()[:16]}"
-    with _LOCK:
-        while _names.setdefault(name, kind) != kind:
-            name += "_"
-        foreign.register(name, make_handler(getattr(loops(kind), which)))
-    return name
+    return foreign.registered(f"{which} {kind!r}", (which, kind), lambda: make_handler(getattr(loops(kind), which)))
 
 
 def _forward_handler(run: Callable) -> foreign.Handler:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from llvmlite import ir
 
-from a2tg_jax.kernels.lanes import FLAGS, INT, Lanes
+from a2tg_jax.kernels.lanes import INT, Lanes
 from a2tg_jax.kernels.writer import LONG, Writer
 
 SMALL_WIDTHS = (1, 2, 4)
@@ -28,6 +28,16 @@ class NativeImage(NamedTuple):
     width: ir.Value
 
 
+class Place(NamedTuple):
+    """Where L lanes look in an image."""
+
+    x: ir.Value
+    """Texel coordinates."""
+    y: ir.Value
+    is_reached: ir.Value
+    """Lanes whose pixel the splat may reach; one at least."""
+
+
 class Line(NamedTuple):
     """A row or a column of texels."""
 
@@ -39,25 +49,26 @@ class Line(NamedTuple):
 
 
 class TexelWriter(Writer):
-    """A function whose buffers "table" and "d_table" are [entries, C]; x and y are texel coordinates of L lanes."""
+    """A function whose buffers "table" and "d_table" are [entries, C]."""
 
     lanes: Lanes
     reals: ir.Type
     num_columns: int
     sums: ir.Value
-    """Cotangents of the texels of a small image per lane, `num_sums`; zero before a splat."""
+    """Cotangents of the texels of a small image per lane, `num_sums` vectors; zero before a splat."""
 
     @property
     def num_sums(self) -> int:
+        """C for every texel of the largest small image."""
         return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
 
-    def sample(self, image: NativeImage, x: ir.Value, y: ir.Value, has_slopes: bool) -> list[ir.Value]:
+    def sample(self, image: NativeImage, place: Place, has_slopes: bool) -> list[ir.Value]:
         """C values; and C slopes along x and C along y, where asked for."""
         count = self.num_columns
         num_slopes = count if has_slopes else 0
         values, along_x, along_y = (self.zeros(num) for num in (count, num_slopes, num_slopes))
         for width in self.cases(image):
-            with self.rows(image, width, y, has_slopes) as row:
+            with self.rows(image, width, place, has_slopes) as row:
                 in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
 
                 def add_texel(column: Line, row=row, in_row=in_row, in_row_along_x=in_row_along_x) -> None:
@@ -66,17 +77,17 @@ class TexelWriter(Writer):
                     self.accumulate(in_row, column.weight, numbers)
                     self.accumulate(in_row_along_x, column.slope, numbers)
 
-                self.each_column(image, width, x, has_slopes, add_texel)
+                self.each_column(image, width, place, has_slopes, add_texel)
                 numbers = self.loads(in_row)
                 self.accumulate(values, row.weight, numbers)
                 self.accumulate(along_y, row.slope, numbers)
                 self.accumulate(along_x, row.weight, self.loads(in_row_along_x))
         return self.loads([*values, *along_x, *along_y])
 
-    def add_to_texels(self, image: NativeImage, x: ir.Value, y: ir.Value, d_values: Sequence[ir.Value]) -> None:
+    def add_to_texels(self, image: NativeImage, place: Place, d_values: Sequence[ir.Value]) -> None:
         """Adds the cotangents of C values, which are zero in lanes that do not count; `finish_texels` completes it."""
         for width in self.cases(image):
-            with self.rows(image, width, y, False) as row:
+            with self.rows(image, width, place, False) as row:
                 in_row = [self.product(row.weight, d_value) for d_value in d_values]
 
                 def add_texel(column: Line, width=width, row=row, in_row=in_row) -> None:
@@ -84,12 +95,12 @@ class TexelWriter(Writer):
                     if width is None:
                         self.add_sums(self.texel("d_table", image, column, row), addends)
                         return
-                    place = self.b.add(self.times(row.index, width), column.index)
+                    texel = self.b.add(self.times(row.index, width), column.index)
                     for k, addend in enumerate(addends):
-                        index = self.b.add(self.times(place, self.num_columns), LONG(k))
+                        index = self.b.add(self.times(texel, self.num_columns), LONG(k))
                         self.store(self.b.fadd(self.load(self.sums, index, self.reals), addend), self.sums, index)
 
-                self.each_column(image, width, x, False, add_texel)
+                self.each_column(image, width, place, False, add_texel)
 
     def finish_texels(self, image: NativeImage) -> None:
         """Adds what the lanes have summed of a small image to the cotangents of the table."""
@@ -124,37 +135,45 @@ class TexelWriter(Writer):
         b.position_at_end(end)
 
     @contextlib.contextmanager
-    def rows(self, image: NativeImage, width: int | None, y: ir.Value, has_slope: bool) -> Iterator[Line]:
+    def rows(self, image: NativeImage, width: int | None, place: Place, has_slope: bool) -> Iterator[Line]:
         """A loop over the rows that may be seen; all of them, where the width is that of a small image."""
-        span = self.seen(y, image.height) if width is None else (LONG(0), image.height)
+        if width is None:
+            span, y = self.seen(place.y, place.is_reached, image.height)
+        else:
+            span, y = (LONG(0), image.height), place.y
         with self.loop(*span) as (index, _):
             yield self.line(index, y, image.height, has_slope)
 
     def each_column(
-        self, image: NativeImage, width: int | None, x: ir.Value, has_slope: bool, visit: Callable[[Line], None]
+        self, image: NativeImage, width: int | None, place: Place, has_slope: bool, visit: Callable[[Line], None]
     ) -> None:
         """Calls `visit` for the columns that may be seen: in a loop, or unrolled for a small image."""
         if width is None:
-            with self.loop(*self.seen(x, image.width)) as (index, _):
+            span, x = self.seen(place.x, place.is_reached, image.width)
+            with self.loop(*span) as (index, _):
                 visit(self.line(index, x, image.width, has_slope))
         elif width == 1:
             visit(Line(LONG(0), self.lanes.constant(1.0, self.real), None))
         else:
             for index in range(width):
-                visit(self.line(LONG(index), x, LONG(width), has_slope))
+                visit(self.line(LONG(index), place.x, LONG(width), has_slope))
 
-    def seen(self, places: ir.Value, size: ir.Value) -> tuple[ir.Value, ir.Value]:
-        """The first texel along an axis that a lane sees, and the one after the last."""
-        return tuple(  # type: ignore[return-value]
-            # Whatever a lane holds, nothing outside of the image is read.
-            self.clamp(self.b.add(self.b.fptosi(place, LONG), LONG(more)), size)
-            for place, more in ((self.lanes.smallest(places), 0), (self.lanes.largest(places), 2))
-        )
-
-    def clamp(self, index: ir.Value, most: ir.Value) -> ir.Value:
-        """An index held in [0, most]."""
-        index = self.b.select(self.b.icmp_signed("<", index, LONG(0)), LONG(0), index)
-        return self.b.select(self.b.icmp_signed(">", index, most), most, index)
+    def seen(
+        self, places: ir.Value, is_reached: ir.Value, size: ir.Value
+    ) -> tuple[tuple[ir.Value, ir.Value], ir.Value]:
+        """The first texel along an axis that a reached lane sees, and the one after the last; and the places, those of
+        other lanes moved between the reached ones."""
+        b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
+        most = self.lanes.splat(b.sitofp(b.sub(size, LONG(1)), self.real))
+        # Whatever a lane holds, even if it is no number, nothing outside of the image is read.
+        places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
+        places = b.select(b.fcmp_ordered("<", places, most), places, most)
+        least = self.lanes.smallest(b.select(is_reached, places, most))
+        largest = self.lanes.largest(b.select(is_reached, places, number(0.0)))
+        end = b.add(b.fptosi(largest, LONG), LONG(2))
+        end = b.select(b.icmp_signed("<", end, size), end, size)
+        moved = self.lanes.smaller(self.lanes.larger(places, self.lanes.splat(least)), self.lanes.splat(largest))
+        return (b.fptosi(least, LONG), end), moved
 
     def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
         """One of `size` texels along an axis, seen from `places`."""
@@ -184,16 +203,13 @@ class TexelWriter(Writer):
         sums = self.sums_over_lanes(vectors)
         self.store(self.b.fadd(self.load(entry, 0, sums.type), sums), entry, 0)
 
-    def product(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        return self.b.fmul(x, y, flags=FLAGS)
-
     def accumulate(self, totals: Sequence[ir.Value], weight: ir.Value | None, numbers: Sequence[ir.Value]) -> None:
         """totals += weight·numbers; a weight of None is zero."""
         if weight is None:
             return
         for total, number in zip(totals, numbers, strict=True):
             before = self.b.load(total, typ=self.reals)
-            self.b.store(self.b.fadd(before, self.product(weight, number), flags=FLAGS), total)
+            self.b.store(self.sum(before, self.product(weight, number)), total)
 
     def zeros(self, num: int) -> list[ir.Value]:
         """Variables, one vector each, set to zero here."""

@@ -17,14 +17,14 @@ def num_threads() -> int:
     return os.cpu_count() or 1
 
 
-def even_spans(num: int, least: int) -> list[Span]:
-    """0..num in one span per thread that has at least so many items; at least one span."""
-    count = max(1, min(num_threads(), num // least))
+def even_spans(num: int, least_items: int) -> list[Span]:
+    """0..num in one span for each thread that gets at least so many items; at least one span."""
+    count = max(1, min(num_threads(), num // max(1, least_items)))
     return list(itertools.pairwise(num * k // count for k in range(count + 1)))
 
 
 def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> None:
-    """work(first, last, index) for every span, each on a thread of its own, the first one on this."""
+    """work(first, last, index) for every span, the first one on this thread, the others on the pool's."""
     others: list[concurrent.futures.Future] = []
     try:
         for index, span in enumerate(spans[1:], start=1):

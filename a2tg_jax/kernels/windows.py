@@ -3,8 +3,8 @@
     score(x, y, sums, d_means, rows; first, last, height, width)
     pull_back(x, y, d_mean, d_squares, d_product, share, d_x, rows; first, last, channels, height, width)
 
-Windows are separable; their T taps go down the columns first, then along the row. `score` does the rows `first` to
-`last` of windows, counted through all channels, `pull_back` those of pixels.
+Windows are separable; their T taps go down the columns first, then along the row. `score` does the rows from `first`
+up to `last` of windows, counted through all channels, `pull_back` those of pixels.
 
 Buffers: x, y and d_x [C, height, width]; sums [C·down] of the scores of a row of down × across windows; d_means
 [4, C, down + 2·(T − 1), across] their derivatives by each mean, between margins of zeros; d_mean, d_squares and
@@ -14,8 +14,6 @@ d_product three of these; share [1] what each score counts; rows for the columns
 import contextlib
 import dataclasses
 import functools
-import hashlib
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -26,7 +24,7 @@ from jax import Array
 from llvmlite import ir
 
 from a2tg_jax.kernels import foreign, library, threads
-from a2tg_jax.kernels.lanes import FLAGS, INT, Lanes, trace
+from a2tg_jax.kernels.lanes import INT, Lanes, trace
 from a2tg_jax.kernels.writer import LONG, Writer
 
 SCORE = ("x", "y", "sums", "d_means", "rows")
@@ -52,7 +50,7 @@ def least_width(dtype, num_taps: int) -> int:
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def mean_score(how: Score, x: Array, y: Array) -> Array:
-    """The average over all windows of images [C, H, W], which are at least `least_width` wide."""
+    """The average over all windows of images [C, H, W], float32 or float64, which are at least `least_width` wide."""
     return _score(how, x, y)[0]
 
 
@@ -90,11 +88,9 @@ mean_score.defvjp(_score_forward, _score_backward)
 
 
 def _registered(how: Score, dtype: str, which: str, handler: Callable) -> str:
-    function = how.function
-    described = f"{function.__module__}.{function.__qualname__} {how.taps}"
-    name = f"a2tg_{which}_{dtype}_{hashlib.sha256(described.encode()).hexdigest()[:16]}"
-    foreign.register(name, functools.partial(handler, getattr(_loops(how, dtype), which), len(how.taps) - 1))
-    return name
+    function = getattr(how.function, "__qualname__", type(how.function).__name__)
+    make_handler = lambda: functools.partial(handler, getattr(_loops(how, dtype), which), len(how.taps) - 1)  # noqa: E731
+    return foreign.registered(f"{which} {dtype} {function} {how.taps}", (which, dtype, how), make_handler)
 
 
 def _score_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
@@ -122,6 +118,7 @@ def _pull_back_handler(run: Any, margin: int, arguments: list[np.ndarray], resul
 
 
 def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: int) -> None:
+    """part(first, last, _) for all rows, on as many threads as the pixels are worth."""
     threads.run_spans(part, threads.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
 
 
@@ -156,12 +153,6 @@ class _Rows(Writer):
     def vector(self, base: ir.Value, index: ir.Value) -> ir.Value:
         """L numbers of an array from an index on."""
         return self.load(self.at(base, index, self.real), 0, self.reals)
-
-    def product(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        return self.b.fmul(x, y, flags=FLAGS)
-
-    def sum(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        return self.b.fadd(x, y, flags=FLAGS)
 
     def weighed(self, numbers: Sequence[ir.Value], taps: Sequence[float]) -> ir.Value:
         """Σ taps·numbers."""
@@ -230,9 +221,6 @@ class _PullBackRows(_Rows):
         b.ret_void()
 
 
-_numbers = itertools.count()
-
-
 @dataclasses.dataclass(frozen=True)
 class _Loops:
     """Compiled loops; each releases the GIL."""
@@ -243,8 +231,8 @@ class _Loops:
 
 @functools.cache
 def _loops(how: Score, dtype: str) -> _Loops:
-    module, tag = ir.Module("windows"), next(_numbers)
-    score, pull_back = f"score_{tag}", f"pull_back_{tag}"
+    module = ir.Module("windows")
+    score, pull_back = (library.unique(name) for name in ("score", "pull_back"))
     _ScoreRows(module, score, SCORE, how, dtype).write(dtype)
     _PullBackRows(module, pull_back, PULL_BACK, how, dtype).write()
     addresses = library.compile_module(module)

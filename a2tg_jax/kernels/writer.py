@@ -7,7 +7,7 @@ import numpy as np
 from llvmlite import ir
 
 from a2tg_jax.kernels import library
-from a2tg_jax.kernels.lanes import INT, scalar_type
+from a2tg_jax.kernels.lanes import FLAGS, INT, scalar_type
 
 LONG = ir.IntType(64)
 POINTER = ir.PointerType()
@@ -46,6 +46,12 @@ class Writer:
         index = LONG(index) if isinstance(index, int) else index
         alignment = 4 if value.type == INT else self.alignment
         self.b.store(value, self.at(base, index, value.type), align=alignment)
+
+    def product(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        return self.b.fmul(x, y, flags=FLAGS)
+
+    def sum(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        return self.b.fadd(x, y, flags=FLAGS)
 
     def long(self, value: ir.Value) -> ir.Value:
         return self.b.sext(value, LONG)
