@@ -88,7 +88,8 @@ def test_an_error_in_a_handler_reaches_the_caller(capsys):
 @pytest.mark.parametrize("tile_size", [8, 16])
 def test_lists_are_those_of_xla(monkeypatch, tile_size, dtype):
     monkeypatch.setattr(native, "SPLATS_PER_THREAD", 100)
-    monkeypatch.setattr(threads, "num_threads", lambda: 2)
+    monkeypatch.setattr(native, "PAIRS_PER_THREAD", 100)
+    monkeypatch.setattr(threads, "num_threads", lambda: 3)
     scene = draw_scene(4, num=300)
     gaussians, camera = as_gaussians(scene, dtype), as_camera(scene, dtype)
     M, _ = homographies(gaussians, camera)

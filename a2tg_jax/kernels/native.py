@@ -102,11 +102,25 @@ def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray])
     if overflow:
         return
     order = _depth_order(M[:, 2, 2], np.flatnonzero(rectangles[:, 3]))
-    counts, (tiles, splats) = np.zeros(len(starts), np.int32), np.empty((2, max(1, room)), np.int32)
-    loops.find(*address(order, rectangles, outlines, counts, tiles, splats), len(order), columns)
-    np.cumsum(counts[:-1], out=starts[1:])
-    cursors = starts[:-1].copy()
-    loops.place(*address(tiles, splats, cursors, ids), int(starts[-1]))
+    # Every thread lists the pairs of a range of splats, and moves them behind those of the ranges in front of it.
+    begins = np.concatenate([[0], np.cumsum(rectangles[order, 3], dtype=np.int64)])
+    spans = _parts(begins)
+    counts = np.zeros((len(spans), len(starts) - 1), np.int32)
+    tiles, splats = np.empty((2, max(1, room)), np.int32)
+
+    def find(first: int, last: int, index: int) -> None:
+        found = tiles[begins[first] :], splats[begins[first] :]
+        loops.find(*address(order[first:], rectangles, outlines, counts[index], *found), last - first, columns)
+
+    threads.run_spans(find, spans)
+    np.cumsum(counts.sum(axis=0), out=starts[1:])
+    cursors = starts[:-1] + np.cumsum(counts, axis=0, dtype=np.int32) - counts
+
+    def place(first: int, _: int, index: int) -> None:
+        found = tiles[begins[first] :], splats[begins[first] :]
+        loops.place(*address(*found, cursors[index], ids), int(counts[index].sum()))
+
+    threads.run_spans(place, spans)
 
 
 def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
@@ -172,10 +186,13 @@ def _backward_handler(run: Callable) -> foreign.Handler:
 
 
 def _parts(starts: np.ndarray) -> list[threads.Span]:
-    """Ranges of tiles with about as many pairs (and tiles) each, one per thread that is worth starting."""
-    num_tiles, num_pairs = len(starts) - 1, int(starts[-1])
+    """Ranges of tiles, or of splats, with about as many pairs each, one per thread that is worth starting.
+
+    `starts` [items + 1] is where the pairs of each begin.
+    """
+    num_items, num_pairs = len(starts) - 1, int(starts[-1])
     count = max(1, min(threads.num_threads(), num_pairs // PAIRS_PER_THREAD))
-    work = starts.astype(np.int64) + np.arange(num_tiles + 1)
+    work = starts.astype(np.int64) + np.arange(num_items + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
-    borders = [0, *borders, num_tiles]
+    borders = [0, *borders, num_items]
     return list(itertools.pairwise(borders))
