@@ -288,15 +288,9 @@ def _read(how: Compositing, rule, params: Array, splats: Splats, images: Image |
     return _Read(image, taps, sample)
 
 
-def _show(how: Compositing, rule, splats: Splats, read: _Read | None, values, at, tile: _Tile, log_tap=None):
-    """`pixel.Shown` of a block at a tile's pixels, each [B, P]; entries past the end of the list show nothing.
-
-    `values` are those of the sample, apart, to be differentiated.
-    """
-    hit, num = _hits(how, splats, tile), how.grid.tile_size**2
-    if read is not None:
-        values = pixel.values_at(rule, read.image, read.sample, hit, values)
-    shown = pixel.show(rule, _split(splats, how.has_geometry, num), hit, values, log_tap)
+def _show(how: Compositing, rule, splats: Splats, hit: pixel.Hit, values, at, tile: _Tile, log_tap=None):
+    """`pixel.Shown` of a block at a tile's pixels, each [B, P]; entries past the end of the list show nothing."""
+    shown = pixel.show(rule, _split(splats, how.has_geometry, how.grid.tile_size**2), hit, values, log_tap)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
@@ -314,7 +308,7 @@ def _block(how: Compositing, rule, params: Array, rows, at, tile: _Tile, light, 
     """
     splats, images = rows
     read = _read(how, rule, params, splats, images, tile)
-    shown = _show(how, rule, splats, read, _values(read), at, tile)
+    shown = _show(how, rule, splats, _hits(how, splats, tile), _values(read), at, tile)
 
     def add_splat(carry, alpha):
         weight, light, is_live = pixel.absorb(alpha, *carry)
@@ -339,11 +333,14 @@ def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, 
     """
     splats, images = rows
     read = _read(how, rule, params, splats, images, tile)
+    image, sample = (None, None) if read is None else (read.image, read.sample)
+
+    def of_floats(splats, values, log_tap):
+        hit = _hits(how, splats, tile)
+        return _show(how, rule, splats, hit, pixel.values_at(rule, image, sample, hit, values), at, tile, log_tap)
+
     log_tap = jnp.zeros((BLOCK, light.shape[0]), light.dtype) if how.has_statistic else None
-    shown, pull_back = jax.vjp(
-        lambda splats, values, log_tap: _show(how, rule, splats, read, values, at, tile, log_tap),
-        splats, _values(read), log_tap,
-    )  # fmt: skip
+    shown, pull_back = jax.vjp(of_floats, splats, _values(read), log_tap)
     g = g[:, None]
     seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 

@@ -7,7 +7,6 @@ replaces what stands between `<!-- NAME -->` and `<!-- end -->` in the document 
 
 import json
 import pathlib
-import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 
@@ -30,10 +29,11 @@ def main() -> None:
         if missing:
             print(f"the table {name!r} stays as it is: {sys.argv[1]} has no {' and no '.join(missing)}")
             continue
-        parts = re.split(f"(?<=<!-- {name} -->\n)(?:.*?)(?=<!-- end -->)", text, flags=re.DOTALL)
-        if len(parts) != 2:
+        before, marker, rest = text.partition(f"<!-- {name} -->\n")
+        _, end, after = rest.partition("<!-- end -->")
+        if not end:
             sys.exit(f"{document} has no place for the table {name!r}: <!-- {name} --> and, below, <!-- end -->")
-        text = make(report).join(parts)
+        text = before + marker + make(report) + end + after
     document.write_text(text)
 
 
