@@ -24,6 +24,7 @@ def main() -> None:
     a2tg_jax.configure_cpu(use_cache="cache" in case)
     measures = {
         "render": rendering.measure_render,
+        "ratios": rendering.measure_ratios,
         "stages": stages.measure_stages,
         "limit": limit.measure_limit,
         "training": training.measure_training,

@@ -1,7 +1,13 @@
 """Forward and backward passes of one view."""
 
+import functools
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import a2tg_jax
 from a2tg_jax.render import appearance_of, render_traced
@@ -18,6 +24,27 @@ def measure_render(case: dict) -> dict:
     return measure_view(gaussians, camera, textures, layout, settings)
 
 
+def measure_ratios(case: dict) -> dict:
+    """Textured beside untextured, in turn in one process: what a noisy machine distorts least."""
+    gaussians, camera = random_scene(case["num"], case["width"], case["height"])
+    calls, kinds = {}, ("none", "mixed", "4x4")
+    for kind in kinds:
+        textures, layout = random_textures(case["num"], kind)
+        made = passes(gaussians, camera, textures, layout, a2tg_jax.RenderSettings())
+        for which in ("forward", "both"):
+            calls[kind, which] = functools.partial(getattr(made, which), gaussians, textures)
+    for call in calls.values():
+        jax.block_until_ready(call())
+    times: dict[tuple[str, str], list[float]] = {key: [] for key in calls}
+    for _ in range(case["rounds"]):
+        for key, call in calls.items():
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            times[key].append(time.perf_counter() - start)
+    medians = {key: {"ms": float(np.median(of_call)) * 1e3} for key, of_call in times.items()}
+    return {"renders": [{"textures": k, **{which: medians[k, which] for which in ("forward", "both")}} for k in kinds]}
+
+
 def measure_view(
     gaussians: a2tg_jax.Gaussians,
     camera: a2tg_jax.Camera,
@@ -25,7 +52,29 @@ def measure_view(
     layout: a2tg_jax.AtlasLayout | None,
     settings: a2tg_jax.RenderSettings,
 ) -> dict:
-    """Forward, forward with backward of L1 against a fixed random image, and how many pairs were composited."""
+    """Forward, forward with backward, and how many pairs were composited."""
+    made = passes(gaussians, camera, textures, layout, settings)
+    counts = made.counts(gaussians, textures, jnp.zeros((gaussians.num, 4)))
+    return {
+        "forward": timed(made.forward, gaussians, textures, wait=jax.block_until_ready),
+        "both": timed(made.both, gaussians, textures, wait=jax.block_until_ready),
+        "composited_pairs": float(counts[:, 3].sum()),
+    }
+
+
+class Passes(NamedTuple):
+    """Jitted functions of Gaussians and textures."""
+
+    forward: Callable
+    """The image."""
+    both: Callable
+    """The gradient of L1 against a fixed random image."""
+    counts: Callable
+    """Of a tap, too: its gradient (`compositor.composite`)."""
+
+
+def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSettings) -> Passes:
+    """What is measured of a view."""
     settings = a2tg_jax.plan_render(gaussians, camera, textures, layout, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 
@@ -36,10 +85,5 @@ def measure_view(
     def loss(gaussians, textures, tap=None):
         return jnp.mean(jnp.abs(image(gaussians, textures, tap) - target))
 
-    both = jax.jit(jax.grad(loss, argnums=(0, 1)))
-    figures = {
-        "forward": timed(jax.jit(image), gaussians, textures, wait=jax.block_until_ready),
-        "both": timed(both, gaussians, textures, wait=jax.block_until_ready),
-    }
-    counts = jax.jit(jax.grad(loss, argnums=2))(gaussians, textures, jnp.zeros((gaussians.num, 4)))
-    return {**figures, "composited_pairs": float(counts[:, 3].sum())}
+    both, counts = jax.grad(loss, argnums=(0, 1)), jax.grad(loss, argnums=2)
+    return Passes(jax.jit(image), jax.jit(both), jax.jit(counts))

@@ -92,6 +92,18 @@ def render(report: dict) -> str:
     return table([*head, "composited", "ns per pair"], rows)
 
 
+def ratios(report: dict) -> str:
+    rows = []
+    for case in measured(report["ratios"]):
+        plain = case["renders"][0]
+        for view in case["renders"]:
+            row = [f"{case['num']:,}", size(case), TEXTURES[view["textures"]]]
+            for which in ("forward", "both"):
+                row += [ms(view[which]), f"{view[which]['ms'] / plain[which]['ms']:.2f}"]
+            rows.append(row)
+    return table(["N", "image", "textures", "forward", "ratio", "forward + backward", "ratio"], rows)
+
+
 def growth(report: dict) -> str:
     head = ["threads", "pass", "a, ms", "b, ns per Gaussian", "c, ns per pair", "cases", "largest error of the fit"]
     names = {"forward": "forward", "both": "forward + backward"}
@@ -189,6 +201,7 @@ def trained(report: dict) -> str:
 TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "machine": (machine, ("machine",)),
     "render": (render, ("render", "pixels")),
+    "ratios": (ratios, ("ratios",)),
     "growth": (growth, ("growth",)),
     "stages": (stages, ("stages",)),
     "limit": (limit, ("limit", "render", "stages")),
