@@ -277,11 +277,11 @@ class _Read(NamedTuple):
     """[B, P] each."""
 
 
-def _read(how: Compositing, rule, params: Array, splats: Splats, images: Image | None, tile: _Tile) -> _Read | None:
+def _read(rule, params: Array, images: Image | None, hit: pixel.Hit) -> _Read | None:
     """None where the rule has no images."""
     if images is None:
         return None
-    hit, image = _hits(how, splats, tile), jax.tree.map(lambda x: x[:, None], images)
+    image = jax.tree.map(lambda x: x[:, None], images)
     taps = bilinear.taps(image, *rule.texel(image, hit.u, hit.v))
     texels = params[jnp.stack([tap.entry for tap in taps])]
     sample = bilinear.interpolate(taps, tuple(tuple(jnp.moveaxis(texel, -1, 0)) for texel in texels))
@@ -307,8 +307,8 @@ def _block(how: Compositing, rule, params: Array, rows, at, tile: _Tile, light, 
       Channels added [D, P], and transmittance and live pixels after the block.
     """
     splats, images = rows
-    read = _read(how, rule, params, splats, images, tile)
-    shown = _show(how, rule, splats, _hits(how, splats, tile), _values(read), at, tile)
+    hit = _hits(how, splats, tile)
+    shown = _show(how, rule, splats, hit, _values(_read(rule, params, images, hit)), at, tile)
 
     def add_splat(carry, alpha):
         weight, light, is_live = pixel.absorb(alpha, *carry)
@@ -332,7 +332,7 @@ def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, 
     `behind` [P] is g·(what this block and all behind it add) + g_T·T_final; g is [D, P].
     """
     splats, images = rows
-    read = _read(how, rule, params, splats, images, tile)
+    read = _read(rule, params, images, _hits(how, splats, tile))
     image, sample = (None, None) if read is None else (read.image, read.sample)
 
     def of_floats(splats, values, log_tap):

@@ -51,7 +51,7 @@ def ssim(image: Array, target: Array) -> Array:
       target: [H, W, 3].
 
     Returns:
-      A scalar, at most 1.
+      A scalar, at most 1 up to rounding.
 
     Raises:
       ValueError: if the shapes differ or a side is shorter than the window.

@@ -1,7 +1,8 @@
 """Which splats touch which tile, in depth order, at a fixed capacity.
 
-A pair is one splat in one tile. Pairs are emitted splat by splat in depth order, those whose outline misses the tile
-are dropped, and one stable sort by tile makes the lists. Tiles of P = tile_size² pixels are numbered row by row.
+A pair is one splat in one tile. Pairs are emitted splat by splat in depth order, and those whose outline misses the
+tile are dropped. Here one stable sort by tile makes the lists; `kernels.native` makes the same ones by counting. Tiles
+of P = tile_size² pixels are numbered row by row.
 """
 
 from typing import NamedTuple

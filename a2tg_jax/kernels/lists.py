@@ -148,7 +148,6 @@ class ListLoops:
     bound: Any
     find: Any
     place: Any
-    num_outline: int = NUM_NUMBERS
 
 
 @functools.cache

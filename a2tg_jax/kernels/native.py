@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.geometry import Outline
 from a2tg_jax.kernels import foreign, threads
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists
@@ -89,7 +90,7 @@ def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray])
     ids, starts, total, overflow = results
     columns, width, height = map(int, size)
     num = len(cutoff)
-    outlines, rectangles = np.empty((num, loops.num_outline), M.dtype), np.empty((num, 4), np.int32)
+    outlines, rectangles = np.empty((num, len(Outline._fields)), M.dtype), np.empty((num, 4), np.int32)
     address = lambda *arrays: [array.ctypes.data for array in arrays]  # noqa: E731
 
     def bound(first: int, last: int, _: int) -> None:

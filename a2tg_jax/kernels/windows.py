@@ -1,7 +1,7 @@
 """A score of two images, natively: of every window the means of x, y, x² + y² and x·y, a function of them, its average.
 
-    score(x, y, sums, d_means, rows; first, last, height, width)
-    pull_back(x, y, d_mean, d_squares, d_product, share, d_x, rows; first, last, channels, height, width)
+    score(x, y, sums, d_means, rows; first, last, channels, height, width)
+    pull_back(x, y, d_mean, d_squares, d_product, share, d_x, rows; the same)
 
 Windows are separable; their T taps go down the columns first, then along the row. `score` does the rows from `first`
 up to `last` of windows, counted through all channels, `pull_back` those of pixels.
