@@ -106,7 +106,7 @@ def fit_stage1(
     progress: bool = True,
 ) -> FitResult:
     """Stage 1: plain 2D Gaussians from the scene's points, with MCMC densification. Arguments as in `fit`."""
-    _check(config)
+    check_config(config)
     gaussians, num_live = _allocate(scene, config)
     run = _Stage(scene, config, 1, initial_state(gaussians, num_live, None, False), None, resume)
     run.train(on_checkpoint, checkpoint_every, progress)
@@ -127,7 +127,7 @@ def fit_stage2(
 
     Args as in `fit`; `gaussians` [N] are all live.
     """
-    _check(config)
+    check_config(config)
     textures, layout = None, None
     if config.texture.is_enabled:
         options = texture_options(config)
@@ -317,10 +317,16 @@ def _allocate(scene: Scene, config: TrainConfig) -> tuple[Gaussians, int]:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), initial, empty), num
 
 
-def _check(config: TrainConfig) -> None:
-    """Refuses what cannot be trained before any time is spent."""
+def check_config(config: TrainConfig) -> None:
+    """Refuses what cannot be trained before any time is spent.
+
+    Raises:
+      ValueError: naming the number, what was wanted and what came.
+    """
     if config.stage1_iterations < 1 or config.stage2_iterations < 1:
         raise ValueError("stage1_iterations and stage2_iterations must be at least 1")
+    if config.batch_size < 1:
+        raise ValueError(f"batch_size must be at least 1; got {config.batch_size}")
     if config.densify.cap < 2:
         raise ValueError(f"densify.cap must be at least 2 Gaussians; got {config.densify.cap}")
     if not 0 <= config.sh_degree <= 3:

@@ -14,7 +14,7 @@ from PIL import Image
 from a2tg_jax import cli, startup
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.results import train_run as train_run_module
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.folder import RunFolder, create_run
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -78,8 +78,20 @@ def test_no_scene_makes_no_run_folder(capsys, tmp_path):
 
 def test_used_folder_is_refused(capsys, tmp_path):
     (tmp_path / "photo.jpg").touch()
-    assert "is not empty; add --resume" in fails(capsys, "train", "synthetic", "--out", tmp_path)
+    assert "not a run folder" in fails(capsys, "train", "synthetic", "--out", tmp_path)
+    assert "not a run folder" in fails(capsys, "train", "synthetic", "--out", tmp_path, "--overwrite")
     assert "is not empty" in fails(capsys, "demo", "--out", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [("--texture.select", "budget"), ("--lpips-weights", "nowhere.npz"), ("--batch-size", "0"), ("--downscale", "0")],
+)
+def test_nothing_is_overwritten_before_the_new_run_is_checked(capsys, tmp_path, mistake):
+    run = create_run(tmp_path / "run")
+    run.own(run.report).write_text("old")
+    fails(capsys, "train", "synthetic", "--out", run.path, "--overwrite", *mistake)
+    assert run.report.read_text() == "old"
 
 
 def test_resume_and_overwrite_exclude_each_other(capsys, tmp_path):

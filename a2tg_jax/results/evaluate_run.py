@@ -55,11 +55,11 @@ def evaluate_run(
         for phase, model in models.items()
     }
     result = RunResult(scene.name, record, phases)
-    write_json(run.metrics, metrics_json(result))
-    write_json(run.per_view, per_view_json(result))
+    write_json(run.own(run.metrics), metrics_json(result))
+    write_json(run.own(run.per_view), per_view_json(result))
     _write_figures(run, record, models, scene)
     last = models.get("stage2") or models["stage1"]
-    save_ply(run.point_cloud, last.gaussians, transform=scene.transform)
+    save_ply(run.own(run.point_cloud), last.gaussians, transform=scene.transform)
     views = scene.test or scene.train
     for index in range(len(views)):
         _write_sheet(run, _compare(views, index, result))
@@ -103,17 +103,17 @@ def _measure(model: Model, scene: Scene, config: TrainConfig, seconds: float, lp
 
 def _write_figures(run: RunFolder, record: RunRecord, models: Mapping[Phase, Model], scene: Scene) -> None:
     histories = {phase: read_history(run.history(phase)) for phase in models}
-    save_figure(run.figures / "curves.png", curves_figure(histories))
+    save_figure(run.own(run.figures / "curves.png"), curves_figure(histories))
     textured = models.get("stage2")
     if textured is None or textured.textures is None or textured.layout is None:
         return
-    save_figure(run.figures / "sizes.png", sizes_figure(textured.layout.sizes))
+    save_figure(run.own(run.figures / "sizes.png"), sizes_figure(textured.layout.sizes))
     cameras = [view.camera for view in (*scene.test, *scene.train)]
     colored = colored_by_resolution(textured.gaussians, textured.textures, textured.layout)
     background = background_of(record.config)
     draw = compiled_renderer(cameras, *colored, settings=render_settings(record.config), background=background)
     num_levels = int(texel_levels(textured.layout).max()) + 1
-    save_figure(run.figures / "resolutions.png", resolutions_figure(to_uint8(draw(cameras[0])), num_levels))
+    save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(to_uint8(draw(cameras[0])), num_levels))
 
 
 def _compare(views: tuple[View, ...], index: int, result: RunResult) -> Comparison:
@@ -131,4 +131,4 @@ def _write_sheet(run: RunFolder, comparison: Comparison) -> None:
     """test/NAME.png: photograph, renders, error of the last render."""
     error = error_picture(comparison.images[-1], comparison.images[0])
     sheet = side_by_side([*comparison.images, error], [*comparison.captions, f"error, {ERROR_GAIN} times"])
-    save_picture(run.test / picture_name(comparison.name), sheet)
+    save_picture(run.own(run.test / picture_name(comparison.name)), sheet)

@@ -32,8 +32,8 @@ def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
     for phase in record.phases:
         if not run.model(phase).is_file():
             result = _train_phase(run, phase, scene, record.phase_config(phase), progress)
-            write_history(run.history(phase), result.history)
-            save_model(run.model(phase), Model(result.gaussians, result.textures, result.layout))
+            write_history(run.own(run.history(phase)), result.history)
+            save_model(run.own(run.model(phase)), Model(result.gaussians, result.textures, result.layout))
 
 
 def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config: TrainConfig, progress: bool) -> FitResult:
@@ -42,7 +42,7 @@ def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config: TrainConfig
     num_iterations = config.stage1_iterations if phase == "stage1" else config.stage2_iterations
 
     def keep(checkpoint: Checkpoint) -> None:
-        save_checkpoint(run.checkpoint(phase, checkpoint.iteration), checkpoint)
+        save_checkpoint(run.own(run.checkpoint(phase, checkpoint.iteration)), checkpoint)
         run.drop_old_checkpoints(phase)
 
     if phase == "stage1":
