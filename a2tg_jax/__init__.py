@@ -3,6 +3,7 @@
 from a2tg_jax.adapt import next_sizes as next_sizes
 from a2tg_jax.adapt import reallocate as reallocate
 from a2tg_jax.adapt import select as select
+from a2tg_jax.appearance import TextureOptions as TextureOptions
 from a2tg_jax.cameras import Camera as Camera
 from a2tg_jax.checkpoint import Checkpoint as Checkpoint
 from a2tg_jax.checkpoint import History as History
@@ -23,7 +24,6 @@ from a2tg_jax.gaussians import Gaussians as Gaussians
 from a2tg_jax.gaussians import init_from_points as init_from_points
 from a2tg_jax.io.ply import load_ply as load_ply
 from a2tg_jax.io.ply import save_ply as save_ply
-from a2tg_jax.lookup import TextureOptions as TextureOptions
 from a2tg_jax.losses import photometric_loss as photometric_loss
 from a2tg_jax.mcmc import grow as grow
 from a2tg_jax.mcmc import perturb as perturb

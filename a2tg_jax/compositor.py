@@ -83,7 +83,7 @@ def composite(how: Compositing, splats: Splats, rule: AppearanceRule, lists: Til
       tap: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are Σ_pixels |∂L/∂μ| per component, through
         the Gaussian factor only, column 3 the number of pixels in which the splat was composited.
     """
-    channels, transmittance = _composite_tiles(how, splats, rule.params, rule, lists, jacobian, tap)
+    channels, transmittance = _composite_tiles(how, splats, rule.table, rule, lists, jacobian, tap)
     return _assemble(channels, how.grid), _assemble(transmittance, how.grid)
 
 

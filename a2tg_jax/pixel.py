@@ -134,8 +134,8 @@ def show(
       values: what the splat's image shows there.
       log_tap: zero, added to the exponent of the falloff, to read the gradient there; or None.
     """
-    residual, factor = rule.shade(values, hit.u, hit.v)
-    a = splat.opacity * rule.falloff(hit.rho)
+    residual, factor = rule.shade((), values, hit.u, hit.v)
+    a = splat.opacity * rule.falloff((), hit.rho)
     a = a if factor is None else a * factor
     a = a if log_tap is None else a * jnp.exp(log_tap)
     alpha = jnp.where(a >= MIN_ALPHA, jnp.where(a < MAX_ALPHA, a, MAX_ALPHA), 0.0)

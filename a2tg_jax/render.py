@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule, PlainAppearance
+from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
 from a2tg_jax.cameras import Camera
 from a2tg_jax.compositor import Compositing, Splats, composite
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose
-from a2tg_jax.lookup import TextureOptions, textured_appearance
 from a2tg_jax.sh import sh_colors
 from a2tg_jax.texture import AtlasLayout, Textures
 from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
@@ -213,12 +212,12 @@ def appearance_of(
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is None or layout is None:
-        return PlainAppearance()
+        return PlainRule()
     if layout.num != gaussians.num:
         raise ValueError(f"layout is of {layout.num} textures, but there are {gaussians.num} gaussians")
     if gaussians.num == 0:
-        return PlainAppearance()
-    return textured_appearance(textures, layout, settings.texture)
+        return PlainRule()
+    return textured_rule(textures, layout, settings.texture)
 
 
 def pairs_of_view(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:

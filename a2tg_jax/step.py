@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.adapt import GradientStatistics
+from a2tg_jax.appearance.textured import project_texels
 from a2tg_jax.cameras import Camera
 from a2tg_jax.config import TrainConfig
 from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.lookup import TextureOptions
 from a2tg_jax.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 from a2tg_jax.mcmc import grow, perturb, relocate
 from a2tg_jax.numerics import safe_norm
@@ -232,12 +232,6 @@ def _updated(how: StepSettings, state: TrainState, grads, rate_of_means: Array) 
     textures, texture_moments = adam_update(state.textures, grads[1], state.texture_moments, rates.texels)
     textures = project_texels(textures, how.render.texture)
     return dataclasses.replace(state, textures=textures, texture_moments=texture_moments)
-
-
-def project_texels(textures: Textures, options: TextureOptions) -> Textures:
-    """Alpha factors clamped to [0, 1]; RGB too where it is unsigned."""
-    is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
-    return jax.tree.map(lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures)
 
 
 def _densify(key_relocate: Array, key_grow: Array, state: TrainState, cap: int) -> tuple[TrainState, Array]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.adapt import GradientStatistics, event_budget, next_sizes, reallocate, select
+from a2tg_jax.appearance import TextureOptions
 from a2tg_jax.batches import BatchOrder, make_batch
 from a2tg_jax.checkpoint import Checkpoint, History
 from a2tg_jax.checkpoint import load_checkpoint as load_checkpoint
@@ -20,7 +21,6 @@ from a2tg_jax.checkpoint import save_checkpoint as save_checkpoint
 from a2tg_jax.config import TrainConfig
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.gaussians import Gaussians, init_from_points
-from a2tg_jax.lookup import TextureOptions
 from a2tg_jax.metrics import parameter_bytes
 from a2tg_jax.optim import AdamState
 from a2tg_jax.progress import ProgressBar

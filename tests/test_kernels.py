@@ -13,7 +13,7 @@ from llvmlite import ir
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
+from a2tg_jax.appearance import AppearanceRule, PlainRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.geometry import homographies
 from a2tg_jax.kernels import foreign, lanes, library, native, threads
@@ -140,10 +140,10 @@ def test_parts_cover_all_tiles():
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class HalvesAppearance:
+class HalvesRule(AppearanceRule):
     """A rule of another kind: two colours and one opacity a splat, [2N, 3], by the sign of u, and another falloff."""
 
-    params: jax.Array
+    table: jax.Array
     first: jax.Array
     sharpness: float = dataclasses.field(metadata={"static": True})
 
@@ -154,19 +154,12 @@ class HalvesAppearance:
     def texel(self, image, u, v):
         return (u > 0).astype(u.dtype), jnp.zeros_like(v)
 
-    def shade(self, values, u, v):
+    def shade(self, numbers, values, u, v):
         a, b, c = values
         return (a, b * u, c), None
 
-    def falloff(self, rho):
+    def falloff(self, numbers, rho):
         return jnp.exp(-0.5 * rho) / (1 + self.sharpness * rho)
-
-    def cutoff(self, opacities):
-        return gaussian_cutoff(opacities)
-
-    @property
-    def num_bytes(self):
-        return 4 * self.params.size
 
 
 @pytest.mark.usefixtures("x64")
@@ -177,7 +170,7 @@ def test_any_appearance_rule_is_compiled():
     first = jnp.arange(gaussians.num, dtype=jnp.int32) * 2
 
     def loss(gaussians, params, compositor):
-        rule = HalvesAppearance(params, first, 0.2)
+        rule = HalvesRule(params, first, 0.2)
         output = render_appearance(gaussians, camera, rule, settings=RenderSettings(compositor=compositor))
         return jnp.sum(output.color**2), output.color
 
@@ -243,8 +236,8 @@ def test_a_rule_defined_anew_is_compiled_anew():
     def image(residual):
         @jax.tree_util.register_dataclass
         @dataclasses.dataclass(frozen=True)
-        class Anew(PlainAppearance):
-            def shade(self, values, u, v):
+        class Anew(PlainRule):
+            def shade(self, numbers, values, u, v):
                 return (residual * jnp.ones_like(u),) * 3, None
 
         return render_appearance(gaussians, camera, Anew()).color

@@ -29,7 +29,7 @@ def _kind(how, splats, rule):
     return Kind(
         rule=jax.tree.structure(rule),
         rule_class=type(rule),
-        num_columns=0 if rule.images is None else rule.params.shape[1],
+        num_columns=0 if rule.images is None else rule.table.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
         tile_size=how.grid.tile_size,
         near_plane=how.near_plane,

@@ -1,4 +1,4 @@
-"""The appearance rule of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
+"""The appearance of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
 
 All textures lie one after the other in a table [texels, 4], row by row.
 """
@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import gaussian_cutoff
+from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
+from a2tg_jax.texture import AtlasLayout, Textures, allocate_textures, texture_arrays, textures_from_arrays
 
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
@@ -42,10 +44,10 @@ class TextureOptions:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class TexturedAppearance:
+class TexturedRule(AppearanceRule):
     """An appearance rule: RGB residual and alpha factor from each splat's own texture."""
 
-    params: Array
+    table: Array
     """[texels, 4] all textures."""
     images: Image
     """[N] each: where the textures lie, Tv × Tu."""
@@ -59,7 +61,7 @@ class TexturedAppearance:
         width, height = image.width.astype(u.dtype), image.height.astype(v.dtype)
         return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
 
-    def shade(self, values: tuple[Array, ...], u: Array, v: Array):
+    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
         red, green, blue, alpha = values
         if self.options.outside == "identity":
             is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
@@ -67,19 +69,11 @@ class TexturedAppearance:
             alpha = jnp.where(is_inside, alpha, 1.0)
         return (red, green, blue), alpha
 
-    def falloff(self, rho: Array) -> Array:
-        return jnp.exp(-0.5 * rho)
-
     def cutoff(self, opacities: Array) -> Array:
         return gaussian_cutoff(opacities * self.peaks)
 
-    @property
-    def num_bytes(self) -> int:
-        heights, widths = (np.asarray(sizes, np.int64) for sizes in (self.images.height, self.images.width))
-        return 16 * int(np.sum(heights * widths))
 
-
-def textured_appearance(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedAppearance:
+def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedRule:
     """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels."""
     areas = [height * width for height, width in layout.resolutions]
     capacities = [bucket.shape[0] for bucket in textures.buckets]
@@ -92,8 +86,8 @@ def textured_appearance(textures: Textures, layout: AtlasLayout, options: Textur
     texels = jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets])
     if options.rgb == "unit":
         texels = jnp.concatenate([jnp.clip(texels[:, :3], 0.0, 1.0), texels[:, 3:]], axis=1)
-    return TexturedAppearance(
-        params=texels,
+    return TexturedRule(
+        table=texels,
         images=Image(offsets, sizes[:, 0], sizes[:, 1]),
         peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
         options=options,
@@ -111,3 +105,64 @@ def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
     unit = (u * (1 / EXTENT) + 1) * 0.5
     x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
     return jnp.clip(x, 0.0, size - 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Textured(Appearance):
+    """A texture for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
+
+    start: tuple[int, int] = (1, 1)
+    """(Tv, Tu) of every texture at first, each 1 to 16."""
+    options: TextureOptions = TextureOptions()
+    """How textures are read."""
+
+    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Textures, AtlasLayout]:
+        sizes = np.broadcast_to(np.asarray(self.start, np.int64), (gaussians.num, 2))
+        return allocate_textures(sizes, rgb=self.options.initial_rgb)
+
+    def rule(self, params: Textures, layout: AtlasLayout) -> AppearanceRule:
+        return textured_rule(params, layout, self.options)
+
+    def project(self, params: Textures) -> Textures:
+        return project_texels(params, self.options)
+
+    def num_floats(self, layout: AtlasLayout, num: int) -> int:
+        texels = int(np.prod(layout.sizes[:num], axis=1).sum())
+        return FLOATS_PER_GAUSSIAN * num + 4 * texels
+
+    def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
+        (bucket,) = self._only(params)
+        return Textures((bucket.at[: rows.shape[0]].set(bucket[rows]),))
+
+    def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
+        (bucket,) = self._only(params)
+        is_cleared = jnp.pad(is_cleared, (0, bucket.shape[0] - is_cleared.shape[0]))
+        return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
+
+    def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
+        """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
+        texels = [array.reshape(-1, 4) for array in texture_arrays(params, layout)]
+        return {"sizes": layout.sizes, "texels": np.concatenate(texels) if texels else np.zeros((0, 4), np.float32)}
+
+    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Textures, AtlasLayout]:
+        missing = [name for name in ("sizes", "texels") if name not in arrays]
+        if missing:
+            raise ValueError(f"the array {missing[0]} of textures is missing")
+        sizes, texels = arrays["sizes"], arrays["texels"]
+        if sizes.ndim != 2 or sizes.shape[1] != 2 or texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
+            raise ValueError(f"sizes [N, 2] and texels [M, 4] disagree; got {sizes.shape} and {texels.shape}")
+        pieces = np.split(texels, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
+        return textures_from_arrays([piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)])
+
+    def _only(self, params: Textures) -> tuple[Array]:
+        if len(params.buckets) != 1:
+            raise ValueError(
+                f"textures of {len(params.buckets)} sizes cannot change rows inside a step: densify before they grow"
+            )
+        return params.buckets
+
+
+def project_texels(textures: Textures, options: TextureOptions) -> Textures:
+    """Alpha factors clamped to [0, 1]; RGB too where it is unsigned."""
+    is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
+    return jax.tree.map(lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures)
