@@ -39,6 +39,14 @@ class Model:
         return self.gaussians.num if self.num_live is None else int(self.num_live)
 
     @property
+    def live(self) -> "Model":
+        """The rows that exist alone (host)."""
+        if self.num_live is None:
+            return self
+        params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
+        return Model(self.gaussians[: self.num], params, layout, appearance=self.appearance)
+
+    @property
     def num_bytes(self) -> int:
         """Bytes of the trained floats of the Gaussians that exist, padding left out (host)."""
         return BYTES_PER_FLOAT * self.appearance.num_floats(self.layout, self.num)

@@ -35,6 +35,8 @@ class TextureOptions:
     """Whether the lookup position carries gradients into the geometry."""
     initial_rgb: float = 0.0
     """RGB of new textures."""
+    max_alpha: float = 0.99
+    """Alpha never exceeds it."""
 
     @staticmethod
     def official() -> "TextureOptions":
@@ -138,6 +140,11 @@ class Textured(Appearance):
         (bucket,) = self._only(params)
         is_cleared = jnp.pad(is_cleared, (0, bucket.shape[0] - is_cleared.shape[0]))
         return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
+
+    def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
+        if num == layout.num:
+            return params, layout
+        return textures_from_arrays(texture_arrays(params, layout)[:num])
 
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
         """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
