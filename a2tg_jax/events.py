@@ -107,7 +107,8 @@ class StepEvent(Event):
 
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
-    impossible: ClassVar[str] = "an event found that training cannot go on"
+    impossible: ClassVar[str] = ""
+    """Why training cannot go on where `EventInfo.is_possible` is False, and what to do."""
 
     def times(self, num_iterations: int) -> Times:
         """When it happens in a stage of so many iterations (host)."""
