@@ -280,6 +280,8 @@ def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) ->
             f"a rule gives opacities [N] and numbers [N, K] of N = {gaussians.num} gaussians; {type(rule).__name__} "
             f"gave {opacities.shape} and {numbers.shape}"
         )
+    if not 0 < rule.max_alpha < 1:
+        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
     is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num) < num_live

@@ -68,6 +68,16 @@ class Hits(NamedTuple):
     margin: Float  # [H, W]
 
 
+class Shown(NamedTuple):
+    """What one splat shows where the rays meet it."""
+
+    strength: Float  # [H, W], alpha before the cut at 1/255 and the cap
+    residual: Float  # [H, W, 3], added to its colour
+    margin: Float | float  # [H, W]
+    kink: Float | float  # [H, W]
+    is_relevant: Bool  # [H, W]; elsewhere it is too weak on either side of a decision of where the ray meets it
+
+
 class Layer(NamedTuple):
     """One splat over the whole image, before compositing."""
 
@@ -78,7 +88,7 @@ class Layer(NamedTuple):
     mean_depth: float
     normal: Float  # [3]
     rho_gradients: dict[str, Float]  # as in Hits
-    texel: Float  # [H, W, 4], what the lookup gave
+    texel: Float | None  # [H, W, 4], what a lookup gave
     margin: Float  # [H, W]
     kink: Float  # [H, W]
 
@@ -210,12 +220,14 @@ def rho_gradients(rays: Rays, M: Float, position_jacobian: Float) -> tuple[Float
     return 2 * uv[..., :1] * du + 2 * uv[..., 1:] * dv, -4 * offset @ dcenter
 
 
-def intersect(M: Float, position_jacobian: Float, width: int, height: int, near: float) -> Hits:
+def intersect(
+    M: Float, position_jacobian: Float, width: int, height: int, near: float, has_low_pass: bool = True
+) -> Hits:
     """Meets the rays of all pixels with one splat; `position_jacobian` [3, 3] is ∂M[:, 2]/∂mean."""
     rays = cross_plane(M, width, height)
     hit_depth = rays.uv @ M[2, :2] + M[2, 2]
     is_hit = rays.is_crossed & (hit_depth >= near)
-    rho2 = 2 * np.sum(rays.offset**2, axis=-1)
+    rho2 = 2 * np.sum(rays.offset**2, axis=-1) if has_low_pass else np.full((height, width), np.inf)
     any_rho3 = np.where(rays.is_crossed, np.sum(rays.uv**2, axis=-1), np.inf)
     rho3 = np.where(is_hit, any_rho3, np.inf)
     is_low_pass = rho3 > rho2
@@ -228,7 +240,7 @@ def intersect(M: Float, position_jacobian: Float, width: int, height: int, near:
     summands = abs(k[..., 0] * l[..., 1]) + abs(k[..., 1] * l[..., 0])
     cancellation = abs(rays.p[..., 2]) / np.maximum(summands, np.finfo(float).tiny)
     with np.errstate(invalid="ignore"):
-        branch = np.where(is_hit, abs(rho3 - rho2) / (rho3 + rho2), np.inf)
+        branch = np.where(is_hit & has_low_pass, abs(rho3 - rho2) / (rho3 + rho2), np.inf)
     return Hits(
         u=np.where(is_hit, rays.uv[..., 0], 0.0),
         v=np.where(is_hit, rays.uv[..., 1], 0.0),
@@ -263,33 +275,38 @@ def splat_layer(scene: Scene, i: int, rules: Rules, texel: Float | None = None) 
     M, position_jacobian = homography(scene, i)
     hits = intersect(M, position_jacobian, scene.width, scene.height, rules.near)
     texture = shown_texture(scene, i, rules)
-    found, lookup_margin, lookup_kink = lookup(texture, hits.u, hits.v, rules)
+    found, margin, kink = lookup(texture, hits.u, hits.v, rules)
     texel = found if texel is None else texel
     opacity = 1 / (1 + np.exp(-scene.logit_opacities[i]))
+    is_relevant = opacity * np.exp(-hits.closest_rho / 2) * max(texture[..., 3].max(), 1.0) >= 0.99 * MIN_ALPHA
     strength = opacity * np.exp(-hits.rho / 2) * texel[..., 3]
-    is_visible = (strength >= MIN_ALPHA) & (M[2, 2] >= rules.near)
+    layer = shown_layer(scene, i, rules, hits, Shown(strength, texel[..., :3], margin, kink, is_relevant))
+    return layer._replace(texel=texel)
 
+
+def shown_layer(scene: Scene, i: int, rules: Rules, hits: Hits, shown: Shown) -> Layer:
+    """The layer of splat `i`, given where the rays meet it and what it shows there."""
+    strength, (M, _) = shown.strength, homography(scene, i)
+    is_visible = (strength >= MIN_ALPHA) & (M[2, 2] >= rules.near)
     direction, normal = view_direction(scene, i), rotation_matrix(scene.quats[i])[:, 2]
     facing = direction @ normal
     num_bases = (rules.sh_degree + 1) ** 2
     sh_color = sh_basis(direction)[:num_bases] @ scene.sh[i, :num_bases] + 0.5
 
     constants = np.broadcast_to([[[abs(facing)]], [[abs(M[2, 2] / rules.near - 1)]]], (2, *strength.shape))
-    margins = [*constants, hits.margin, lookup_margin, abs(strength / MIN_ALPHA - 1)]
+    margins = np.broadcast_arrays(*constants, hits.margin, shown.margin, abs(strength / MIN_ALPHA - 1))
     margin = np.min(margins, axis=0) if M[2, 2] >= rules.near else constants[1]
-    # A splat too weak for this pixel on either side of a decision makes the decision irrelevant.
-    is_relevant = opacity * np.exp(-hits.closest_rho / 2) * max(texture[..., 3].max(), 1.0) >= 0.99 * MIN_ALPHA
-    kink = np.minimum(np.minimum(abs(strength / rules.max_alpha - 1), lookup_kink), abs(sh_color).min())
+    kink = np.minimum(np.minimum(abs(strength / rules.max_alpha - 1), shown.kink), abs(sh_color).min())
     return Layer(
         alpha=np.where(is_visible, np.minimum(strength, rules.max_alpha), 0.0),
         is_capped=strength > rules.max_alpha,
-        color=np.maximum(sh_color, 0) + texel[..., :3],
+        color=np.maximum(sh_color, 0) + shown.residual,
         depth=hits.depth,
         mean_depth=float(M[2, 2]),
         normal=-normal if facing > 0 else normal,
         rho_gradients=hits.rho_gradients,
-        texel=texel,
-        margin=np.where(is_relevant, margin, np.inf),
+        texel=None,
+        margin=np.where(shown.is_relevant, margin, np.inf),
         kink=np.where(is_visible, kink, np.inf),
     )
 
