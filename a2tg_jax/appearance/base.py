@@ -66,6 +66,10 @@ class Appearance:
         limited = jnp.minimum(gaussians.logit_opacities, logit(jnp.asarray(most, gaussians.means.dtype)))
         return dataclasses.replace(gaussians, logit_opacities=limited), params
 
+    def first(self, params: Any, layout: Any, num: int) -> tuple[Any, Any]:
+        """Parameters and layout of the first `num` Gaussians (host)."""
+        return jax.tree.map(lambda x: x[:num], params), layout
+
     # Files.
 
     def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:
