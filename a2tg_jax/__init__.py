@@ -1,10 +1,19 @@
 """Adaptive anisotropic textured Gaussians as a functional JAX library: the public names."""
 
+from a2tg_jax.adapt import GradientStatistics as GradientStatistics
+from a2tg_jax.adapt import event_budget as event_budget
 from a2tg_jax.adapt import next_sizes as next_sizes
 from a2tg_jax.adapt import reallocate as reallocate
 from a2tg_jax.adapt import select as select
+from a2tg_jax.appearance import Appearance as Appearance
+from a2tg_jax.appearance import AppearanceRule as AppearanceRule
+from a2tg_jax.appearance import Plain as Plain
+from a2tg_jax.appearance import PlainRule as PlainRule
+from a2tg_jax.appearance import Textured as Textured
+from a2tg_jax.appearance import TexturedRule as TexturedRule
 from a2tg_jax.appearance import TextureOptions as TextureOptions
 from a2tg_jax.cameras import Camera as Camera
+from a2tg_jax.cameras import resize_camera as resize_camera
 from a2tg_jax.checkpoint import Checkpoint as Checkpoint
 from a2tg_jax.checkpoint import History as History
 from a2tg_jax.checkpoint import load_checkpoint as load_checkpoint
@@ -19,11 +28,16 @@ from a2tg_jax.data import View as View
 from a2tg_jax.data import load_scene as load_scene
 from a2tg_jax.data import run_sfm as run_sfm
 from a2tg_jax.data import synthetic_scene as synthetic_scene
+from a2tg_jax.data import view_image as view_image
+from a2tg_jax.data.world import Similarity as Similarity
 from a2tg_jax.evaluation import evaluate as evaluate
 from a2tg_jax.gaussians import Gaussians as Gaussians
 from a2tg_jax.gaussians import init_from_points as init_from_points
+from a2tg_jax.io.model import load_model as load_model
+from a2tg_jax.io.model import save_model as save_model
 from a2tg_jax.io.ply import load_ply as load_ply
 from a2tg_jax.io.ply import save_ply as save_ply
+from a2tg_jax.losses import normal_consistency as normal_consistency
 from a2tg_jax.losses import photometric_loss as photometric_loss
 from a2tg_jax.mcmc import grow as grow
 from a2tg_jax.mcmc import perturb as perturb
@@ -32,13 +46,18 @@ from a2tg_jax.metrics import lpips as lpips
 from a2tg_jax.metrics import parameter_bytes as parameter_bytes
 from a2tg_jax.metrics import psnr as psnr
 from a2tg_jax.metrics import ssim as ssim
+from a2tg_jax.model import Model as Model
 from a2tg_jax.optim import adam_init as adam_init
 from a2tg_jax.optim import adam_update as adam_update
+from a2tg_jax.optim import exponential_decay as exponential_decay
+from a2tg_jax.origin import Origin as Origin
+from a2tg_jax.paths import smooth_path as smooth_path
 from a2tg_jax.render import RenderOutput as RenderOutput
 from a2tg_jax.render import RenderSettings as RenderSettings
 from a2tg_jax.render import plan_render as plan_render
 from a2tg_jax.render import render_appearance as render_appearance
 from a2tg_jax.render import render_image as render_image
+from a2tg_jax.renderer import Renderer as Renderer
 from a2tg_jax.startup import configure_cpu as configure_cpu
 from a2tg_jax.texture import AtlasLayout as AtlasLayout
 from a2tg_jax.texture import Textures as Textures
@@ -50,3 +69,4 @@ from a2tg_jax.training import fit as fit
 from a2tg_jax.training import fit_stage1 as fit_stage1
 from a2tg_jax.training import fit_stage2 as fit_stage2
 from a2tg_jax.training import render_settings as render_settings
+from a2tg_jax.transform import transform_gaussians as transform_gaussians

@@ -18,6 +18,7 @@ from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_co
 from a2tg_jax.io.model import save_model
 from a2tg_jax.io.ply import ATTRIBUTES, load_ply, save_ply
 from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
 from a2tg_jax.render import render_image
 from a2tg_jax.sh import sh_basis
 from a2tg_jax.texture import textures_from_arrays
@@ -98,9 +99,50 @@ def test_ply_of_3d_gaussians_warns(tmp_path):
         assert load_ply(tmp_path / "g.ply").num == 2
 
 
+def test_flat_ellipsoids_show_the_same_whichever_axis_is_thin(tmp_path):
+    """The same splats with their axes cycled, so that the first or the second is thin, are the same splats."""
+    gaussians, camera = (
+        some_gaussians(30),
+        Camera(jnp.eye(4).at[2, 3].set(5), jnp.diag(jnp.array([30.0, 30, 1])), 32, 24),
+    )
+    camera = dataclasses.replace(camera, K=camera.K.at[:2, 2].set(jnp.array([16.0, 12])))
+    gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + 1)
+    save_ply(tmp_path / "flat.ply", gaussians, third_scale=True)
+    header, data = (tmp_path / "flat.ply").read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property float ")]
+    rows = np.frombuffer(data, "<f4").reshape(30, 62).copy()
+    scales, quats = ([names.index(f"{kind}_{i}") for i in range(n)] for kind, n in (("scale", 3), ("rot", 4)))
+    expected = render_image(gaussians, camera)
+    for turn in range(3):
+        order = np.roll(np.arange(3), turn)
+        turned = rows.copy()
+        turned[:, scales] = rows[:, scales][:, order]
+        axes = Rotation.from_quat(rows[:, quats], scalar_first=True).as_matrix()[:, :, order]
+        turned[:, quats] = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+        write_ply(tmp_path / "turned.ply", names, turned)
+        found = render_image(load_ply(tmp_path / "turned.ply"), camera)
+        np.testing.assert_allclose(found.color, expected.color, atol=1e-4)
+        np.testing.assert_allclose(found.alpha, expected.alpha, atol=1e-4)
+    assert expected.alpha.mean() > 0.2
+
+
+def test_third_scale_round_trip(tmp_path):
+    save_ply(tmp_path / "g.ply", some_gaussians(), third_scale=True)
+    assert_same(load_ply(tmp_path / "g.ply"), some_gaussians())
+
+
+def test_ply_of_a_model_is_in_its_original_world(tmp_path):
+    world = some_world()
+    model = Model(some_gaussians(), num_live=jnp.asarray(5, jnp.int32), origin=Origin.of_cameras([], transform=world))
+    save_ply(tmp_path / "model.ply", model)
+    save_ply(tmp_path / "gaussians.ply", some_gaussians()[:5], transform=world)
+    assert (tmp_path / "model.ply").read_bytes() == (tmp_path / "gaussians.ply").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (lambda path: path.write_bytes(b"ply\nelement vertex -3\n"), "announces -3 of vertex"),
         (lambda path: path.write_bytes(b"not a ply\n"), "is not a PLY file"),
         (lambda path: path.write_bytes(b"ply\nformat ascii 1.0\n"), "save it as binary_little_endian"),
         (lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\n"), "header does not end"),
