@@ -95,17 +95,20 @@ def logit(p: Array) -> Array:
     return jnp.log(p) - jnp.log1p(-p)
 
 
-def init_from_points(points, colors, num: int | None = None, seed: int = 0) -> Gaussians:
+def init_from_points(
+    points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY
+) -> Gaussians:
     """Initial Gaussians from points of a sparse reconstruction.
 
     log-scale = log of the root mean square distance to the 3 nearest neighbours (both axes), uniformly random
-    rotations, opacity 0.1, SH degree 0 from the point's colour, higher degrees 0.
+    rotations, one opacity, SH degree 0 from the point's colour, higher degrees 0.
 
     Args:
       points: [P, 3] positions, P >= 2.
       colors: [P, 3] colours in [0, 1].
       num: how many Gaussians; None or anything >= P takes all the points, less draws that many without replacement.
       seed: of the drawing and of the rotations.
+      opacity: of every Gaussian, between 0 and 1.
 
     Returns:
       float32 Gaussians, min(num, P) of them.
@@ -136,6 +139,6 @@ def init_from_points(points, colors, num: int | None = None, seed: int = 0) -> G
         means=as_float(points),
         quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
         log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
-        logit_opacities=as_float(np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))),
+        logit_opacities=as_float(np.full(count, np.log(opacity / (1 - opacity)))),
         sh=as_float(sh),
     )

@@ -46,7 +46,7 @@ class Model:
         """The model of the rows that exist, and no others (host)."""
         if self.num_live is None:
             return self
-        params, layout = self.appearance.first(self.params, self.layout, self.num)
+        params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
         return dataclasses.replace(
             self, gaussians=self.gaussians[: self.num], params=params, layout=layout, num_live=None
         )

@@ -42,6 +42,8 @@ class TextureOptions:
     """Whether the lookup position carries gradients into the geometry."""
     initial_rgb: float = 0.0
     """RGB of new textures."""
+    max_alpha: float = 0.99
+    """Alpha never exceeds it."""
 
     @staticmethod
     def official() -> "TextureOptions":
@@ -146,8 +148,8 @@ class Textured(Appearance):
         is_cleared = jnp.pad(is_cleared, (0, bucket.shape[0] - is_cleared.shape[0]))
         return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
 
-    def first(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
-        return first_textures(params, layout, num)
+    def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
+        return (params, layout) if num == layout.num else first_textures(params, layout, num)
 
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
         """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
