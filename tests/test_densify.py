@@ -72,7 +72,7 @@ def test_plan_is_that_of_the_twin(seed, cap, iteration):
     event = CloneSplitPrune(cap)
     edit, refused = jax.jit(event.plan)(now(iteration), model, jnp.asarray(gradients))
     kept, cloned, split, wanted_refused = twin_plan(event, model, gradients, iteration, 30_000, NUM)
-    assert kept and cloned and split
+    assert kept and (cloned | split)
     for mask, rows in ((edit.is_kept, kept), (edit.is_cloned, cloned), (edit.is_split, split)):
         assert set(np.flatnonzero(np.asarray(mask)).tolist()) == rows
     assert int(refused) == wanted_refused
