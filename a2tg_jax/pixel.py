@@ -138,7 +138,8 @@ def show(
     a = splat.opacity * rule.falloff(hit.rho)
     a = a if factor is None else a * factor
     a = a if log_tap is None else a * jnp.exp(log_tap)
-    alpha = jnp.where(a >= MIN_ALPHA, jnp.where(a < MAX_ALPHA, a, MAX_ALPHA), 0.0)
+    # What is not a number stays so, here and in `absorb`: it must not vanish.
+    alpha = jnp.where(a < MIN_ALPHA, 0.0, jnp.where(a >= MAX_ALPHA, MAX_ALPHA, a))
     channels: tuple[Array, ...] = splat.color
     if residual is not None:
         channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
@@ -150,7 +151,7 @@ def show(
 def absorb(alpha: Array, light: Array, is_live: Array) -> Triple:
     """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
     leave less than 10⁻⁴."""
-    is_live = is_live & (light * (1 - alpha) >= MIN_TRANSMITTANCE)
+    is_live = is_live & ~(light * (1 - alpha) < MIN_TRANSMITTANCE)
     weight = jnp.where(is_live, alpha * light, 0.0)
     return weight, light - weight, is_live
 

@@ -94,6 +94,10 @@ def render_image(
       background: [3] colour behind everything.
       settings: static choices. An eager call, also under `jax.grad`, needs no capacity and never overflows.
 
+    Returns:
+      What the view shows. Where a splat would show, but a number of it is not finite (mean, rotation, scales, opacity
+      or colour), all of the picture is NaN, and so are the gradients; a texel that is NaN is seen where it shows.
+
     Raises:
       ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, or if the layout
         is of another number of Gaussians.
@@ -168,6 +172,8 @@ def render_traced(
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
     channels, transmittance = composite(how, splats, rule, lists, jacobian, tap)
+    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
+    channels, transmittance = channels + taint, transmittance + taint
     return _output(how, channels, transmittance, background, lists.overflow), lists.num_pairs
 
 
@@ -270,14 +276,26 @@ def _tile_batch(settings: RenderSettings) -> int:
 
 
 def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
-    """The N splats, and [N] the squared distance within which each shows; not positive where it shows nowhere."""
+    """The N splats, and [N] the squared distance within which each shows: not positive where it shows nowhere, NaN
+    where it would show, but a number of it is not finite."""
     M, normals = homographies(gaussians, camera)
     opacities = gaussians.opacities
-    is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)
+    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
+    # Not >=: a depth that is no number is not behind the camera.
+    is_drawn = ~(M[:, 2, 2] < settings.near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num) < num_live
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
-    # Rows that are drawn nowhere may hold anything; a finite stand-in keeps 0 · inf out of the gradients.
-    M = jnp.where(is_drawn[:, None, None], M, jnp.eye(3, dtype=M.dtype)[None])
-    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
+    is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors)
+    cutoff = jnp.where(is_broken, jnp.nan, cutoff)
+    is_shown = (cutoff > 0)[:, None]
+    # Rows that show nowhere may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
+    M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
+    colors, normals = jnp.where(is_shown, colors, 0.0), jnp.where(is_shown, normals, 0.0)
     return Splats(M, colors, opacities, normals), cutoff
+
+
+def _are_finite(M: Array, colors: Array) -> Array:
+    """[N] whether all numbers of a splat are."""
+    numbers = [*(M[:, i, k] for i in range(3) for k in range(3)), *(colors[:, k] for k in range(3))]
+    return functools.reduce(jnp.logical_and, map(jnp.isfinite, numbers))

@@ -90,7 +90,7 @@ class Functions:
             tap = ()
             if kind.has_statistic:
                 tap = pixel.absolute_gradient(splat.M, x, y, *center, d.log_falloff, jacobian, near_plane)
-            return state, weight > 0, d.values, (d.planes, d.opacity, d.color, d.normal, tap)
+            return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, tap)
 
         at_pixel = number, number, number, flag
         channels = (number,) * kind.num_channels

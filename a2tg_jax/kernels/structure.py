@@ -155,7 +155,7 @@ def _while(lanes: Lanes, operands: list, equation) -> list:
 def _scan(lanes: Lanes, operands: list, equation) -> list:
     """A loop; unrolled where it reads or writes arrays."""
     params, length = equation.params, equation.params["length"]
-    num_consts, num_carry = params["num_consts"], params["num_carry"]
+    num_consts, num_carry = _scan_sizes(params)
     consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
     arrays, num_written = operands[num_consts + num_carry :], len(equation.outvars) - num_carry
     if not arrays and not num_written:
@@ -171,6 +171,14 @@ def _scan(lanes: Lanes, operands: list, equation) -> list:
         flat = [entry for row in written for entry in entries(row[k])]
         stacked.append(array_of(flat, variable.aval.shape))
     return [*carry, *stacked]
+
+
+def _scan_sizes(params) -> tuple[int, int]:
+    """How many constants and how many carried values a scan has."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()  # JAX 0.12
+    return len(list(consts)), len(list(carry))
 
 
 def _counted(lanes: Lanes, length: int, values: list, step: Callable[[list], list]) -> list:
