@@ -20,7 +20,7 @@ from a2tg_jax.compositor import Compositing, Splats, composite
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
-from a2tg_jax.kernels.choice import choose
+from a2tg_jax.kernels.choice import choose, instead_of_native
 from a2tg_jax.lookup import TextureOptions, textured_appearance
 from a2tg_jax.sh import sh_colors
 from a2tg_jax.texture import AtlasLayout, Textures
@@ -45,7 +45,8 @@ class RenderSettings:
     capacity: int | None = None
     """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
     compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
-    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had."""
+    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had, and XLA,
+    with a warning, where an appearance rule uses what native loops cannot do."""
     tile_batch: int | None = None
     """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
 
@@ -166,6 +167,12 @@ def render_traced(
         return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings, degree, num_live)
+    if compositor == "native" and (reason := native.refusal(how, splats, rule)):
+        settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
+        return render_traced(
+            gaussians, camera, rule, background, settings,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, tap=tap,
+        )  # fmt: skip
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
     M = jax.lax.stop_gradient(splats.M)
     lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)

@@ -188,6 +188,26 @@ def test_any_appearance_rule_is_compiled():
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class UntranslatableAppearance(PlainAppearance):
+    def falloff(self, rho):
+        return jnp.exp(-0.5 * rho) + 0 * jax.lax.digamma(1 + rho)
+
+
+def test_a_rule_without_translation_is_left_to_xla():
+    """With "auto", with one warning that names the primitive; with "native" it is an error."""
+    scene = draw_scene(9, num=8, width=16, height=16)
+    gaussians, camera, rule = as_gaussians(scene, "float32"), as_camera(scene, "float32"), UntranslatableAppearance()
+    show = lambda **settings: render_appearance(gaussians, camera, rule, settings=RenderSettings(**settings)).color  # noqa: E731
+    with pytest.warns(UserWarning, match=r"UntranslatableAppearance is composited by XLA.*'digamma'"):
+        found = show()
+    show(near_plane=0.3)
+    np.testing.assert_array_equal(found, show(compositor="xla"))
+    with pytest.raises(ValueError, match=r"compositor='native' cannot run UntranslatableAppearance.*'digamma'"):
+        show(compositor="native")
+
+
 @pytest.mark.parametrize("has_textures", [False, True])
 def test_pallas_kernels_are_those_of_xla(has_textures):
     """Interpreted, on a small scene: the image, the gradient, and the absolute positional gradient."""

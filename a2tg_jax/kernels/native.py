@@ -38,6 +38,23 @@ def _kind(how, splats, rule):
     )
 
 
+def refusal(how, splats, rule) -> str | None:
+    """Why there can be no native loops for a rule; None where there are, which are then compiled."""
+    return _refusal(_kind(how, splats, rule))
+
+
+@functools.cache
+def _refusal(kind) -> str | None:
+    from a2tg_jax.kernels.lanes import Untranslatable
+    from a2tg_jax.kernels.loops import loops
+
+    try:
+        loops(kind)
+    except Untranslatable as error:
+        return str(error)
+    return None
+
+
 def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
     """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
     kind = _kind(how, splats, rule)
