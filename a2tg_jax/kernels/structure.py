@@ -220,6 +220,13 @@ def _concatenate(lanes: Lanes, operands: list, equation) -> list:
     return [np.concatenate(operands, axis=equation.params["dimension"])]
 
 
+def _stack(lanes: Lanes, operands: list, equation) -> list:
+    shape, axis = equation.outvars[0].aval.shape, equation.params["axis"]
+    flat = [entry for operand in operands for entry in entries(operand)]
+    first = [len(operands), *np.delete(shape, axis).tolist()]
+    return [np.moveaxis(array_of(flat, first), 0, axis)]
+
+
 def _reduction(name: str):
     def emit(lanes: Lanes, operands: list, equation) -> list:
         (array,), axes = operands, equation.params["axes"]
@@ -248,6 +255,7 @@ STRUCTURE: dict[str, Callable[[Lanes, list, Any], list]] = {
     "rev": _shaped(lambda operand, params: np.flip(operand, params["dimensions"])),
     "scan": _scan,
     "slice": _shaped(_slice),
+    "stack": _stack,
     "squeeze": _shaped(lambda operand, _: operand),
     "transpose": _shaped(lambda operand, params: np.transpose(operand, params["permutation"])),
     "while": _while,
