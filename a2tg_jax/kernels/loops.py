@@ -116,8 +116,8 @@ class _Compositing(TexelWriter):
         """Which pixels of a vector lie inside the image, as 0 and 1."""
         b, inside = self.b, []
         for table, center, size in ((self.pixel_x, tile_x, "width"), (self.pixel_y, tile_y, "height")):
-            at = b.fadd(self.load(table, index, self.reals), self.lanes.splat(center))
-            limit = self.lanes.splat(b.sitofp(self.arguments[size], self.real))
+            at = b.fadd(self.load(table, index, self.reals), self.lanes.broadcast(center))
+            limit = self.lanes.broadcast(b.sitofp(self.arguments[size], self.real))
             inside.append(b.fcmp_ordered("<", at, limit))
         return b.zext(b.and_(*inside), self.integers)
 
@@ -139,7 +139,7 @@ class _Compositing(TexelWriter):
         image = self.image_numbers(id_)
         spread = self.spread(planes), self.spread(numbers)
         as_longs = NativeImage(*map(self.long, image)) if image else None
-        return _LoadedSplat(numbers, *spread, as_longs, self.spread(image), self.lanes.splat(limit))
+        return _LoadedSplat(numbers, *spread, as_longs, self.spread(image), self.lanes.broadcast(limit))
 
     def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
         """Calls composite(k, x, y, place, is_live) for every vector k of the tile's pixels that the splat may reach,
@@ -168,7 +168,7 @@ class _Compositing(TexelWriter):
         return [self.load(base, k, INT) for k in range(3)] if self.num_columns else []
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
-        return [self.lanes.splat(number) for number in numbers]
+        return [self.lanes.broadcast(number) for number in numbers]
 
 
 class _Forward(_Compositing):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance import StaticRule
 from a2tg_jax.geometry import Outline
 from a2tg_jax.kernels import foreign, threads
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
@@ -36,6 +37,23 @@ def _kind(how, rule, splats, table: Array, images):
         has_geometry=how.has_geometry,
         statistic=how.statistic,
     )
+
+
+def refusal(how, rule, splats) -> str | None:
+    """Why there can be no native loops for a rule; None where there are, which are then compiled."""
+    return _refusal(_kind(how, StaticRule.of(rule), splats, rule.table, rule.images))
+
+
+@functools.cache
+def _refusal(kind) -> str | None:
+    from a2tg_jax.kernels.lanes import Untranslatable
+    from a2tg_jax.kernels.loops import loops
+
+    try:
+        loops(kind)
+    except Untranslatable as error:
+        return str(error)
+    return None
 
 
 def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:

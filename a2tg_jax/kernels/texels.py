@@ -73,7 +73,7 @@ class TexelWriter(Writer):
 
                 def add_texel(column: Line, row=row, in_row=in_row, in_row_along_x=in_row_along_x) -> None:
                     texel = self.texel("table", image, column, row)
-                    numbers = [self.lanes.splat(self.load(texel, k, self.real)) for k in range(count)]
+                    numbers = [self.lanes.broadcast(self.load(texel, k, self.real)) for k in range(count)]
                     self.accumulate(in_row, column.weight, numbers)
                     self.accumulate(in_row_along_x, column.slope, numbers)
 
@@ -164,7 +164,7 @@ class TexelWriter(Writer):
         """The first texel along an axis that a reached lane sees, and the one after the last; and the places, those of
         other lanes moved between the reached ones."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
-        most = self.lanes.splat(b.sitofp(b.sub(size, LONG(1)), self.real))
+        most = self.lanes.broadcast(b.sitofp(b.sub(size, LONG(1)), self.real))
         # Whatever a lane holds, even if it is no number, nothing outside of the image is read.
         places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
         places = b.select(b.fcmp_ordered("<", places, most), places, most)
@@ -172,19 +172,21 @@ class TexelWriter(Writer):
         largest = self.lanes.largest(b.select(is_reached, places, number(0.0)))
         end = b.add(b.fptosi(largest, LONG), LONG(2))
         end = b.select(b.icmp_signed("<", end, size), end, size)
-        moved = self.lanes.smaller(self.lanes.larger(places, self.lanes.splat(least)), self.lanes.splat(largest))
+        moved = self.lanes.smaller(
+            self.lanes.larger(places, self.lanes.broadcast(least)), self.lanes.broadcast(largest)
+        )
         return (b.fptosi(least, LONG), end), moved
 
     def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
         """One of `size` texels along an axis, seen from `places`."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
-        distance = b.fsub(places, self.lanes.splat(b.sitofp(index, self.real)))
+        distance = b.fsub(places, self.lanes.broadcast(b.sitofp(index, self.real)))
         weight = self.lanes.larger(b.fsub(number(1.0), self.lanes.intrinsic("fabs", [distance])), number(0.0))
         if not has_slope:
             return Line(index, weight, None)
         # The last texel goes on: nothing changes beyond it.
         is_last = b.icmp_signed("==", index, b.sub(size, LONG(1)))
-        falling = self.lanes.splat(b.select(is_last, self.real(0.0), self.real(-1.0)))
+        falling = self.lanes.broadcast(b.select(is_last, self.real(0.0), self.real(-1.0)))
         slope = b.select(b.fcmp_ordered("<", distance, number(0.0)), number(1.0), falling)
         is_in_cell = b.fcmp_ordered("<", distance, number(1.0)), b.fcmp_ordered(">=", distance, number(-1.0))
         return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
