@@ -13,6 +13,7 @@ from a2tg_jax.config import LearningRates as LearningRates
 from a2tg_jax.config import LossConfig as LossConfig
 from a2tg_jax.config import TextureConfig as TextureConfig
 from a2tg_jax.config import TrainConfig as TrainConfig
+from a2tg_jax.cores import set_num_threads as set_num_threads
 from a2tg_jax.data import Scene as Scene
 from a2tg_jax.data import View as View
 from a2tg_jax.data import load_scene as load_scene

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import jax
 
+from a2tg_jax import cores
+
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11))
 """Versions known to have the flags below; an unknown flag would end the process."""
 WHOLE_LOOPS_FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 
 
-def configure_cpu(*, use_cache: bool = True) -> None:
+def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> None:
     """Makes JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
     Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS, of which the user's own settings have
@@ -24,7 +26,14 @@ def configure_cpu(*, use_cache: bool = True) -> None:
     Args:
       use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
         unless JAX has a cache already or reading one would be too noisy (`is_cache_quiet`).
+      num_threads: of native loops (`set_num_threads`); None leaves what is set.
+
+    Raises:
+      ValueError: if the number of threads, here or in the environment, is not a positive integer.
     """
+    if num_threads is not None:
+        cores.set_num_threads(num_threads)
+    cores.num_threads()
     features = _processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
     if use_cache and is_cache_quiet(features) and jax.config.values["jax_compilation_cache_dir"] is None:
