@@ -9,7 +9,10 @@ import itertools
 
 import numpy as np
 
-from a2tg_jax.kernels.threads import Span
+from a2tg_jax.kernels import threads
+
+ROWS_PER_THREAD = 2_000
+"""Fewer rows to be added than these are not worth another thread."""
 
 
 class SumsOfParts:
@@ -23,7 +26,7 @@ class SumsOfParts:
       parts: ranges of tiles.
     """
 
-    def __init__(self, ids: np.ndarray, starts: np.ndarray, images: np.ndarray, results, parts: list[Span]):
+    def __init__(self, ids: np.ndarray, starts: np.ndarray, images: np.ndarray, results, parts: list[threads.Span]):
         for result in results:
             result[...] = 0
         d_splats, d_table, d_tap = self.results = results
@@ -54,25 +57,27 @@ class SumsOfParts:
 
     def add_up(self) -> None:
         """Adds the further rows to the results, in the order of the parts."""
-        d_splats, d_table, d_tap = self.results
         for first, last in itertools.pairwise(self.borders):
-            splats = self.splats[first:last]
-            d_splats[splats] += self.more_splats[first:last]
-            if len(d_tap) == len(d_splats):
-                d_tap[splats] += self.more_tap[first:last]
-            if not self.is_shared and len(self.images):
-                self._add_texels(first, last)
+            # A splat has at most one row of a part, so that threads may share these.
+            spans = threads.even_spans(last - first, ROWS_PER_THREAD)
+            threads.run_spans(self._add_rows, [(first + begin, first + end) for begin, end in spans])
         for table in self.tables[1:] if self.is_shared else ():
-            d_table += table
+            self.results[1][...] += table
 
-    def _add_texels(self, first: int, last: int) -> None:
-        begins, ends = self.ends[first:last], self.ends[first + 1 : last + 1]
-        more = slice(self.ends[first], self.ends[last])
-        entries = np.arange(more.start, more.stop) + np.repeat(self.images[first:last, 0] - begins, ends - begins)
-        self.results[1][entries] += self.more_tables[0][more]
+    def _add_rows(self, first: int, last: int, _: int) -> None:
+        d_splats, d_table, d_tap = self.results
+        splats = self.splats[first:last]
+        d_splats[splats] += self.more_splats[first:last]
+        if len(d_tap) == len(d_splats):
+            d_tap[splats] += self.more_tap[first:last]
+        if not self.is_shared and len(self.images):
+            begins, ends = self.ends[first:last], self.ends[first + 1 : last + 1]
+            entries = np.arange(self.ends[first], self.ends[last])
+            more = self.more_tables[0][self.ends[first] : self.ends[last]]
+            d_table[entries + np.repeat(self.images[first:last, 0] - begins, ends - begins)] += more
 
 
-def _places(ids: np.ndarray, spans: list[Span], num: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
+def _places(ids: np.ndarray, spans: list[threads.Span], num: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """The further row of every pair, −1 where it has none; the splat of every further row; where each part's end.
 
     Args:
@@ -83,13 +88,14 @@ def _places(ids: np.ndarray, spans: list[Span], num: int) -> tuple[np.ndarray, n
     places, is_listed, row = np.full(max(1, spans[-1][1]), -1, np.int32), np.zeros(num, bool), np.empty(num, np.int32)
     again: list[np.ndarray] = []
     borders = [0]
-    for first, last in spans:
+    for index, (first, last) in enumerate(spans):
         listed = ids[first:last]
-        pairs = np.flatnonzero(is_listed[listed])
+        pairs = np.flatnonzero(is_listed[listed]) if index else np.zeros(0, np.int64)
         splats = np.unique(listed[pairs])
         row[splats] = borders[-1] + np.arange(len(splats), dtype=np.int32)
         places[first + pairs] = row[listed[pairs]]
-        is_listed[listed] = True
+        if index + 1 < len(spans):
+            is_listed[listed] = True
         again.append(splats)
         borders.append(borders[-1] + len(splats))
     return places, np.concatenate(again), borders
