@@ -15,20 +15,9 @@ from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import AppearanceRule, PlainRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.geometry import homographies
-from a2tg_jax.kernels import foreign, native, threads
+from a2tg_jax.kernels import native, threads
 from a2tg_jax.render import appearance_of, render_traced
 from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
-
-
-def test_an_error_in_a_handler_reaches_the_caller(capsys):
-    def handler(arguments, results):
-        raise ValueError(f"refused {arguments[0].tolist()}")
-
-    name = foreign.registered("test error", None, lambda: handler)
-    x = jnp.arange(3, dtype=jnp.float32)
-    with pytest.raises(Exception, match=r"refused \[0\.0, 1\.0, 2\.0\]"):
-        jax.block_until_ready(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))(x))
-    assert "ValueError: refused" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("x64")
