@@ -66,6 +66,13 @@ class Appearance:
         limited = jnp.minimum(gaussians.logit_opacities, logit(jnp.asarray(most, gaussians.means.dtype)))
         return dataclasses.replace(gaussians, logit_opacities=limited), params
 
+    def share(self, gaussians: Gaussians, params: Any, layout: Any, num_shares: Array) -> tuple[Gaussians, Any]:
+        """Gaussians and parameters of which num_shares [N] copies, one over the other, show what one did; traceable.
+
+        Relocation asks for it. There is no default, since what splats show is not their Gaussians' alone.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not say how copies share what a splat shows")
+
     # Files.
 
     def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:
