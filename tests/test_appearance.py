@@ -10,6 +10,8 @@ from test_oracle import FACING, FOCAL, hand_scene
 from a2tg_jax import TextureOptions, Textures, render_appearance
 from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Plain, Textured
 from a2tg_jax.appearance.textured import shown_textures
+from a2tg_jax.gaussians import logit
+from a2tg_jax.sharing import share
 from a2tg_jax.texture import allocate_textures
 
 KEY = jax.random.key(0)
@@ -135,8 +137,20 @@ def test_copies_of_a_billboard_show_what_one_did():
     before, after = (np.asarray(one.buckets[0][:40, ..., 3]) for one in (params, shared))
     stacked = 1 - (1 - after) ** np.asarray(num_shares)[:, None, None]
     np.testing.assert_allclose(stacked, before, atol=1e-6)
-    with pytest.raises(NotImplementedError, match="Plain does not say"):
-        Plain().share(gaussians, (), (), num_shares)
+
+
+def test_copies_of_movable_kernels_are_those_of_a_gaussian_as_opaque():
+    appearance = MovableKernels()
+    gaussians, params, layout = allocated(appearance)
+    params = moved(params)
+    num_shares = jnp.arange(40, dtype=jnp.int32) % 4 + 1
+    before = appearance.opacities(gaussians, params, layout)
+    smaller, shared = appearance.share(gaussians, params, layout, num_shares)
+    logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
+    np.testing.assert_allclose(appearance.opacities(smaller, shared, layout), jax.nn.sigmoid(logits), rtol=1e-5)
+    np.testing.assert_array_equal(smaller.log_scales, log_scales)
+    kept = shared.opacities / params.opacities
+    np.testing.assert_allclose(kept, jnp.broadcast_to(kept[:, :1], kept.shape), rtol=1e-5)
 
 
 def test_padding_is_not_the_largest_alpha():

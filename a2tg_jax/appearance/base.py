@@ -17,6 +17,7 @@ from jax import Array
 
 from a2tg_jax.appearance.rule import AppearanceRule
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians, logit
+from a2tg_jax.sharing import share
 
 BYTES_PER_FLOAT = 4
 
@@ -57,6 +58,11 @@ class Appearance:
         zeroed = lambda x: jnp.where(is_cleared.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x)  # noqa: E731
         return jax.tree.map(zeroed, params)
 
+    def share(self, gaussians: Gaussians, params: Any, layout: Any, num_shares: Array) -> tuple[Gaussians, Any]:
+        """Each row as one of num_shares [N] coincident copies that together look like it; traceable."""
+        opacities, scales = share(gaussians.logit_opacities, gaussians.log_scales, num_shares)
+        return dataclasses.replace(gaussians, logit_opacities=opacities, log_scales=scales), params
+
     def opacities(self, gaussians: Gaussians, params: Any, layout: Any) -> Array:
         """[N] how opaque densification takes the splats to be; traceable."""
         return gaussians.opacities
@@ -66,12 +72,9 @@ class Appearance:
         limited = jnp.minimum(gaussians.logit_opacities, logit(jnp.asarray(most, gaussians.means.dtype)))
         return dataclasses.replace(gaussians, logit_opacities=limited), params
 
-    def share(self, gaussians: Gaussians, params: Any, layout: Any, num_shares: Array) -> tuple[Gaussians, Any]:
-        """Gaussians and parameters of which num_shares [N] copies, one over the other, show what one did; traceable.
-
-        Relocation asks for it. There is no default, since what splats show is not their Gaussians' alone.
-        """
-        raise NotImplementedError(f"{type(self).__name__} does not say how copies share what a splat shows")
+    def first_rows(self, params: Any, layout: Any, num: int) -> tuple[Any, Any]:
+        """Parameters and layout of the first `num` rows (host)."""
+        return jax.tree.map(lambda x: x[:num], params), layout
 
     # Files.
 

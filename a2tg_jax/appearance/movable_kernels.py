@@ -20,6 +20,7 @@ from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.rule import PlainRule, gaussian_cutoff
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians, logit
+from a2tg_jax.sharing import LARGEST_OPACITY, share
 
 NUM_KERNELS = 4
 LEAST_WEIGHT = 1e-4
@@ -104,7 +105,7 @@ class MovableKernels(Appearance):
         return params, ()
 
     def rule(self, params: MovableKernelParams, layout: tuple) -> MovableKernelsRule:
-        return MovableKernelsRule(self.max_alpha, kernels=params)
+        return MovableKernelsRule(max_alpha=self.max_alpha, kernels=params)
 
     def project(self, params: MovableKernelParams) -> MovableKernelParams:
         """The kernels with sharpness of 0 at least."""
@@ -116,6 +117,18 @@ class MovableKernels(Appearance):
 
     def num_published_floats(self, layout: tuple, num: int) -> int:
         return PUBLISHED_FLOATS * num
+
+    def share(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple, num_shares: Array):
+        """As Gaussians as opaque as the kernels are on average share theirs; all kernels fade by one factor."""
+        before = self.opacities(gaussians, params, layout)
+        logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
+        faded = params.opacities * (jax.nn.sigmoid(logits) / before)[:, None]
+        is_shared = (num_shares > 1)[:, None]
+        logits = jnp.where(is_shared, logit(jnp.minimum(faded, LARGEST_OPACITY)), params.logit_opacities)
+        return (
+            dataclasses.replace(gaussians, log_scales=log_scales),
+            dataclasses.replace(params, logit_opacities=logits),
+        )
 
     def opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple) -> Array:
         """[N] mean opacity of the kernels; no splat is more opaque anywhere, but for 10⁻⁴ of it."""
