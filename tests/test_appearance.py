@@ -7,7 +7,7 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 from test_oracle import FACING, FOCAL, hand_scene
 
-from a2tg_jax import TextureOptions, Textures, render_appearance
+from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appearance, save_model
 from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Plain, Textured
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.gaussians import logit
@@ -44,6 +44,18 @@ def test_arrays_lead_back(name):
     assert arrays.keys() == again.keys()
     for key in arrays:
         np.testing.assert_array_equal(arrays[key], again[key])
+
+
+@pytest.mark.parametrize("name", APPEARANCES)
+def test_models_are_saved_with_what_they_show(name, tmp_path):
+    gaussians, params, layout = allocated(APPEARANCES[name])
+    model = Model(gaussians, moved(params), layout, num_live=jnp.int32(30), appearance=APPEARANCES[name])
+    save_model(tmp_path / "model.npz", model)
+    loaded, camera = load_model(tmp_path / "model.npz"), as_camera(draw_scene(2, num=3), "float32")
+    assert loaded.appearance == model.appearance and loaded.num == 30
+    expected = model.render(camera).color
+    assert jnp.max(expected) > 0.1
+    np.testing.assert_array_equal(loaded.render(camera).color, expected)
 
 
 @pytest.mark.parametrize("name", ["textured", "movable kernels", "billboards"])
