@@ -45,8 +45,8 @@ class RenderSettings:
     capacity: int | None = None
     """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
     compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
-    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had, and XLA,
-    with a warning, where an appearance rule uses what native loops cannot do."""
+    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had, and
+    XLA, with a warning, where an appearance rule uses what native loops cannot do."""
     tile_batch: int | None = None
     """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
 

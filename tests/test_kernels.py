@@ -1,4 +1,4 @@
-"""The native loops apart from the images they make: translation, threads, lists, errors, other rules and fallback."""
+"""The native loops apart from the images they make: threads, lists, errors, other rules and fallback."""
 
 import dataclasses
 import itertools
@@ -9,65 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from llvmlite import ir
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.geometry import homographies
-from a2tg_jax.kernels import foreign, lanes, library, native, threads
-from a2tg_jax.kernels.writer import LONG, Writer
+from a2tg_jax.kernels import foreign, native, threads
 from a2tg_jax.render import appearance_of, render_traced
 from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
-
-FUNCTIONS = {
-    "arithmetic": lambda x, y: (x + y) * (x - y) / (2 + y * y),
-    "exp": lambda x, y: jnp.exp(x * 10) + jnp.exp(-y),
-    "log and sqrt": lambda x, y: jnp.log(1 + x * x) + jnp.sqrt(y * y),
-    "powers": lambda x, y: x**3 + jnp.square(y) + (2 + x) ** -2,
-    "floor": lambda x, y: jnp.floor(3 * x) + jnp.floor(y).astype(jnp.int32).astype(y.dtype),
-    "choices": lambda x, y: jnp.where((x < y) & ~(x < 0), x, -y) + jnp.where((x != y) | (y > 0), 1.0, 2.0),
-    "limits": lambda x, y: jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y) + jnp.minimum(x, 0.2) + abs(y) + jnp.sign(x),
-    "integers": lambda x, y: (jnp.maximum((x * 9).astype(jnp.int32) * 3 - 1, -2)).astype(x.dtype) + y,
-    "gradient": lambda x, y: jax.grad(lambda x: jnp.clip(x, -0.5, 0.5) * jnp.exp(x) / (1.5 + y))(x),
-}
-
-
-class Elementwise(Writer):
-    """A loop that applies a function of two numbers to arrays."""
-
-    def __init__(self, function, dtype: str, width: int, name: str):
-        self.module = ir.Module(name)
-        super().__init__(self.module, name, ("x", "y", "out"), ("num",), dtype)
-        number = jax.ShapeDtypeStruct((), dtype)
-        traced, _ = lanes.trace(function, number, number)
-        at = lanes.Lanes(self.b, width)
-        with self.loop(LONG(0), self.long(self.arguments["num"])) as (k, _):
-            inputs = [self.load(self.arguments[name], k, at.vector(self.real)) for name in "xy"]
-            self.store(at.emit(traced, inputs)[0], self.arguments["out"], k)
-        self.b.ret_void()
-
-
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("width", [1, 4, 8])
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("float64", 1e-13)])
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_translated_functions_are_those_of_jax(name, dtype, tolerance, width):
-    x, y = np.random.default_rng(0).normal(size=(2, 64)).astype(dtype)
-    x[:4], y[:4] = [0, 0.5, -0.5, 0.25], [0, 0.5, 1, 0.25]
-    tag = f"{name}_{dtype}_{width}".replace(" ", "_")
-    addresses = library.compile_module(Elementwise(FUNCTIONS[name], dtype, width, tag).module)
-    out = np.empty_like(x)
-    run = library.as_function(addresses[tag], 3, 1)
-    run(*(array.ctypes.data for array in (x, y, out)), len(x) // width)
-    expected = jax.vmap(FUNCTIONS[name])(jnp.asarray(x), jnp.asarray(y))
-    np.testing.assert_allclose(out, expected, rtol=tolerance, atol=tolerance)
-
-
-def test_what_cannot_be_translated_is_named():
-    with pytest.raises(lanes.Untranslatable, match="'digamma'"):
-        Elementwise(lambda x, y: jax.lax.digamma(x) + y, "float32", 1, "refused")
 
 
 def test_an_error_in_a_handler_reaches_the_caller(capsys):

@@ -113,7 +113,7 @@ def log1p(x: Array) -> Array:
     u = 1.0 + x
     rest = jnp.where(x > 1, 1.0 - (u - x), x - (u - 1.0)) / u
     result = _log_at_ends(u, _log_of_parts(*_parts(u), rest))
-    return jnp.where(jnp.abs(x) < 1e-5, x * (1 - 0.5 * x), result)
+    return jnp.where(jnp.abs(x) < 1e-5, x - 0.5 * x * x, result)
 
 
 def tanh(x: Array) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from llvmlite import ir
 
 from a2tg_jax.kernels.primitives import PRIMITIVES
-from a2tg_jax.kernels.vectors import BOOL, INT, Untranslatable
+from a2tg_jax.kernels.vectors import BOOL, INT, Untranslatable, scalar_type
 
 if TYPE_CHECKING:
     from a2tg_jax.kernels.lanes import Lanes
@@ -53,13 +53,13 @@ def array_of(values: Sequence[Any], shape: Sequence[int]) -> Any:
 
 
 def map_entries(emit: Callable[[list[ir.Value]], ir.Value], operands: Sequence[Any]) -> Any:
-    """An element-wise primitive: of scalars, or entry by entry of arrays of one shape."""
-    arrays = [operand for operand in operands if isinstance(operand, np.ndarray)]
-    if not arrays:
+    """An element-wise primitive: of scalars, or entry by entry of arrays, axes of length 1 broadcast."""
+    shapes = [operand.shape for operand in operands if isinstance(operand, np.ndarray)]
+    if not shapes:
         return emit(list(operands))
-    shape = arrays[0].shape
-    per_entry = zip(*(entries(x) if isinstance(x, np.ndarray) else [x] * math.prod(shape) for x in operands))  # noqa: B905
-    return array_of([emit(list(numbers)) for numbers in per_entry], shape)
+    shape = np.broadcast_shapes(*shapes)
+    rows = [list(np.broadcast_to(operand, shape).flat) for operand in operands]
+    return array_of([emit(list(numbers)) for numbers in zip(*rows, strict=True)], shape)
 
 
 def call(lanes: Lanes, operands: list, equation) -> list:
@@ -220,14 +220,23 @@ def _concatenate(lanes: Lanes, operands: list, equation) -> list:
     return [np.concatenate(operands, axis=equation.params["dimension"])]
 
 
+def _stack(lanes: Lanes, operands: list, equation) -> list:
+    shape, axis = equation.outvars[0].aval.shape, equation.params["axis"]
+    flat = [entry for operand in operands for entry in entries(operand)]
+    first = [len(operands), *np.delete(shape, axis).tolist()]
+    return [np.moveaxis(array_of(flat, first), 0, axis)]
+
+
 def _reduction(name: str):
     def emit(lanes: Lanes, operands: list, equation) -> list:
         (array,), axes = operands, equation.params["axes"]
         combine = lambda x, y: PRIMITIVES[name](lanes, [x, y], equation)  # noqa: E731
         kept = np.moveaxis(array, axes, range(len(axes)))
         rows = kept.reshape(math.prod(kept.shape[: len(axes)]), -1)
-        shape = equation.outvars[0].aval.shape
-        return [array_of([functools.reduce(combine, column) for column in rows.T], shape)]
+        shape, dtype = equation.outvars[0].aval.shape, equation.outvars[0].aval.dtype
+        # As XLA does, which shows where all that is summed is −0.
+        first = [lanes.constant(0, scalar_type(dtype))] if name == "add" else []
+        return [array_of([functools.reduce(combine, [*first, *column]) for column in rows.T], shape)]
 
     return emit
 
@@ -248,6 +257,7 @@ STRUCTURE: dict[str, Callable[[Lanes, list, Any], list]] = {
     "rev": _shaped(lambda operand, params: np.flip(operand, params["dimensions"])),
     "scan": _scan,
     "slice": _shaped(_slice),
+    "stack": _stack,
     "squeeze": _shaped(lambda operand, _: operand),
     "transpose": _shaped(lambda operand, params: np.transpose(operand, params["permutation"])),
     "while": _while,
