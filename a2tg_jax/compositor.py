@@ -21,6 +21,7 @@ from a2tg_jax import bilinear, pixel
 from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.bilinear import Image
 from a2tg_jax.kernels.choice import Compositor
+from a2tg_jax.kernels.manual_axes import cotangent_of
 from a2tg_jax.numerics import pixel_sum, spread
 from a2tg_jax.tiles import TileGrid, TileLists
 
@@ -112,7 +113,8 @@ def _composite_tiles_bwd(how, residuals, cotangents):
     g, g_transmittance = cotangents
     behind = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
     backward = _backward if how.compositor == "xla" else _accelerated(how).backward
-    d_splats, d_params, d_tap = backward(how, splats, params, rule, lists, jacobian, tap, g, behind)
+    cotangents = backward(how, splats, params, rule, lists, jacobian, tap, g, behind)
+    d_splats, d_params, d_tap = cotangent_of((splats, params, tap), cotangents)
     return d_splats, d_params, None, None, None, d_tap
 
 
