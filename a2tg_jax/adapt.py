@@ -1,22 +1,29 @@
 """Where texels go: the gradient statistic, the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
 
-An event of stage 2 reads: average the statistic, propose `next_sizes`, `select` who gets them, `reallocate`. All but
-the statistic runs on the host, on whole arrays.
+The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select` choose who gets them, and calls
+`reallocate`. All but the statistic runs on the host, on whole arrays.
 """
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.numerics import safe_divide
-from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
+from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
+from a2tg_jax.model import Model
+from a2tg_jax.numerics import safe_divide, safe_norm
+from a2tg_jax.optim import AdamState
+from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, plan_layout
 
 BYTES_PER_TEXEL = 16
+PAPER_ITERATIONS = 30_000
+EARLY_EVENTS = (0.15, 0.30)
+"""Upscaling in short second stages, where n/60 and n/30 would leave the statistic no time to settle."""
 
 
 @jax.tree_util.register_dataclass
@@ -34,7 +41,7 @@ class GradientStatistics:
         """Empty sums for `num` Gaussians."""
         return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
 
-    def accumulate(self, norms: Array, is_visible: Array) -> "GradientStatistics":
+    def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
         """Adds one view: `norms` [N] counts where `is_visible` [N]."""
         total = self.total + jnp.where(is_visible, norms, 0.0)
         return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
@@ -53,7 +60,90 @@ class ReallocateResult(NamedTuple):
     """As given, carried along with the texels."""
 
 
-def next_sizes(sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: bool = True) -> np.ndarray:
+_compiled_shapes: set[Shape] = set()
+"""Shapes that steps of this process have been compiled for. They change padding only, never a result."""
+
+
+@event
+class Upscale(HostEvent):
+    """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
+
+    select: Literal["fraction", "threshold", "budget"] = static(default="fraction")
+    """How the Gaussians to upscale are chosen (`select`)."""
+    fraction: float = 0.25
+    """Share of the Gaussians upscaled at each event."""
+    threshold: float | None = None
+    """Smallest average gradient that is upscaled (k_G)."""
+    budget_mb: float | None = None
+    """Reported memory never exceeds this many MB (10^6 bytes)."""
+    anisotropic: bool = static(default=True)
+    """Double one axis only on thin Gaussians; off: always both."""
+    axes: Literal["paper", "authors"] = static(default="paper")
+    """Which axis of a thin Gaussian doubles (`next_sizes`)."""
+    k_a: float = 4.0
+    """Aspect ratio above which a Gaussian counts as elongated."""
+    k_s: float = 0.01
+    """Shorter scale, in units of the normalised world, below which an elongated Gaussian counts as thin."""
+    cap: int = static(default=4)
+    """Largest texture side in texels (at most 16)."""
+    at: tuple[float, ...] | None = static(default=None)
+    """Fractions of the stage after which textures grow; None: the paper's 1/60 and 1/30, under 30,000 iterations 0.15
+    and 0.30."""
+    gradient: Statistic = static(default="position")
+    """The gradient that is averaged: by position in the world, as the paper has it, or "screen": by the position on
+    the screen, in units of half an image, and only where the low-pass filter decides, as in the authors' program."""
+
+    @property
+    def statistic(self) -> Statistic:
+        return self.gradient
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        fractions = self.at
+        if fractions is None:
+            fractions = EARLY_EVENTS if num_iterations < PAPER_ITERATIONS else (1 / 60, 1 / 30)
+        if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
+            raise ValueError(f"texture.upscale_at must be ascending fractions between 0 and 1; got {fractions}")
+        return tuple(max(1, round(fraction * num_iterations)) for fraction in fractions)
+
+    def init(self, model: Model) -> GradientStatistics:
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+
+    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
+        for gradient, is_visible in zip(seen.gradients, seen.is_visible, strict=True):
+            if self.gradient != "position":
+                half = jnp.asarray([seen.cameras.width / 2, seen.cameras.height / 2, 1.0], gradient.dtype)
+                gradient = gradient * half[None]
+            state = state.observe(safe_norm(gradient), is_visible)
+        return state
+
+    def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
+        layout, num = model.layout, model.num
+        proposed = next_sizes(
+            layout.sizes, np.asarray(model.gaussians.scales), k_a=self.k_a, k_s=self.k_s, cap=self.cap,
+            anisotropic=self.anisotropic, axes=self.axes,
+        )  # fmt: skip
+        how = self._how_to_select(model.num_bytes, index, count)
+        mask = select(np.asarray(state.average()), layout.sizes, proposed, **how)
+        mask &= np.arange(layout.num) < num
+        new_sizes = np.where(mask[:, None], proposed, layout.sizes)
+        (mu_gaussians, mu), (nu_gaussians, nu) = moments.mu, moments.nu
+        rebuilt = reallocate(model.params, layout, new_sizes, (mu, nu), tuple(_compiled_shapes))
+        mu, nu = rebuilt.moments
+        _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
+        moments = dataclasses.replace(moments, mu=(mu_gaussians, mu), nu=(nu_gaussians, nu))
+        model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
+        return Change(model, moments, self.init(model))
+
+    def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
+        """The keyword that tells `select` how to choose."""
+        if self.select == "budget":
+            return {"budget_bytes": event_budget(1e6 * (self.budget_mb or 0.0), used_bytes, index, count)}
+        return {self.select: getattr(self, self.select)}
+
+
+def next_sizes(
+    sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: bool = True, axes: str = "paper"
+) -> np.ndarray:
     """The texture sizes one upscaling would give (A²TG, anisotropic upscaling).
 
     s_x/s_y > k_A and s_y < k_S: Tu doubles. s_y/s_x > k_A and s_x < k_S: Tv doubles. Otherwise both double. Each
@@ -66,6 +156,7 @@ def next_sizes(sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: 
       k_s: shorter scale below which an elongated Gaussian is thin.
       cap: largest side.
       anisotropic: False doubles both axes always.
+      axes: "paper", or "authors": their program doubles the short axis of a thin Gaussian, Tv where s_x is the longer.
 
     Returns:
       [N, 2] int64 (Tv, Tu), nowhere below `sizes`.
@@ -79,6 +170,8 @@ def next_sizes(sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: 
     s_x, s_y = scales.T
     is_thin_u = anisotropic & (s_x > k_a * s_y) & (s_y < k_s)
     is_thin_v = anisotropic & (s_y > k_a * s_x) & (s_x < k_s)
+    if axes == "authors":
+        is_thin_u, is_thin_v = is_thin_v, is_thin_u
     doubles = np.stack([~is_thin_u, ~is_thin_v], axis=1)
     return np.where(doubles, np.maximum(sizes, np.minimum(2 * sizes, cap)), sizes)
 
@@ -156,7 +249,9 @@ def event_budget(total_bytes: float, current_bytes: float, event_index: int, num
     return int((total_bytes - current_bytes) // (num_events - event_index + 1))
 
 
-def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None) -> ReallocateResult:
+def reallocate(
+    textures: Textures, layout: AtlasLayout, new_sizes, moments=None, known: Sequence[Shape] = ()
+) -> ReallocateResult:
     """Rebuilds the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
     Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding
@@ -167,6 +262,7 @@ def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None)
       layout: their layout, of N Gaussians.
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
       moments: any pytree of `Textures`, such as (mu, nu) of Adam.
+      known: shapes of buckets to prefer (`texture.plan_layout`).
 
     Raises:
       ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
@@ -174,7 +270,7 @@ def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None)
     new_sizes = np.asarray(new_sizes)
     if new_sizes.shape != (layout.num, 2):
         raise ValueError(f"new_sizes must be [{layout.num}, 2]; got {new_sizes.shape}")
-    new_layout, capacities = plan_layout(new_sizes)
+    new_layout, capacities = plan_layout(new_sizes, known)
     moves = _plan_moves(layout, new_layout)
 
     def rebuild(tree: Textures, padding: tuple[float, ...]) -> Textures:

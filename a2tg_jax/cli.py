@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.config import DensifyConfig, LearningRates, TextureConfig, TrainConfig
 from a2tg_jax.data import Scene, run_sfm
+from a2tg_jax.metrics import load_lpips
 from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import PHASES, Phase, RunFolder, check_free, create_run, open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
@@ -24,6 +25,7 @@ from a2tg_jax.results.record import SYNTHETIC, RunRecord, SceneSource, changed_f
 from a2tg_jax.results.summary import summary_text
 from a2tg_jax.results.train_run import train_run
 from a2tg_jax.startup import configure_cpu
+from a2tg_jax.training import check_config
 
 PRESETS = {"paper": TrainConfig.paper, "quick": TrainConfig.quick}
 DEMO_SOURCE = SceneSource(SYNTHETIC)
@@ -273,7 +275,10 @@ def _value_of(flag: str, arguments: list[str]) -> str:
 
 
 def _begin(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None = None) -> None:
-    """Makes the run folder, once it is sure that the scene can be loaded, and trains."""
+    """Makes the run folder, once all about the new run has been checked, and trains."""
+    check_config(record.config)
+    if lpips_weights is not None:
+        load_lpips(lpips_weights)
     check_free(out, overwrite=overwrite)
     scene = record.source.load()
     run = create_run(out, overwrite=overwrite)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial import cKDTree
 
+from a2tg_jax.checks import check_floats, dtype_of, short_repr
 from a2tg_jax.numerics import safe_divide, safe_sqrt
 
 FLOATS_PER_GAUSSIAN = 58
@@ -53,6 +54,23 @@ class Gaussians:
         """The Gaussians of the given rows (slice, mask or index array)."""
         return jax.tree.map(lambda x: x[rows], self)
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
+    """Raises ValueError, naming the field, unless all fields have their shapes and one float dtype."""
+    if not isinstance(gaussians, Gaussians):
+        raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
+    check_floats(f"{name}.means", gaussians.means, ("N", 3))
+    num, dtype = gaussians.num, dtype_of(gaussians.means)
+    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, 16, 3)}
+    for field, shape in shapes.items():
+        value = getattr(gaussians, field)
+        check_floats(f"{name}.{field}", value, shape)
+        if dtype_of(value) != dtype:
+            raise ValueError(f"{name}.{field} must be {dtype} as the means are; got {dtype_of(value)}")
+
 
 def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
     """The columns of the rotation of a quaternion (w, x, y, z), which is normalised first; element-wise."""
@@ -77,17 +95,20 @@ def logit(p: Array) -> Array:
     return jnp.log(p) - jnp.log1p(-p)
 
 
-def init_from_points(points, colors, num: int | None = None, seed: int = 0) -> Gaussians:
+def init_from_points(
+    points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY
+) -> Gaussians:
     """Initial Gaussians from points of a sparse reconstruction.
 
     log-scale = log of the root mean square distance to the 3 nearest neighbours (both axes), uniformly random
-    rotations, opacity 0.1, SH degree 0 from the point's colour, higher degrees 0.
+    rotations, one opacity, SH degree 0 from the point's colour, higher degrees 0.
 
     Args:
       points: [P, 3] positions, P >= 2.
       colors: [P, 3] colours in [0, 1].
       num: how many Gaussians; None or anything >= P takes all the points, less draws that many without replacement.
       seed: of the drawing and of the rotations.
+      opacity: of every Gaussian, between 0 and 1.
 
     Returns:
       float32 Gaussians, min(num, P) of them.
@@ -118,6 +139,6 @@ def init_from_points(points, colors, num: int | None = None, seed: int = 0) -> G
         means=as_float(points),
         quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
         log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
-        logit_opacities=as_float(np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))),
+        logit_opacities=as_float(np.full(count, np.log(opacity / (1 - opacity)))),
         sh=as_float(sh),
     )

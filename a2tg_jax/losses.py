@@ -22,7 +22,7 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
 
-def photometric_loss(image: Array, target: Array, *, ssim_weight: float = 0.2) -> Array:
+def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array = 0.2) -> Array:
     """(1 - w)·L1 + w·(1 - SSIM), the loss of 3DGS; L1 is the mean over all pixels and channels.
 
     Args:
@@ -35,7 +35,7 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float = 0.2) -
     """
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
-    if ssim_weight == 0:
+    if isinstance(ssim_weight, (int, float)) and ssim_weight == 0:
         return l1
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(image, target))
 

@@ -6,24 +6,24 @@ the image stays nearly the same.
 """
 
 import dataclasses
+import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.gaussians import Gaussians, logit, rotation_matrices
+from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, event, gather_rows, static
+from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.model import Model
+from a2tg_jax.optim import AdamState
+from a2tg_jax.sharing import DEAD_OPACITY, MAX_SHARES, share
+from a2tg_jax.texture import bucket_capacity
 
-DEAD_OPACITY = 0.005
-MAX_SHARES = 51
-LARGEST_OPACITY = 1 - 2**-23
 NOISE_SCALE = 5e5
 NOISE_STEEPNESS = 100.0
 NOISE_TRANSPARENCY = 0.995
-
-QUADRATURE_END = 5.0
-QUADRATURE_STEPS = 32
 
 
 class MoveInfo(NamedTuple):
@@ -68,13 +68,8 @@ def relocate(key: Array, gaussians: Gaussians, moments, num_live: Array | int) -
     """
     _check_moments(gaussians, moments)
     num_live = jnp.asarray(num_live, jnp.int32)
-    is_live, is_host = _live_and_hosts(gaussians, num_live)
-    is_dead = is_live & ~is_host
-    has_hosts = jnp.any(is_host)
-    hosts = draw_hosts(key, gaussians.opacities, is_host)
-    gaussians, is_drawn = _copy_hosts(gaussians, hosts, is_dead & has_hosts)
-    info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
-    return MoveResult(gaussians, _zero_rows(moments, is_drawn), num_live, info)
+    moves = plan_relocation(key, gaussians.opacities, num_live)
+    return MoveResult(_copy_hosts(gaussians, moves), _zero_rows(moments, moves.is_reset), num_live, moves.info)
 
 
 def grow(key: Array, gaussians: Gaussians, moments, num_live: Array | int, cap: Array | int) -> MoveResult:
@@ -99,16 +94,44 @@ def grow(key: Array, gaussians: Gaussians, moments, num_live: Array | int, cap: 
     if not isinstance(cap, jax.core.Tracer) and int(cap) > gaussians.num:
         raise ValueError(f"cap must be at most the {gaussians.num} rows that are allocated; got {int(cap)}")
     num_live = jnp.asarray(num_live, jnp.int32)
-    is_live, is_host = _live_and_hosts(gaussians, num_live)
+    moves = plan_growth(key, gaussians.opacities, num_live, cap)
+    moments = _zero_rows(moments, moves.is_reset)
+    return MoveResult(_copy_hosts(gaussians, moves), moments, num_live + moves.info.num_added, moves.info)
+
+
+class Moves(NamedTuple):
+    """Which rows become copies of which; N rows, all traced."""
+
+    rows: Array
+    """[N] int32: row i becomes a copy of row rows[i], after sharing."""
+    num_shares: Array
+    """[N] int32: how many copies a row is shared among, 1 to 51."""
+    is_reset: Array
+    """[N]: rows whose moments become zero."""
+    info: MoveInfo
+
+
+def plan_relocation(key: Array, opacities: Array, num_live: Array) -> Moves:
+    """What `relocate` does to rows of these opacities [N], of which the first `num_live` exist."""
+    is_live, is_host = _live_and_hosts(opacities, num_live)
+    is_dead = is_live & ~is_host
+    has_hosts = jnp.any(is_host)
+    rows, num_draws = _copied_rows(draw_hosts(key, opacities, is_host), is_dead & has_hosts)
+    info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
+    return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), num_draws > 0, info)
+
+
+def plan_growth(key: Array, opacities: Array, num_live: Array, cap: Array | int) -> Moves:
+    """What `grow` does to rows of these opacities [N], of which the first `num_live` exist."""
+    is_live, is_host = _live_and_hosts(opacities, num_live)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
     wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), jnp.maximum(num_live + 1, num_live + num_live // 20))
     grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
-    is_added = ~is_live & (jnp.arange(gaussians.num, dtype=jnp.int32) < grown)
-    hosts = draw_hosts(key, gaussians.opacities, is_host)
-    gaussians, is_drawn = _copy_hosts(gaussians, hosts, is_added)
+    is_added = ~is_live & (jnp.arange(opacities.shape[0], dtype=jnp.int32) < grown)
+    rows, num_draws = _copied_rows(draw_hosts(key, opacities, is_host), is_added)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
-    return MoveResult(gaussians, _zero_rows(moments, is_drawn | is_added), grown, info)
+    return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), (num_draws > 0) | is_added, info)
 
 
 def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array | float) -> Gaussians:
@@ -134,60 +157,6 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
     strength = gate * (jnp.asarray(lr, dtype) * NOISE_SCALE)
     is_live = jnp.arange(gaussians.num, dtype=jnp.int32) < jnp.asarray(num_live, jnp.int32)
     return dataclasses.replace(gaussians, means=jnp.where(is_live[:, None], means + shift * strength[:, None], means))
-
-
-def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple[Array, Array]:
-    """Opacity and size with which `num_shares` coincident copies replace one Gaussian (3DGS-MCMC, relocation).
-
-    o' = 1 - (1 - o)^(1/N), clamped to [0.005, 1 - 2⁻²³], keeps the opacity at the centre; the scales, multiplied by
-    o / S(o', N), keep the integral of the opacity along a line through it.
-
-    Args:
-      logit_opacities: [N] of the originals.
-      log_scales: [N, 2] of the originals.
-      num_shares: [N] integers of at least 1; 1 leaves a row as it is.
-
-    Returns:
-      logit_opacities [N] and log_scales [N, 2] of each copy.
-    """
-    dtype = logit_opacities.dtype
-    # log(1 - o) straight from the logit: 1 - o itself has no digits left when o is close to 1.
-    log_transparency = jax.nn.log_sigmoid(-logit_opacities)
-    opacities = -jnp.expm1(log_transparency / num_shares.astype(dtype))
-    opacities = jnp.clip(opacities, DEAD_OPACITY, LARGEST_OPACITY)
-    log_ratio = jax.nn.log_sigmoid(logit_opacities) - jnp.log(stacked_integral(opacities, num_shares))
-    is_shared = num_shares > 1
-    return (
-        jnp.where(is_shared, logit(opacities), logit_opacities),
-        jnp.where(is_shared[:, None], log_scales + log_ratio[:, None], log_scales),
-    )
-
-
-def stacked_integral(opacities: Array, num_shares: Array) -> Array:
-    """S = π^(-1/2)·∫ [1 - (1 - o·e^(-x²))^N] dx: the opacity of N coincident Gaussians, integrated along a line.
-
-    Equal to the binomial double sum of 3DGS-MCMC, without its cancellation. The integrand is even and entire, so the
-    trapezoidal rule converges exponentially: 32 steps on [0, 5] are off by less than 1e-10 for N up to 51.
-
-    Args:
-      opacities: [N] in (0, 1).
-      num_shares: [N] integers, 1 to 51.
-
-    Returns:
-      [N], positive; `opacities` itself where `num_shares` is 1.
-    """
-    count = num_shares.astype(opacities.dtype)
-    spacing = QUADRATURE_END / QUADRATURE_STEPS
-
-    def integrand(x: float | Array) -> Array:
-        return -jnp.expm1(count * jnp.log1p(-opacities * jnp.exp(-jnp.asarray(x * x, opacities.dtype))))
-
-    def add_node(node: Array, total: Array) -> Array:
-        return total + integrand(node.astype(opacities.dtype) * spacing)
-
-    # A loop over nodes, not an axis of nodes: the memory stays that of one value per row.
-    half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
-    return half * (2 * spacing / math.sqrt(math.pi))
 
 
 def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
@@ -231,21 +200,22 @@ def _first_above(tables: Array, which: Array, targets: Array) -> Array:
     return column
 
 
-def _live_and_hosts(gaussians: Gaussians, num_live: Array) -> tuple[Array, Array]:
+def _live_and_hosts(opacities: Array, num_live: Array) -> tuple[Array, Array]:
     """[N] which rows are live, and which of those are above the death opacity."""
-    is_live = jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
-    return is_live, is_live & (gaussians.opacities > DEAD_OPACITY)
+    is_live = jnp.arange(opacities.shape[0], dtype=jnp.int32) < num_live
+    return is_live, is_live & (opacities > DEAD_OPACITY)
 
 
-def _copy_hosts(gaussians: Gaussians, hosts: Array, is_target: Array) -> tuple[Gaussians, Array]:
-    """Overwrites the target rows with their hosts' after sharing; also [N], which rows served as a host."""
-    num_draws = jnp.zeros(gaussians.num, jnp.int32).at[hosts].add(is_target.astype(jnp.int32))
-    logit_opacities, log_scales = share(
-        gaussians.logit_opacities, gaussians.log_scales, jnp.minimum(num_draws + 1, MAX_SHARES)
-    )
-    shared = dataclasses.replace(gaussians, logit_opacities=logit_opacities, log_scales=log_scales)
-    source = jnp.where(is_target, hosts, jnp.arange(gaussians.num, dtype=jnp.int32))
-    return shared[source], num_draws > 0
+def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
+    """[N] the row that each row copies, its host where it is a target; and [N] how often each is drawn."""
+    num_draws = jnp.zeros(hosts.shape[0], jnp.int32).at[hosts].add(is_target.astype(jnp.int32))
+    return jnp.where(is_target, hosts, jnp.arange(hosts.shape[0], dtype=jnp.int32)), num_draws
+
+
+def _copy_hosts(gaussians: Gaussians, moves: Moves) -> Gaussians:
+    """Rows copied from their hosts after sharing."""
+    shared = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
+    return dataclasses.replace(gaussians, logit_opacities=shared[0], log_scales=shared[1])[moves.rows]
 
 
 def _zero_rows(tree, is_zeroed: Array):
@@ -258,3 +228,60 @@ def _check_moments(gaussians: Gaussians, moments) -> None:
     for leaf in jax.tree.leaves(moments):
         if leaf.ndim == 0 or leaf.shape[0] != gaussians.num:
             raise ValueError(f"every leaf of moments must have {gaussians.num} rows; got shape {leaf.shape}")
+
+
+def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
+    """When densification happens: the paper's 500, 25,000 and every 100 of 30,000 iterations, scaled."""
+    every = max(10, round(num_iterations / 300))
+    return Times(round(num_iterations / 60), int(last * num_iterations + 1e-9), every)
+
+
+@event
+class Noise(StepEvent):
+    """Exploration noise on the means, after every iteration (`perturb`)."""
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+        num_live = model.gaussians.num if model.num_live is None else model.num_live
+        gaussians = perturb(now.keys[0], model.gaussians, num_live, now.rate_of_means)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+@event
+class Mcmc(StepEvent):
+    """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), of whatever appearance."""
+
+    cap: int = static(default=500_000)
+    """Largest number of Gaussians."""
+
+    num_keys: ClassVar[int] = 2
+    impossible: ClassVar[str] = (
+        "no Gaussian above the death opacity is left: check the cameras and points of the scene, or lower "
+        "rates.logit_opacities"
+    )
+
+    def times(self, num_iterations: int) -> Times:
+        return densify_times(num_iterations)
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        """Growth from `num` by the end of the stage, rounded up so that few shapes occur; at most the cap."""
+        times = self.times(num_iterations)
+        for iteration in range(times.every, times.last + 1, times.every):
+            if num < self.cap and iteration >= times.first:
+                num = min(self.cap, max(num + 1, num + num // 20))
+        return max(num, min(self.cap, bucket_capacity(num)))
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+        moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
+        plan = functools.partial(plan_growth, now.keys[1], cap=min(self.cap, model.gaussians.num))
+        model, moments, info = self._move(moved, moments, plan)
+        return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
+
+    @staticmethod
+    def _move(model: Model, moments: AdamState, plan) -> tuple[Model, AdamState, MoveInfo]:
+        appearance, layout = model.appearance, model.layout
+        num_live = jnp.asarray(model.gaussians.num if model.num_live is None else model.num_live, jnp.int32)
+        moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)
+        gaussians, params = appearance.share(model.gaussians, model.params, layout, moves.num_shares)
+        num_live = num_live + moves.info.num_added
+        shared = dataclasses.replace(model, gaussians=gaussians, params=params, num_live=num_live)
+        return gather_rows(shared, moves.rows), clear_moments(model, moments, moves.is_reset), moves.info

@@ -14,16 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule, PlainAppearance
-from a2tg_jax.cameras import Camera
+from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
+from a2tg_jax.cameras import Camera, check_camera
+from a2tg_jax.checks import check_shape
 from a2tg_jax.compositor import Compositing, Splats, composite
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose, instead_of_native
-from a2tg_jax.lookup import TextureOptions, textured_appearance
+from a2tg_jax.pixel import Statistic
 from a2tg_jax.sh import sh_colors
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
 
 HEAD_ROOM = 1.25
@@ -114,13 +115,27 @@ def render_appearance(
     *,
     background: Any = (0, 0, 0),
     settings: RenderSettings = RenderSettings(),
+    num_live: Array | int | None = None,
 ) -> RenderOutput:
-    """As `render_image`, of splats that show what `rule` says."""
+    """As `render_image`, of splats that show what `rule` says; only the first `num_live` rows, where that is given."""
+    check_gaussians(gaussians)
+    check_camera(camera)
+    check_background(background)
     if settings.capacity is None:
-        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings))
+        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings, num_live))
     background = jnp.asarray(background, gaussians.means.dtype)
-    output, _ = _jitted_render()(gaussians, camera, rule, background, settings)
+    output, _ = _jitted_render()(gaussians, camera, rule, background, settings, num_live=num_live)
     return output
+
+
+def check_background(background: Any) -> None:
+    """Raises ValueError unless it is one colour."""
+    if np.ndim(background) == 3:
+        raise ValueError(
+            f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
+            "render on black and add (1 - output.alpha[..., None]) * image"
+        )
+    check_shape("background", background, (3,))
 
 
 @functools.cache
@@ -139,6 +154,7 @@ def render_traced(
     sh_degree: Any = None,
     num_live: Any = None,
     tap: Array | None = None,
+    statistic: Statistic | None = "position",
 ) -> tuple[RenderOutput, Array]:
     """What training differentiates: the output, and how many pairs the view has, for `capacity_for`.
 
@@ -148,7 +164,8 @@ def render_traced(
       has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
       sh_degree: overrides the settings' by a value that may be traced.
       num_live: only the first so many rows show; may be traced.
-      tap: [N, 4] zeros, at which the gradient is the absolute positional gradient (`compositor.composite`).
+      tap: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
+      statistic: which (`pixel.positional_gradient`); not used without a tap.
     """
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     compositor = choose(settings.compositor, settings.tile_size)
@@ -156,7 +173,7 @@ def render_traced(
         grid=grid,
         near_plane=settings.near_plane,
         has_geometry=has_geometry,
-        has_statistic=tap is not None,
+        statistic=None if tap is None else statistic,
         compositor=compositor,
         tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
     )
@@ -167,18 +184,18 @@ def render_traced(
         return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings, degree, num_live)
-    if compositor == "native" and (reason := native.refusal(how, splats, rule)):
+    if compositor == "native" and (reason := native.refusal(how, rule, splats)):
         settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
         return render_traced(
             gaussians, camera, rule, background, settings,
-            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, tap=tap,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, tap=tap, statistic=statistic,
         )  # fmt: skip
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
     M = jax.lax.stop_gradient(splats.M)
     lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
-    channels, transmittance = composite(how, splats, rule, lists, jacobian, tap)
+    channels, transmittance = composite(how, splats, rule, cutoff, lists, jacobian, tap)
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
     channels, transmittance = channels + taint, transmittance + taint
     return _output(how, channels, transmittance, background, lists.overflow), lists.num_pairs
@@ -201,22 +218,43 @@ def plan_render(
     textures: Textures | None = None,
     layout: AtlasLayout | None = None,
     *,
+    rule: AppearanceRule | None = None,
+    head_room: float = HEAD_ROOM,
     settings: RenderSettings = RenderSettings(),
 ) -> RenderSettings:
     """The settings with a capacity that suffices for every one of the cameras, with head room (host).
 
+    Args:
+      gaussians: N Gaussians.
+      cameras: one or more.
+      textures, layout: their textures; neither, and the splats are plain 2DGS.
+      rule: what the splats show, instead of textures.
+      head_room: factor, at least 1, on the pairs of the fullest view.
+      settings: all but the capacity.
+
     Raises:
-      ValueError: if called under a transformation, where shapes cannot be chosen.
+      ValueError: if there is no camera, if both textures and a rule are given, or if called under a transformation,
+        where shapes cannot be chosen.
     """
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-    rule = appearance_of(gaussians, textures, layout, settings)
+    if not cameras:
+        raise ValueError("cameras must be one camera at least; got none")
+    if not head_room >= 1:
+        raise ValueError(f"head_room must be at least 1; got {head_room}")
+    if rule is None:
+        rule = appearance_of(gaussians, textures, layout, settings)
+    elif textures is not None or layout is not None:
+        raise ValueError("rule already says what the splats show: give it, or textures and layout")
+    check_gaussians(gaussians)
+    for camera in cameras:
+        check_camera(camera)
     most = max(pairs_of_view(gaussians, camera, rule, settings) for camera in cameras)
-    return dataclasses.replace(settings, capacity=capacity_for(most))
+    return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 
-def capacity_for(pairs: int) -> int:
+def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
     """A capacity with head room for so many pairs, rounded up so that few distinct shapes occur."""
-    return max(1024, -(-int(pairs * HEAD_ROOM) // 1024) * 1024)
+    return max(1024, -(-int(pairs * head_room) // 1024) * 1024)
 
 
 def appearance_of(
@@ -226,18 +264,19 @@ def appearance_of(
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is None or layout is None:
-        return PlainAppearance()
-    if layout.num != gaussians.num:
-        raise ValueError(f"layout is of {layout.num} textures, but there are {gaussians.num} gaussians")
+        return PlainRule(max_alpha=settings.texture.max_alpha)
+    check_textures(textures, layout, gaussians.num)
     if gaussians.num == 0:
-        return PlainAppearance()
-    return textured_appearance(textures, layout, settings.texture)
+        return PlainRule(max_alpha=settings.texture.max_alpha)
+    return textured_rule(textures, layout, settings.texture)
 
 
-def pairs_of_view(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
-    """(splat, tile) pairs of one view, before the outline test (host)."""
+def pairs_of_view(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """(splat, tile) pairs of one view, of the first `num_live` rows, before the outline test (host)."""
     try:
-        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane))
+        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
@@ -247,20 +286,23 @@ def _jitted_count():
     return jax.jit(_count_pairs, static_argnums=(3, 4))
 
 
-def _count_pairs(gaussians, camera, rule, tile_size, near_plane):
+def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     M, _ = homographies(gaussians, camera)
-    bounds = screen_bounds(M, rule.cutoff(gaussians.opacities), near_plane)
+    cutoff = rule.cutoff(rule.opacities(gaussians))
+    if num_live is not None:
+        cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
+    bounds = screen_bounds(M, cutoff, near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 
 
-def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
-    gaussians, camera, rule = jax.tree.map(_primal_value, (gaussians, camera, rule))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule))):
+def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings, num_live=None) -> int:
+    gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
         )
-    return capacity_for(pairs_of_view(gaussians, camera, rule, settings))
+    return capacity_for(pairs_of_view(gaussians, camera, rule, settings, num_live))
 
 
 def _primal_value(x):
@@ -286,23 +328,30 @@ def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) ->
     """The N splats, and [N] the squared distance within which each shows: not positive where it shows nowhere, NaN
     where it would show, but a number of it is not finite."""
     M, normals = homographies(gaussians, camera)
-    opacities = gaussians.opacities
+    opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
+    if opacities.shape != (gaussians.num,) or numbers.shape[:-1] != (gaussians.num,):
+        raise ValueError(
+            f"a rule gives opacities [N] and numbers [N, K] of N = {gaussians.num} gaussians; {type(rule).__name__} "
+            f"gave {opacities.shape} and {numbers.shape}"
+        )
+    if not 0 < rule.max_alpha < 1:
+        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
     colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
     # Not >=: a depth that is no number is not behind the camera.
     is_drawn = ~(M[:, 2, 2] < settings.near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num) < num_live
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
-    is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors)
+    is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)
     is_shown = (cutoff > 0)[:, None]
     # Rows that show nowhere may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
     M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
-    colors, normals = jnp.where(is_shown, colors, 0.0), jnp.where(is_shown, normals, 0.0)
-    return Splats(M, colors, opacities, normals), cutoff
+    colors, normals, numbers = (jnp.where(is_shown, x, 0.0) for x in (colors, normals, numbers))
+    return Splats(M, colors, opacities, normals, numbers), cutoff
 
 
-def _are_finite(M: Array, colors: Array) -> Array:
+def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:
     """[N] whether all numbers of a splat are."""
-    numbers = [*(M[:, i, k] for i in range(3) for k in range(3)), *(colors[:, k] for k in range(3))]
-    return functools.reduce(jnp.logical_and, map(jnp.isfinite, numbers))
+    columns = [*(M[:, i, k] for i in range(3) for k in range(3)), *colors.T, *numbers.T]
+    return functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))

@@ -223,7 +223,7 @@ def test_an_event_of_a_million_takes_seconds():
 
 def test_statistics_average_over_the_views_that_saw_it():
     stats = GradientStatistics.init(3)
-    accumulate = jax.jit(GradientStatistics.accumulate)
+    accumulate = jax.jit(GradientStatistics.observe)
     stats = accumulate(stats, jnp.asarray([1.0, 5.0, jnp.nan]), jnp.asarray([True, True, False]))
     stats = accumulate(stats, jnp.asarray([3.0, 7.0, 0.0]), jnp.asarray([True, False, False]))
     np.testing.assert_array_equal(stats.average(), [2.0, 5.0, 0.0])

@@ -14,7 +14,7 @@ from PIL import Image
 from a2tg_jax import cli, startup
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.results import train_run as train_run_module
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.folder import RunFolder, create_run
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -78,8 +78,20 @@ def test_no_scene_makes_no_run_folder(capsys, tmp_path):
 
 def test_used_folder_is_refused(capsys, tmp_path):
     (tmp_path / "photo.jpg").touch()
-    assert "is not empty; add --resume" in fails(capsys, "train", "synthetic", "--out", tmp_path)
+    assert "not a run folder" in fails(capsys, "train", "synthetic", "--out", tmp_path)
+    assert "not a run folder" in fails(capsys, "train", "synthetic", "--out", tmp_path, "--overwrite")
     assert "is not empty" in fails(capsys, "demo", "--out", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [("--texture.select", "budget"), ("--lpips-weights", "nowhere.npz"), ("--batch-size", "0"), ("--downscale", "0")],
+)
+def test_nothing_is_overwritten_before_the_new_run_is_checked(capsys, tmp_path, mistake):
+    run = create_run(tmp_path / "run")
+    run.own(run.report).write_text("old")
+    fails(capsys, "train", "synthetic", "--out", run.path, "--overwrite", *mistake)
+    assert run.report.read_text() == "old"
 
 
 def test_resume_and_overwrite_exclude_each_other(capsys, tmp_path):
@@ -140,6 +152,7 @@ def test_flags_fit_the_processor_and_the_version():
     avx512 = frozenset({"avx512f"})
     assert startup.cpu_flags(avx512, (0, 10)) == (startup.WHOLE_LOOPS_FLAG, startup.WIDE_VECTORS_FLAG)
     assert startup.cpu_flags(frozenset(), (0, 10)) == (startup.WHOLE_LOOPS_FLAG,)
+    assert startup.cpu_flags(avx512, (0, 12)) == startup.cpu_flags(avx512, (0, 10))
     assert startup.cpu_flags(avx512, (9, 9)) == ()
 
 
@@ -148,6 +161,42 @@ def test_xla_accepts_the_flags():
     script = "from a2tg_jax.startup import configure_cpu; configure_cpu(); import jax; jax.numpy.ones(3).sum()"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+CACHED = """
+import logging, jax
+from a2tg_jax import startup
+before = jax.config.values["jax_logging_level"], logging.getLogger("jax").level
+startup.configure_cpu()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.jit(lambda x: jax.numpy.sort(x) @ x)(jax.numpy.ones((9, 9))).block_until_ready()
+assert (jax.config.values["jax_logging_level"], logging.getLogger("jax").level) == before
+print("kept" if jax.config.values["jax_compilation_cache_dir"] else "no cache")
+"""
+
+
+def test_programs_are_kept_and_read_again_in_silence(tmp_path):
+    """In a program that has imported JAX already, on any processor."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "XLA_FLAGS": ""}
+    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)
+    counts = []
+    for _ in range(2):
+        command = [sys.executable, "-c", CACHED]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        assert (done.stdout, done.stderr) == ("kept\n", "")
+        counts.append(len([path for path in tmp_path.rglob("*") if path.name.endswith("-cache")]))
+    assert counts[0] == counts[1] > 0
+
+
+def test_a_user_who_asks_for_the_log_gets_it(monkeypatch):
+    asked = []
+    monkeypatch.setattr(startup.jax.config, "update", lambda *given: asked.append(given))
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+    startup.silence_xla()
+    assert not asked
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
+    startup.silence_xla()
+    assert asked == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
 
 
 # A whole run

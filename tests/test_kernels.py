@@ -12,23 +12,12 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import PlainAppearance, gaussian_cutoff
+from a2tg_jax.appearance import AppearanceRule, PlainRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.geometry import homographies
-from a2tg_jax.kernels import foreign, native, threads
+from a2tg_jax.kernels import native, threads
 from a2tg_jax.render import appearance_of, render_traced
 from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
-
-
-def test_an_error_in_a_handler_reaches_the_caller(capsys):
-    def handler(arguments, results):
-        raise ValueError(f"refused {arguments[0].tolist()}")
-
-    name = foreign.registered("test error", None, lambda: handler)
-    x = jnp.arange(3, dtype=jnp.float32)
-    with pytest.raises(Exception, match=r"refused \[0\.0, 1\.0, 2\.0\]"):
-        jax.block_until_ready(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))(x))
-    assert "ValueError: refused" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("x64")
@@ -88,10 +77,10 @@ def test_parts_cover_all_tiles():
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class HalvesAppearance:
+class HalvesRule(AppearanceRule):
     """A rule of another kind: two colours and one opacity a splat, [2N, 3], by the sign of u, and another falloff."""
 
-    params: jax.Array
+    table: jax.Array
     first: jax.Array
     sharpness: float = dataclasses.field(metadata={"static": True})
 
@@ -102,19 +91,12 @@ class HalvesAppearance:
     def texel(self, image, u, v):
         return (u > 0).astype(u.dtype), jnp.zeros_like(v)
 
-    def shade(self, values, u, v):
+    def shade(self, numbers, values, u, v):
         a, b, c = values
         return (a, b * u, c), None
 
-    def falloff(self, rho):
+    def falloff(self, numbers, rho):
         return jnp.exp(-0.5 * rho) / (1 + self.sharpness * rho)
-
-    def cutoff(self, opacities):
-        return gaussian_cutoff(opacities)
-
-    @property
-    def num_bytes(self):
-        return 4 * self.params.size
 
 
 @pytest.mark.usefixtures("x64")
@@ -125,7 +107,7 @@ def test_any_appearance_rule_is_compiled():
     first = jnp.arange(gaussians.num, dtype=jnp.int32) * 2
 
     def loss(gaussians, params, compositor):
-        rule = HalvesAppearance(params, first, 0.2)
+        rule = HalvesRule(params, first, 0.2)
         output = render_appearance(gaussians, camera, rule, settings=RenderSettings(compositor=compositor))
         return jnp.sum(output.color**2), output.color
 
@@ -140,27 +122,29 @@ def test_any_appearance_rule_is_compiled():
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class UntranslatableAppearance(PlainAppearance):
-    def falloff(self, rho):
+class UntranslatableRule(PlainRule):
+    def falloff(self, numbers, rho):
         return jnp.exp(-0.5 * rho) + 0 * jax.lax.digamma(1 + rho)
 
 
 def test_a_rule_without_translation_is_left_to_xla():
     """With "auto", with one warning that names the primitive; with "native" it is an error."""
     scene = draw_scene(9, num=8, width=16, height=16)
-    gaussians, camera, rule = as_gaussians(scene, "float32"), as_camera(scene, "float32"), UntranslatableAppearance()
+    gaussians, camera, rule = as_gaussians(scene, "float32"), as_camera(scene, "float32"), UntranslatableRule()
     show = lambda **settings: render_appearance(gaussians, camera, rule, settings=RenderSettings(**settings)).color  # noqa: E731
-    with pytest.warns(UserWarning, match=r"UntranslatableAppearance is composited by XLA.*'digamma'"):
+    with pytest.warns(UserWarning, match=r"UntranslatableRule is composited by XLA.*'digamma'"):
         found = show()
     show(near_plane=0.3)
     np.testing.assert_array_equal(found, show(compositor="xla"))
-    with pytest.raises(ValueError, match=r"compositor='native' cannot run UntranslatableAppearance.*'digamma'"):
+    with pytest.raises(ValueError, match=r"compositor='native' cannot run UntranslatableRule.*'digamma'"):
         show(compositor="native")
 
 
-@pytest.mark.parametrize("has_textures", [False, True])
-def test_pallas_kernels_are_those_of_xla(has_textures):
-    """Interpreted, on a small scene: the image, the gradient, and the absolute positional gradient."""
+@pytest.mark.parametrize(
+    ("has_textures", "statistic"), [(False, "position"), (True, "position"), (False, "screen"), (False, "center")]
+)
+def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
+    """Interpreted, on a small scene: the image, the gradient, and a statistic."""
     scene = draw_scene(4, num=16, width=19, height=13)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
     textures, layout = as_textures(scene, "float32") if has_textures else (None, None)
@@ -168,7 +152,7 @@ def test_pallas_kernels_are_those_of_xla(has_textures):
     def loss(gaussians, textures, tap, compositor):
         settings = RenderSettings(compositor=compositor, capacity=1024)
         rule = appearance_of(gaussians, textures, layout, settings)
-        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, tap=tap)
+        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, tap=tap, statistic=statistic)
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)
@@ -211,8 +195,8 @@ def test_a_rule_defined_anew_is_compiled_anew():
     def image(residual):
         @jax.tree_util.register_dataclass
         @dataclasses.dataclass(frozen=True)
-        class Anew(PlainAppearance):
-            def shade(self, values, u, v):
+        class Anew(PlainRule):
+            def shade(self, numbers, values, u, v):
                 return (residual * jnp.ones_like(u),) * 3, None
 
         return render_appearance(gaussians, camera, Anew()).color

@@ -32,7 +32,8 @@ from a2tg_jax import (
     render_image,
     texture_arrays,
 )
-from a2tg_jax.render import appearance_of
+from a2tg_jax.appearance import Textured
+from a2tg_jax.model import Model
 
 FIELDS = ("color", "alpha", "depth", "normal")
 rendered = functools.partial(render_scene, dtype="float64")
@@ -233,12 +234,12 @@ def test_quaternion_of_a_rotation():
     np.testing.assert_allclose(oracle.rotation_matrix(quaternion(rotation)), rotation, atol=1e-12)
 
 
-def test_a_rule_reports_the_bytes_of_its_textures():
+def test_a_model_reports_its_bytes():
     scene = draw_scene(0)
     gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
-    rule = appearance_of(gaussians, textures, layout, RenderSettings())
-    assert rule.num_bytes == parameter_bytes(gaussians, layout) - 232 * gaussians.num
-    assert appearance_of(gaussians, None, None, RenderSettings()).num_bytes == 0
+    model = Model(gaussians, textures, layout, appearance=Textured())
+    assert model.num_bytes == parameter_bytes(gaussians, layout)
+    assert Model(gaussians).num_bytes == 232 * gaussians.num
 
 
 @pytest.mark.parametrize("compositor", ["native", "xla"])

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from a2tg_jax.gaussians import Gaussians, logit, rotation_matrices
-from a2tg_jax.mcmc import DEAD_OPACITY, draw_hosts, grow, perturb, relocate, share, stacked_integral
+from a2tg_jax.mcmc import draw_hosts, grow, perturb, relocate
+from a2tg_jax.sharing import DEAD_OPACITY, share, stacked_integral
 
 KEY = jax.random.key(0)
 NUM = 64

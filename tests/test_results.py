@@ -20,7 +20,7 @@ from a2tg_jax.metrics import psnr
 from a2tg_jax.paths import smooth_path
 from a2tg_jax.render import render_image
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
-from a2tg_jax.results.folder import RunFolder, create_run, open_run
+from a2tg_jax.results.folder import create_run, open_run
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.pictures import error_picture, largest_gain, resolution_colors, side_by_side, to_uint8
 from a2tg_jax.results.record import RunRecord, SceneSource, changed_fields, read_record, write_record
@@ -84,9 +84,14 @@ def test_evaluation_measures_the_render():
 
 
 def test_existing_folder_is_refused(tmp_path):
-    (tmp_path / "photo.jpg").touch()
+    run = create_run(tmp_path / "run")
+    run.own(run.report).touch()
     with pytest.raises(FileExistsError, match=r"is not empty; add --resume .* --overwrite"):
-        create_run(tmp_path)
+        create_run(tmp_path / "run")
+    (tmp_path / "photo.jpg").touch()
+    for overwrite in (False, True):
+        with pytest.raises(FileExistsError, match="is not empty and not a run folder"):
+            create_run(tmp_path, overwrite=overwrite)
     with pytest.raises(FileExistsError, match="is a file"):
         create_run(tmp_path / "photo.jpg", overwrite=True)
 
@@ -97,14 +102,34 @@ def test_folder_of_a_run_that_never_began_is_free(tmp_path):
 
 
 def test_overwrite_deletes_only_what_runs_write(tmp_path):
-    run = RunFolder(tmp_path)
+    run = create_run(tmp_path / "run")
     write_record(run, RECORD)
     own = [run.model("stage1"), run.history("stage2"), run.checkpoint("stage1", 5), run.report, run.test / "a.png"]
-    for path in [*own, tmp_path / "notes.txt"]:
+    foreign = [
+        tmp_path / "outside.txt",
+        run.path / "notes.txt",
+        run.test / "mine.png",
+        run.path / "models" / "mine.npz",
+    ]
+    for path in [*map(run.own, own), *foreign]:
         path.parent.mkdir(exist_ok=True)
         path.touch()
-    create_run(tmp_path, overwrite=True)
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["notes.txt"]
+    with open(run.marker, "a", encoding="utf-8") as file:
+        file.write("../outside.txt\n")
+    create_run(run.path, overwrite=True)
+    left = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert sorted(left) == sorted([*foreign, run.marker])
+
+
+def test_a_scene_is_never_overwritten(tmp_path):
+    """A Blender scene has folders that runs have too."""
+    photographs = [tmp_path / split / "r_0.png" for split in ("train", "test", "models", "figures")]
+    for path in [*photographs, tmp_path / "transforms_train.json", tmp_path / "config.json"]:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    with pytest.raises(FileExistsError, match="not a run folder"):
+        create_run(tmp_path, overwrite=True)
+    assert all(path.is_file() for path in photographs)
 
 
 def test_open_run_wants_a_run(tmp_path):

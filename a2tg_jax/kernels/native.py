@@ -1,7 +1,7 @@
 """Tile lists and compositing by native loops on CPUs: what `tiles` and `compositor` do with XLA, faster, on all cores.
 
-Tiles are dealt to threads in contiguous parts of about as many pairs each. Every thread adds to cotangents of its own,
-which are summed in order: results do not depend on timing, only, in the last bits, on the number of threads.
+Tiles are dealt to threads in contiguous parts of about as many pairs each. Results do not depend on timing, only, in
+the last bits, on the number of threads (`sums`).
 """
 
 import functools
@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance import StaticRule
 from a2tg_jax.geometry import Outline
-from a2tg_jax.kernels import foreign, threads
+from a2tg_jax.kernels import foreign, sums, threads
 from a2tg_jax.kernels.manual_axes import vary_with
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists
@@ -24,24 +25,24 @@ PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
 """Fewer than these are not worth another thread."""
 
 
-def _kind(how, splats, rule):
+def _kind(how, rule, splats, table: Array, images):
     from a2tg_jax.kernels.functions import Kind
 
     return Kind(
-        rule=jax.tree.structure(rule),
-        rule_class=type(rule),
-        num_columns=0 if rule.images is None else rule.params.shape[1],
+        rule=rule,
+        num_rule_numbers=splats.numbers.shape[1],
+        num_columns=0 if images is None else table.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
         tile_size=how.grid.tile_size,
         near_plane=how.near_plane,
         has_geometry=how.has_geometry,
-        has_statistic=how.has_statistic,
+        statistic=how.statistic,
     )
 
 
-def refusal(how, splats, rule) -> str | None:
+def refusal(how, rule, splats) -> str | None:
     """Why there can be no native loops for a rule; None where there are, which are then compiled."""
-    return _refusal(_kind(how, splats, rule))
+    return _refusal(_kind(how, StaticRule.of(rule), splats, rule.table, rule.images))
 
 
 @functools.cache
@@ -56,34 +57,36 @@ def _refusal(kind) -> str | None:
     return None
 
 
-def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
+def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:
     """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    kind = _kind(how, splats, rule)
+    kind = _kind(how, rule, splats, table, images)
     name = _registered(kind, "forward", _forward_handler)
     shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.tile_size**2), splats.M.dtype)
     call = jax.ffi.ffi_call(name, shape, vmap_method="sequential")
-    inputs = _inputs(kind, how, splats, params, rule, lists)
+    inputs = _inputs(kind, how, splats, table, images, cutoff, lists)
     image = vary_with(inputs, call(*inputs))[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
-def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: Array, behind: Array):
+def backward(
+    how, rule, splats, table: Array, images, cutoff: Array, lists, jacobian, tap: Array, g: Array, behind: Array
+):
     """As `compositor._backward`."""
-    kind = _kind(how, splats, rule)
+    kind = _kind(how, rule, splats, table, images)
     name = _registered(kind, "backward", _backward_handler)
     dtype, num = splats.M.dtype, splats.M.shape[0]
     shapes = (
         jax.ShapeDtypeStruct((num, kind.num_floats), dtype),
-        jax.ShapeDtypeStruct(params.shape, dtype),
-        jax.ShapeDtypeStruct(tap.shape if kind.has_statistic else (1, 4), dtype),
+        jax.ShapeDtypeStruct(table.shape, dtype),
+        jax.ShapeDtypeStruct(tap.shape if kind.statistic else (1, 4), dtype),
     )
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
     cotangents = [array.astype(dtype) for array in (g, behind, jacobian)]
-    inputs = (*_inputs(kind, how, splats, params, rule, lists), *cotangents)
-    packed, d_params, d_tap = vary_with(inputs, call(*inputs))
+    inputs = (*_inputs(kind, how, splats, table, images, cutoff, lists), *cotangents)
+    packed, d_table, d_tap = vary_with(inputs, call(*inputs))
     d_splats = unpack_splats(packed, splats, kind.has_geometry)
-    d_tap = d_tap.astype(tap.dtype) if kind.has_statistic else jnp.zeros_like(tap)
-    return d_splats, d_params.astype(params.dtype), d_tap
+    d_tap = d_tap.astype(tap.dtype) if kind.statistic else jnp.zeros_like(tap)
+    return d_splats, d_table.astype(table.dtype), d_tap
 
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
@@ -157,11 +160,11 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
     return visible[order].astype(np.int32)
 
 
-def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
+def _inputs(kind, how, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, ...]:
     """ids, starts, splats, images, table, and (columns, width, height)."""
-    packed = pack_splats(splats, kind.has_geometry, rule.cutoff(splats.opacities)).astype(kind.dtype)
+    packed = pack_splats(splats, kind.has_geometry, cutoff).astype(kind.dtype)
     size = jnp.asarray([how.grid.columns, how.grid.width, how.grid.height], jnp.int32)
-    return lists.ids, lists.starts, packed, pack_images(rule), params.astype(kind.dtype), size
+    return lists.ids, lists.starts, packed, pack_images(images), table.astype(kind.dtype), size
 
 
 def _registered(kind, which: str, make_handler: Callable[[Any], foreign.Handler]) -> str:
@@ -190,19 +193,15 @@ def _backward_handler(run: Callable) -> foreign.Handler:
         *inputs, size, g, behind, jacobian = arguments
         starts = inputs[1]
         parts = _parts(starts)
-        totals = [results, *([np.zeros_like(result) for result in results] for _ in parts[1:])]
-        for result in results:
-            result[...] = 0
+        room = sums.SumsOfParts(inputs[0], starts, inputs[3], results, parts)
         given = [array.ctypes.data for array in (*inputs, g, behind, jacobian)]
 
         def part(first: int, last: int, index: int) -> None:
-            outputs = [total.ctypes.data for total in totals[index]]
+            outputs = [array.ctypes.data for array in room.outputs(index)]
             run(*given, *outputs, first, last, *map(int, size))
 
         threads.run_spans(part, parts)
-        for more in totals[1:]:
-            for result, addend in zip(results, more, strict=True):
-                result += addend
+        room.add_up()
 
     return handler
 

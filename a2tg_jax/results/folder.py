@@ -1,6 +1,7 @@
 """The run folder: what lies where, and when an existing one may be used.
 
     RUN/
+      .a2tg-run                  the marker: this program made the folder, and what it wrote there
       config.json                the scene, every number, the versions
       checkpoints/PHASE-*.npz    the newest two, to resume from
       models/PHASE.npz           what each finished phase left behind
@@ -17,7 +18,6 @@ The phases are `stage1`, `stage2` and, where asked for, `baseline`: a second sta
 import dataclasses
 import json
 import os
-import shutil
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,8 +26,7 @@ from a2tg_jax.io.atomic import replacing
 Phase = Literal["stage1", "stage2", "baseline"]
 PHASES: tuple[Phase, ...] = ("stage1", "stage2", "baseline")
 KEPT_CHECKPOINTS = 2
-OWN_FOLDERS = ("checkpoints", "models", "history", "test", "figures")
-OWN_FILES = ("config.json", "metrics.json", "per_view.json", "point_cloud.ply", "report.html")
+MARKER = "a2tg-jax run"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +34,33 @@ class RunFolder:
     """Paths within one run folder."""
 
     path: Path
+
+    @property
+    def marker(self) -> Path:
+        return self.path / ".a2tg-run"
+
+    def own(self, path: Path) -> Path:
+        """The path, noted in the marker as one that this program writes: nothing else is ever replaced or deleted."""
+        name = path.relative_to(self.path).as_posix()
+        if name not in self.written():
+            self.path.mkdir(parents=True, exist_ok=True)
+            is_new = not self.marker.is_file()
+            with open(self.marker, "a", encoding="utf-8") as file:
+                file.write(f"{MARKER}\n{name}\n" if is_new else f"{name}\n")
+        return path
+
+    def written(self) -> list[str]:
+        """What the marker lists, relative to the folder; nothing where there is no marker.
+
+        Raises:
+          ValueError: if the marker is not this program's.
+        """
+        if not self.marker.is_file():
+            return []
+        first, *names = self.marker.read_text(encoding="utf-8").splitlines() or [""]
+        if first != MARKER:
+            raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with --out")
+        return names
 
     @property
     def config(self) -> Path:
@@ -87,12 +113,19 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """Refuses a folder that `create_run` would refuse, without touching it.
 
     Raises:
-      FileExistsError: if there is something at `path` already that must not be lost.
+      FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a
+        folder that no run was made in.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; choose another folder with --out")
-    if path.is_dir() and not overwrite and any(entry.name != "config.json" for entry in path.iterdir()):
+    run = RunFolder(path)
+    unused = {run.marker.name, run.config.name} if run.marker.is_file() else set()
+    if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):
+        return
+    if not run.written():
+        raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with --out")
+    if not overwrite:
         raise FileExistsError(
             f"{path} is not empty; add --resume to go on with it, --overwrite to start anew, or choose another --out"
         )
@@ -103,16 +136,18 @@ def create_run(path: str | os.PathLike, *, overwrite: bool = False) -> RunFolder
 
     Args:
       path: where; an existing folder must be empty, or hold no more than the config.json of a run that never began.
-      overwrite: delete what an earlier run left there first (nothing else).
+      overwrite: delete first what an earlier run wrote there, as its marker lists it, and nothing else. Check all that
+        the new run needs before.
 
     Raises:
-      FileExistsError: if there is something at `path` already.
+      FileExistsError: as `check_free` does.
     """
     check_free(path, overwrite=overwrite)
     run = RunFolder(Path(path))
     if overwrite:
-        _clear(run.path)
+        _clear(run)
     run.path.mkdir(parents=True, exist_ok=True)
+    run.own(run.marker)
     return run
 
 
@@ -146,9 +181,13 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path}: is not valid JSON: {error}") from error
 
 
-def _clear(path: Path) -> None:
-    """Deletes what runs write into their folder."""
-    for name in OWN_FOLDERS:
-        shutil.rmtree(path / name, ignore_errors=True)
-    for name in OWN_FILES:
-        (path / name).unlink(missing_ok=True)
+def _clear(run: RunFolder) -> None:
+    """Deletes what runs wrote into their folder, and the folders that are empty then; the marker last."""
+    for name in run.written():
+        path = run.path / name
+        is_inside = path.resolve().is_relative_to(run.path.resolve())
+        if is_inside and path != run.marker:
+            path.unlink(missing_ok=True)
+            if path.parent != run.path and path.parent.is_dir() and not any(path.parent.iterdir()):
+                path.parent.rmdir()
+    run.marker.unlink(missing_ok=True)

@@ -75,7 +75,7 @@ class RunRecord:
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Writes config.json."""
-    write_json(run.config, config_to_dict(record))
+    write_json(run.own(run.config), config_to_dict(record))
 
 
 def read_record(run: RunFolder) -> RunRecord:

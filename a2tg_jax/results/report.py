@@ -60,7 +60,7 @@ def write_report(run: RunFolder, result: RunResult, comparisons: Sequence[Compar
         f'<p class="soft">Adaptive anisotropic textured 2D Gaussian splatting. {_views_told(result)}</p>'
         f"<nav>{links}</nav>\n{sections}</body></html>\n"
     )
-    with replacing(run.report) as temporary:
+    with replacing(run.own(run.report)) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 

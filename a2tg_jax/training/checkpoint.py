@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.adapt import GradientStatistics
-from a2tg_jax.config import TrainConfig
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.optim import adam_init
-from a2tg_jax.step import TrainState
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.model import Model
+from a2tg_jax.training.options import System
+from a2tg_jax.training.registry import system_from_dict, system_to_dict
+from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.step import TrainState, initial_state
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -23,6 +22,7 @@ class History:
     """What was logged every so many iterations; arrays of one length."""
 
     stage: np.ndarray
+    """From 1."""
     iteration: np.ndarray
     """Within its stage, from 1."""
     loss: np.ndarray
@@ -59,11 +59,10 @@ class History:
 class Checkpoint:
     """A training run stopped between two iterations."""
 
-    config: TrainConfig
+    system: System
     stage: int
-    """1 or 2."""
+    """Which of the system's stages, from 0."""
     state: TrainState
-    layout: AtlasLayout | None
     history: History
     """Of this stage."""
 
@@ -73,43 +72,60 @@ class Checkpoint:
         return int(self.state.iteration)
 
     @property
-    def live_gaussians(self) -> Gaussians:
-        """The Gaussians that exist."""
-        return self.state.gaussians[: int(self.state.num_live)]
+    def model(self) -> Model:
+        """The Gaussians that exist, and what they show."""
+        return self.state.model.live
 
 
 def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
     """Writes a checkpoint; an older file of that name is replaced once the new one is whole."""
-    state, layout = checkpoint.state, checkpoint.layout
+    state, model = checkpoint.state, checkpoint.state.model
     header = {
-        "config": config_to_dict(checkpoint.config),
+        "system": system_to_dict(checkpoint.system),
         "stage": checkpoint.stage,
-        "num_rows": state.gaussians.num,
-        "resolutions": None if layout is None else [list(resolution) for resolution in layout.resolutions],
-        "capacities": None if state.textures is None else [bucket.shape[0] for bucket in state.textures.buckets],
-        "has_statistics": state.statistics is not None,
+        "is_ahead": [event is not None for event in state.events],
     }
-    write_archive(path, header, _named_arrays((state, layout, dataclasses.asdict(checkpoint.history))))
+    shown = model.appearance.arrays(model.params, model.layout)
+    arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
+    rest = _rest(state), dataclasses.asdict(checkpoint.history)
+    write_archive(path, header, arrays | _named_arrays((model.gaussians, rest)))
 
 
-def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
+def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None) -> Checkpoint:
     """Reads what `save_checkpoint` wrote.
+
+    Args:
+      path: the file.
+      system: the class of its system, where that is not one of this library's and its module is not imported.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is no checkpoint, is damaged, or is of another version.
+      ValueError: if it is no checkpoint, is damaged, is of another version, or its system is unknown.
     """
     header, arrays = read_archive(path)
     try:
-        template = _template(header)
+        options = system_from_dict(header["system"], str(path), system)
+        stage = options.stages()[header["stage"]]
+        shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
+        params, layout = stage.appearance.from_arrays(shown)
+        template = _template(stage, params, layout, header["is_ahead"])
         names = _named_arrays(template, only_names=True)
         leaves = [arrays[name] for name in names]
-        state, layout, history = jax.tree.unflatten(jax.tree.structure(template), leaves)
-        config = config_from_dict(TrainConfig, header["config"])
-        state, layout = jax.tree.map(jnp.asarray, (state, layout))
-        return Checkpoint(config, header["stage"], state, layout, History(**history))
-    except KeyError as error:
+        gaussians, ((moments, *rest), history) = jax.tree.unflatten(jax.tree.structure(template), leaves)
+    except (KeyError, IndexError) as error:
         raise ValueError(f"{path}: the checkpoint lacks {error}; it is damaged or of another version") from error
+    gaussians, moments, (num_live, *rest) = jax.tree.map(jnp.asarray, (gaussians, moments, rest))
+    model = Model(gaussians, params, layout, num_live, appearance=stage.appearance)
+    return Checkpoint(options, header["stage"], TrainState(model, moments, *rest), History(**history))
+
+
+SHOWN = "shown/"
+"""Names of the arrays of what splats show begin so."""
+
+
+def _rest(state: TrainState) -> tuple:
+    """What a checkpoint keeps besides Gaussians and what they show."""
+    return state.moments, state.model.num_live, state.events, state.iteration, state.status
 
 
 def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:
@@ -118,21 +134,12 @@ def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:
     return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
 
 
-def _template(header: dict[str, Any]):
+def _template(stage: Stage, params, layout, is_ahead: list[bool]):
     """A tree of the structure that was saved; its values mean nothing."""
-    num = header["num_rows"]
-    row: Any = np.zeros(0)
-    gaussians, textures, layout = Gaussians(row, row, row, row, row), None, None
-    if header["resolutions"] is not None:
-        textures = Textures(tuple(row for _ in header["capacities"]))
-        layout = AtlasLayout(row, row, tuple((int(v), int(u)) for v, u in header["resolutions"]))
-    state = TrainState(
-        gaussians=gaussians,
-        moments=adam_init(gaussians),
-        textures=textures,
-        texture_moments=None if textures is None else adam_init(textures),
-        statistics=GradientStatistics.init(num) if header["has_statistics"] else None,
-        num_live=row,
-        iteration=row,
-    )
-    return state, layout, {field.name: row for field in dataclasses.fields(History)}
+    row = lambda *shape: jnp.zeros((1, *shape))  # noqa: E731
+    gaussians = Gaussians(row(3), row(4), row(2), row(), row(16, 3))
+    model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
+    state = jax.eval_shape(lambda: initial_state(stage, model))
+    events = tuple(event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
+    rest = _rest(dataclasses.replace(state, events=events))
+    return gaussians, (rest, {field.name: 0 for field in dataclasses.fields(History)})

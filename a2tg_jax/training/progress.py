@@ -2,8 +2,8 @@
 
 from tqdm import tqdm
 
-from a2tg_jax.checkpoint import History
-from a2tg_jax.step import StepInfo
+from a2tg_jax.training.checkpoint import History
+from a2tg_jax.training.step import StepInfo
 
 MOMENTUM = 0.95
 

@@ -1,0 +1,12 @@
+"""What a splat shows: `AppearanceRule` is what the renderer is given, `Appearance` the value that makes one."""
+
+from a2tg_jax.appearance.base import Appearance as Appearance
+from a2tg_jax.appearance.plain import Plain as Plain
+from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
+from a2tg_jax.appearance.rule import PlainRule as PlainRule
+from a2tg_jax.appearance.rule import StaticRule as StaticRule
+from a2tg_jax.appearance.rule import gaussian_cutoff as gaussian_cutoff
+from a2tg_jax.appearance.textured import Textured as Textured
+from a2tg_jax.appearance.textured import TexturedRule as TexturedRule
+from a2tg_jax.appearance.textured import TextureOptions as TextureOptions
+from a2tg_jax.appearance.textured import textured_rule as textured_rule

@@ -1,0 +1,142 @@
+"""Appearance rules: what a splat shows at (u, v). The compositor is given one and knows nothing else about it.
+
+Each of N splats may own an image of one texel or more in a table [T, C], and K numbers. At (u, v), in standard
+deviations, the rule says where the image is looked up (`texel`), and what the C values found there, with the K numbers,
+make visible (`shade`):
+
+    residual, factor = rule.shade(numbers, interpolated image at rule.texel(image, u, v), u, v)
+    α = min(max_alpha, opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
+
+`texel`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They see the rule without its
+arrays (`StaticRule`): whatever is differentiated, or differs between splats, is in the table or in the numbers. All
+else is computed by XLA for the N splats at once, and may use any field.
+"""
+
+import dataclasses
+from typing import Any, NoReturn
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.bilinear import Image
+from a2tg_jax.cameras import Camera
+from a2tg_jax.gaussians import Gaussians
+
+Residual = tuple[Array, Array, Array] | None
+"""Added to red, green and blue; None stands for 0."""
+Factor = Array | None
+"""Multiplies alpha; None stands for 1."""
+
+
+class AppearanceRule:
+    """The splat's own colour, weighted by its Gaussian. A rule is a pytree that overrides what it does otherwise."""
+
+    max_alpha: float = 0.99
+    """Static. Alpha never exceeds it; less than 1."""
+    has_low_pass: bool = True
+    """Static. The low-pass filter of 2DGS shows splats that are smaller than a pixel, or seen edge-on. Without it, ρ is
+    u² + v² where the pixel's ray meets the splat, and nothing shows where it does not."""
+
+    table: Array
+    """[T, C] the entries of all images, differentiable; T >= 1, and C >= 1 where there are images."""
+    images: Image | None
+    """[N] each: the splats' images in the table. None where nothing of it is read."""
+
+    def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
+        """[N, K] what else `shade` and `falloff` know of each splat, differentiable; it may depend on the view.
+
+        It is called once per view and differentiated by JAX, gradients of rows that do not show being zero.
+        """
+        return jnp.zeros((gaussians.num, 0), gaussians.means.dtype)
+
+    def opacities(self, gaussians: Gaussians) -> Array:
+        """[N] peak opacities."""
+        return gaussians.opacities
+
+    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
+        """(x, y) where an image is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""
+        raise NotImplementedError(f"{type(self).__name__} has images, but does not say where they are looked up")
+
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
+        """Colour residual and alpha factor at (u, v), given the splat's K numbers and the C values of its image."""
+        return None, None
+
+    def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
+        """The kernel at squared distance rho; exp(−rho/2) for a Gaussian."""
+        return jnp.exp(-0.5 * rho)
+
+    def cutoff(self, opacities: Array) -> Array:
+        """[N] squared distance rho beyond which the splat shows less than 1/255; not positive where it never does.
+
+        Bounds only: no gradient flows. Too large a bound costs time, too small a one cuts the splat off.
+        """
+        return gaussian_cutoff(opacities)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PlainRule(AppearanceRule):
+    """Plain 2DGS; also what a rule without images derives from."""
+
+    max_alpha: float = dataclasses.field(default=0.99, kw_only=True, metadata={"static": True})
+
+    @property
+    def table(self) -> Array:  # type: ignore[override]
+        return jnp.zeros((1, 0), jnp.float32)
+
+    @property
+    def images(self) -> None:  # type: ignore[override]
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class StaticRule:
+    """A rule without its arrays; hashable, so that code can be compiled for it."""
+
+    structure: Any
+    """Its tree structure, with the static fields."""
+    rule_class: type
+    """Its class, which equality of tree structures disregards."""
+
+    @staticmethod
+    def of(rule: AppearanceRule) -> "StaticRule":
+        return StaticRule(jax.tree.structure(rule), type(rule))
+
+    @property
+    def rule(self) -> Any:
+        """The rule as its element-wise functions see it: an array field refuses to be used."""
+        numbered = jax.tree.unflatten(self.structure, range(self.structure.num_leaves))
+        paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
+        name = self.rule_class.__name__
+        return jax.tree.unflatten(self.structure, [_LeftOut(name + jax.tree_util.keystr(path)) for path, _ in paths])
+
+
+class _LeftOut:
+    """Stands where a rule has an array, and says what to do instead where it is used."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def _refuse(self, *_: Any) -> NoReturn:
+        raise ValueError(
+            f"{self._name} is an array, and texel, shade and falloff see the static fields of a rule only: "
+            "return it from numbers(), or put it in the table"
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self._refuse()
+
+    __jax_array__ = __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
+    __add__ = __sub__ = __mul__ = __truediv__ = __pow__ = __neg__ = __abs__ = __matmul__ = _refuse
+    __radd__ = __rsub__ = __rmul__ = __rtruediv__ = __rpow__ = __rmatmul__ = _refuse
+    __lt__ = __le__ = __gt__ = __ge__ = _refuse
+
+
+def gaussian_cutoff(peak: Array) -> Array:
+    """r² = 2·ln(255·peak), where peak·exp(−r²/2) = 1/255; peaks that are not positive give a negative r²."""
+    return 2 * jnp.log(jnp.maximum(255 * peak, 1e-6))

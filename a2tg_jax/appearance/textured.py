@@ -1,0 +1,214 @@
+"""The appearance of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
+
+All textures lie one after the other in a table [texels, 4], row by row.
+"""
+
+import dataclasses
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
+from a2tg_jax.bilinear import Image
+from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
+from a2tg_jax.texture import (
+    AtlasLayout,
+    Textures,
+    allocate_textures,
+    first_textures,
+    texture_arrays,
+    textures_from_arrays,
+)
+
+EXTENT = 3.0
+"""Half the side of a texture, in standard deviations."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TextureOptions:
+    """How textures are read. The defaults are the paper's text; `official()` is the authors' program."""
+
+    uv: Literal["texel-centre", "align-corners"] = "texel-centre"
+    """Texel centres at half-texel offsets over ±3σ, or the outer ones at ±3σ exactly."""
+    outside: Literal["clamp", "identity"] = "clamp"
+    """Beyond ±3σ: the edge texel goes on, or the texture shows nothing (RGB 0, alpha 1)."""
+    rgb: Literal["signed", "unit"] = "signed"
+    """RGB residuals of either sign, or clipped to [0, 1]."""
+    uv_gradient: bool = True
+    """Whether the lookup position carries gradients into the geometry."""
+    initial_rgb: float = 0.0
+    """RGB of new textures."""
+    alpha: Literal["projected", "global-maximum"] = "projected"
+    """Alpha factors as they are, kept in [0, 1] after each update; or any numbers, divided by the largest of all
+    textures and clipped to [0, 1]."""
+    max_alpha: float = 0.99
+    """Alpha of a splat never exceeds it."""
+
+    @staticmethod
+    def official() -> "TextureOptions":
+        """The conventions of the authors' own program."""
+        return TextureOptions("align-corners", "identity", "unit", False, 0.1, "global-maximum", max_alpha=0.999)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TexturedRule(AppearanceRule):
+    """An appearance rule: RGB residual and alpha factor from each splat's own texture."""
+
+    table: Array
+    """[texels, 4] all textures."""
+    images: Image
+    """[N] each: where the textures lie, Tv × Tu."""
+    peaks: Array
+    """[N] the largest alpha factor of each splat; bounds only, without gradient."""
+    options: TextureOptions = dataclasses.field(metadata={"static": True})
+
+    @property
+    def max_alpha(self) -> float:  # type: ignore[override]
+        return self.options.max_alpha
+
+    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
+        if not self.options.uv_gradient:
+            u, v = jax.lax.stop_gradient((u, v))
+        width, height = image.width.astype(u.dtype), image.height.astype(v.dtype)
+        return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
+
+    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+        red, green, blue, alpha = values
+        if self.options.outside == "identity":
+            is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
+            red, green, blue = (jnp.where(is_inside, channel, 0.0) for channel in (red, green, blue))
+            alpha = jnp.where(is_inside, alpha, 1.0)
+        return (red, green, blue), alpha
+
+    def cutoff(self, opacities: Array) -> Array:
+        return gaussian_cutoff(opacities * self.peaks)
+
+
+def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedRule:
+    """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels."""
+    textures = shown_textures(textures, layout, options)
+    areas = [height * width for height, width in layout.resolutions]
+    capacities = [bucket.shape[0] for bucket in textures.buckets]
+    starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
+    bucket_starts, bucket_areas = jnp.asarray(starts, jnp.int32), jnp.asarray(areas, jnp.int32)
+    sizes = jnp.asarray(layout.resolutions, jnp.int32)[layout.bucket]
+    peaks = jnp.stack([_padded_peaks(bucket, max(capacities)) for bucket in textures.buckets])
+    peaks = jax.lax.stop_gradient(peaks[layout.bucket, layout.row])
+    offsets = bucket_starts[layout.bucket] + layout.row * bucket_areas[layout.bucket]
+    texels = jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets])
+    return TexturedRule(
+        table=texels,
+        images=Image(offsets, sizes[:, 0], sizes[:, 1]),
+        peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
+        options=options,
+    )
+
+
+def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> Textures:
+    """RGB residuals and alpha factors as they are seen, from the texels that are trained."""
+    if options.rgb == "signed" and options.alpha == "projected":
+        return textures
+    divisor = _largest_alpha(textures, layout) + 1e-6 if options.alpha == "global-maximum" else None
+
+    def shown(texels: Array) -> Array:
+        rgb, alpha = texels[..., :3], texels[..., 3:]
+        rgb = jnp.clip(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
+        alpha = alpha if divisor is None else jnp.clip(alpha / divisor, 0.0, 1.0)
+        return jnp.concatenate([rgb, alpha], axis=-1)
+
+    return jax.tree.map(shown, textures)
+
+
+def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
+    """The largest alpha of all texels, buckets' padding left out; where several are, they share its gradient."""
+    alphas = []
+    for index, bucket in enumerate(textures.buckets):
+        num_used = jnp.sum(layout.bucket == index, dtype=jnp.int32)
+        is_used = jnp.arange(bucket.shape[0], dtype=jnp.int32) < num_used
+        alphas.append(jnp.where(is_used[:, None, None], bucket[..., 3], -jnp.inf).reshape(-1))
+    return jnp.max(jnp.concatenate(alphas))
+
+
+def _padded_peaks(bucket: Array, length: int) -> Array:
+    """[length] largest alpha of each texture of a bucket, zeros past its capacity."""
+    peaks = jnp.max(bucket[..., 3], axis=(1, 2))
+    return jnp.pad(peaks, (0, length - peaks.shape[0]))
+
+
+def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
+    """Where u, in standard deviations, lies among the `size` texels of its axis, clamped to [0, size − 1]."""
+    unit = (u * (1 / EXTENT) + 1) * 0.5
+    x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
+    return jnp.clip(x, 0.0, size - 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Textured(Appearance):
+    """A texture for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
+
+    start: tuple[int, int] = (1, 1)
+    """(Tv, Tu) of every texture at first, each 1 to 16."""
+    options: TextureOptions = TextureOptions()
+    """How textures are read."""
+
+    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Textures, AtlasLayout]:
+        sizes = np.broadcast_to(np.asarray(self.start, np.int64), (gaussians.num, 2))
+        return allocate_textures(sizes, rgb=self.options.initial_rgb)
+
+    def rule(self, params: Textures, layout: AtlasLayout) -> AppearanceRule:
+        return textured_rule(params, layout, self.options)
+
+    def project(self, params: Textures) -> Textures:
+        return project_texels(params, self.options)
+
+    def num_floats(self, layout: AtlasLayout, num: int) -> int:
+        texels = int(np.prod(layout.sizes[:num], axis=1).sum())
+        return FLOATS_PER_GAUSSIAN * num + 4 * texels
+
+    def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
+        (bucket,) = self._only(params)
+        return Textures((bucket.at[: rows.shape[0]].set(bucket[rows]),))
+
+    def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
+        (bucket,) = self._only(params)
+        is_cleared = jnp.pad(is_cleared, (0, bucket.shape[0] - is_cleared.shape[0]))
+        return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
+
+    def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
+        return (params, layout) if num == layout.num else first_textures(params, layout, num)
+
+    def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
+        """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
+        texels = [array.reshape(-1, 4) for array in texture_arrays(params, layout)]
+        return {"sizes": layout.sizes, "texels": np.concatenate(texels) if texels else np.zeros((0, 4), np.float32)}
+
+    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Textures, AtlasLayout]:
+        missing = [name for name in ("sizes", "texels") if name not in arrays]
+        if missing:
+            raise ValueError(f"the array {missing[0]} of textures is missing")
+        sizes, texels = arrays["sizes"], arrays["texels"]
+        if sizes.ndim != 2 or sizes.shape[1] != 2 or texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
+            raise ValueError(f"sizes [N, 2] and texels [M, 4] disagree; got {sizes.shape} and {texels.shape}")
+        pieces = np.split(texels, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
+        return textures_from_arrays([piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)])
+
+    def _only(self, params: Textures) -> tuple[Array]:
+        if len(params.buckets) != 1:
+            raise ValueError(
+                f"textures of {len(params.buckets)} sizes cannot change rows inside a step: densify before they grow"
+            )
+        return params.buckets
+
+
+def project_texels(textures: Textures, options: TextureOptions) -> Textures:
+    """Alpha factors clamped to [0, 1]; RGB too where it is unsigned. Where alpha is divided by its maximum, nothing is
+    moved: what is shown is clipped instead."""
+    if options.alpha == "global-maximum":
+        return textures
+    is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
+    return jax.tree.map(lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures)

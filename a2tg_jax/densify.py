@@ -1,0 +1,183 @@
+"""Adaptive density control (3DGS, Kerbl et al., 2023; 2DGS, Huang et al., 2024): clone, split, prune, reset opacities.
+
+Arrays hold N rows, of which the first `num_live` exist. All of it happens inside the step at fixed shapes: what is
+pruned leaves its row, the rows behind it move up, and copies are appended while there is room.
+"""
+
+import dataclasses
+import math
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.adapt import GradientStatistics
+from a2tg_jax.events import (
+    Change,
+    EventInfo,
+    Now,
+    Seen,
+    Statistic,
+    StepEvent,
+    Times,
+    clear_moments,
+    event,
+    gather_moments,
+    gather_rows,
+    static,
+)
+from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.model import Model
+from a2tg_jax.numerics import safe_norm
+from a2tg_jax.optim import AdamState
+
+SPLIT_SHRINK = 1.6
+"""The halves of a split Gaussian are so many times smaller."""
+LEAST_BETWEEN_RESETS = 500
+RECOVERY = 100
+"""Iterations after a reset in which nothing is pruned for being faint: Adam needs them to raise an opacity again."""
+
+
+class Edit(NamedTuple):
+    """Which rows stay, and which are doubled; [N] booleans."""
+
+    is_kept: Array
+    is_cloned: Array
+    is_split: Array
+
+
+@event
+class CloneSplitPrune(StepEvent):
+    """Clones small Gaussians and splits large ones where the gradient is large; prunes what is faint or too large.
+
+    It happens every max(10, n/300) of n iterations, from n/60 to n/2. The programs of 3DGS and 2DGS also have a largest
+    radius on the screen, but set the radii back to 0 just before they look at them: it has no effect, and is left out.
+    """
+
+    cap: int = static(default=500_000)
+    """Largest number of Gaussians. Where more are wanted the largest gradients are served, and the others counted."""
+    threshold: float = 2e-4
+    """Smallest average gradient that is densified, by the position on the screen in units of half an image."""
+    dense_share: float = 0.01
+    """Gaussians larger than this share of scene_scale are split, the others cloned."""
+    least_opacity: float = 0.05
+    """Fainter ones are pruned."""
+    largest_share: float = 0.1
+    """Larger ones, as a share of scene_scale, are pruned after the first reset of opacities."""
+
+    impossible: ClassVar[str] = (
+        "adaptive density control would prune every Gaussian: check the cameras and points of the scene, or lower "
+        "densify.least_opacity"
+    )
+
+    @property
+    def statistic(self) -> Statistic:
+        return "center"
+
+    def times(self, num_iterations: int) -> Times:
+        return Times(num_iterations // 60 + 1, num_iterations // 2 - 1, max(10, round(num_iterations / 300)))
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        return max(num, self.cap)
+
+    def init(self, model: Model) -> GradientStatistics:
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+
+    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
+        half = jnp.asarray([seen.cameras.width / 2, seen.cameras.height / 2, 1.0], seen.gradients.dtype)
+        for gradient, is_visible in zip(seen.gradients, seen.is_visible, strict=True):
+            state = state.observe(safe_norm(gradient * half[None]), is_visible)
+        return state
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
+        edit, num_refused = self.plan(now, model, state.average())
+        model, moments = apply_edit(now.keys[0], edit, model, moments)
+        return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
+
+    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
+        """What happens to each row, and how many Gaussians there was no room for.
+
+        Args:
+          gradients: [N] averages.
+        """
+        num, size = model.gaussians.num, jnp.max(model.gaussians.scales, axis=1)
+        is_live = jnp.arange(num, dtype=jnp.int32) < (num if model.num_live is None else model.num_live)
+        opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+        between = reset_interval(now.num_iterations)
+        is_late, since_reset = now.iteration > between, now.iteration % between
+        is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
+        is_pruned = is_faint | (is_late & (size > self.largest_share * now.scene_scale))
+        is_kept = is_live & ~is_pruned
+        # A copy of what is pruned would be pruned as well.
+        is_wanted = is_kept & (gradients >= self.threshold)
+        room = min(num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
+        order = jnp.argsort(jnp.where(is_wanted, -gradients, jnp.inf), stable=True)
+        rank = jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
+        is_doubled = is_wanted & (rank < room)
+        is_large = size > self.dense_share * now.scene_scale
+        num_refused = jnp.sum(is_wanted & ~is_doubled, dtype=jnp.int32)
+        return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large), num_refused
+
+
+def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tuple[Model, AdamState]:
+    """Kept rows move up, in order, and the copies of doubled ones follow; what is new starts with zero moments.
+
+    Both halves of a split Gaussian are drawn from it, each a Gaussian 1.6 times smaller. A clone lies where it came
+    from, which keeps its moments.
+    """
+    num = model.gaussians.num
+    index = jnp.arange(num, dtype=jnp.int32)
+    is_doubled = edit.is_cloned | edit.is_split
+    num_kept, num_copies = (jnp.sum(mask, dtype=jnp.int32) for mask in (edit.is_kept, is_doubled))
+    kept_first = jnp.argsort(~edit.is_kept, stable=True).astype(jnp.int32)
+    doubled_first = jnp.argsort(~is_doubled, stable=True).astype(jnp.int32)
+    is_copy = (index >= num_kept) & (index < num_kept + num_copies)
+    rows = jnp.where(is_copy, doubled_first[jnp.maximum(index - num_kept, 0)], kept_first)
+    is_live = index < num_kept + num_copies
+    is_half = edit.is_split[rows] & is_live
+    moments = clear_moments(model, gather_moments(model, moments, rows), is_copy | is_half | ~is_live)
+    model = gather_rows(model, rows)
+    gaussians = halved(key, model.gaussians, is_half)
+    return dataclasses.replace(model, gaussians=gaussians, num_live=num_kept + num_copies), moments
+
+
+def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
+    """Marked rows [N] moved to a point drawn from their Gaussian, and made 1.6 times smaller."""
+    drawn = jax.random.normal(key, gaussians.scales.shape, gaussians.means.dtype) * gaussians.scales
+    axes = rotation_matrices(gaussians.quats)[:, :, :2]
+    means = gaussians.means + jnp.sum(axes * drawn[:, None, :], axis=2)
+    return dataclasses.replace(
+        gaussians,
+        means=jnp.where(is_half[:, None], means, gaussians.means),
+        log_scales=gaussians.log_scales - jnp.where(is_half[:, None], math.log(SPLIT_SHRINK), 0.0),
+    )
+
+
+def reset_interval(num_iterations):
+    """Iterations between two resets of the opacities: the published 3,000 of 30,000, scaled, but 500 at least."""
+    return jnp.maximum(num_iterations // 10, LEAST_BETWEEN_RESETS)
+
+
+@event
+class OpacityReset(StepEvent):
+    """No Gaussian stays more opaque than `most`: every max(500, n/10) of n iterations, until n/2."""
+
+    most: float = 0.01
+
+    num_keys: ClassVar[int] = 0
+
+    def times(self, num_iterations: int) -> Times:
+        every = int(reset_interval(num_iterations))
+        return Times(every, num_iterations // 2 - 1, every)
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+        before = model.gaussians, model.params
+        after = model.appearance.limit_opacities(*before, model.layout, jnp.asarray(self.most))
+
+        def cleared(moment):
+            # Adam forgets whatever was changed.
+            return jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
+
+        moments = dataclasses.replace(moments, mu=cleared(moments.mu), nu=cleared(moments.nu))
+        return Change(dataclasses.replace(model, gaussians=after[0], params=after[1]), moments, state)

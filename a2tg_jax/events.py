@@ -1,0 +1,168 @@
+"""Events: what changes a model between steps, such as densification, noise, or textures that grow.
+
+An event is a frozen dataclass registered as a pytree. Its numbers (thresholds, weights) are leaves and reach the step
+as traced arguments, so that other values compile nothing anew; what chooses shapes or code is static
+(`metadata={"static": True}`). An event either happens inside the step, at fixed shapes (`StepEvent`), or between steps
+on the host, where shapes may change (`HostEvent`). Either may gather a statistic of the gradients until it is past.
+"""
+
+import dataclasses
+from typing import Any, ClassVar, NamedTuple, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.model import Model
+from a2tg_jax.optim import AdamState
+from a2tg_jax.pixel import Statistic
+
+
+class Times(NamedTuple):
+    """Every so many iterations, counted from 1, between two of them, both included. Numbers of the host, or traced."""
+
+    first: Any
+    last: Any
+    every: Any
+
+    def is_due(self, iteration: Array) -> Array:
+        """Whether the event follows this iteration."""
+        return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
+
+
+EVERY_ITERATION = Times(1, 2**31 - 1, 1)
+
+
+class Seen(NamedTuple):
+    """What the views of one iteration tell an event; V views, N rows."""
+
+    cameras: Camera
+    """V cameras, stacked."""
+    gradients: Array
+    """[V, N, 3] the statistic that the event asked for (`render.render_traced`), 0 where a Gaussian was not seen."""
+    is_visible: Array
+    """[V, N] whether the Gaussian was composited at one pixel at least."""
+
+
+class Now(NamedTuple):
+    """What an event inside the step is told, all traced."""
+
+    keys: Array
+    """[num_keys] random keys."""
+    iteration: Array
+    """Just done, from 1."""
+    rate_of_means: Array
+    """Learning rate of the means, in world units."""
+    num_iterations: Array
+    """Of the stage."""
+    scene_scale: Array
+    """1.1 × the largest distance of a camera from the cameras' mean."""
+
+
+class EventInfo(NamedTuple):
+    """What an event did inside the step, traced."""
+
+    is_possible: Any = True
+    """False: training cannot go on (`StepEvent.impossible` says why), and the step is not taken."""
+    num_refused: Any = 0
+    """Gaussians that wanted to be added, for which there was no room."""
+
+
+class Change(NamedTuple):
+    """What an event leaves."""
+
+    model: Model
+    moments: AdamState
+    """Of (gaussians, params)."""
+    state: Any
+    info: EventInfo = EventInfo()
+
+
+class Event:
+    """What both kinds of event have in common."""
+
+    @property
+    def statistic(self) -> Statistic | None:
+        """The statistic of the gradients that `observe` wants."""
+        return None
+
+    def init(self, model: Model) -> Any:
+        """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered."""
+        return ()
+
+    def observe(self, state: Any, model: Model, seen: Seen) -> Any:
+        """The state after the views of an iteration; traced, and called while the event is still ahead."""
+        return state
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        """How many Gaussians the event can reach from `num`: so many rows are allocated (host)."""
+        return num
+
+
+class StepEvent(Event):
+    """Happens inside the step, at fixed shapes."""
+
+    num_keys: ClassVar[int] = 1
+    """Random keys that `apply` uses."""
+    impossible: ClassVar[str] = ""
+    """Why training cannot go on where `EventInfo.is_possible` is False, and what to do."""
+
+    def times(self, num_iterations: int) -> Times:
+        """When it happens in a stage of so many iterations (host)."""
+        return EVERY_ITERATION
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
+        """The model after the event; traced."""
+        raise NotImplementedError(f"{type(self).__name__} must say what it does")
+
+
+class HostEvent(Event):
+    """Happens between steps, where values may be read and shapes may change."""
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        """After which iterations of a stage of so many it happens, ascending."""
+        raise NotImplementedError(f"{type(self).__name__} must say when it happens")
+
+    def apply(self, index: int, count: int, model: Model, moments: AdamState, state: Any) -> Change:
+        """The model after the event, which is number `index` of `count` of its kind, from 1 (host)."""
+        raise NotImplementedError(f"{type(self).__name__} must say what it does")
+
+
+def static(*, default: Any = dataclasses.MISSING) -> Any:
+    """A field of an event (or loss term) that chooses shapes or code, and is not traced."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
+def event(cls):
+    """Decorator: a frozen dataclass that is a pytree of its numbers."""
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+def gather_rows(model: Model, rows: Array) -> Model:
+    """The model whose row i is the former row rows[i]."""
+    params = model.appearance.gather(model.params, model.layout, rows)
+    return dataclasses.replace(model, gaussians=model.gaussians[rows], params=params)
+
+
+def gather_moments(model: Model, moments: AdamState, rows: Array) -> AdamState:
+    """Moments whose row i is the former row rows[i]."""
+    return _of_pairs(moments, lambda g, p: (g[rows], model.appearance.gather(p, model.layout, rows)))
+
+
+def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamState:
+    """Moments with the marked rows [N] at zero."""
+
+    def clear(leaf: Array) -> Array:
+        return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
+
+    def cleared(gaussians, params):
+        return jax.tree.map(clear, gaussians), model.appearance.clear(params, model.layout, is_cleared)
+
+    return _of_pairs(moments, cleared)
+
+
+def _of_pairs(moments: AdamState, function) -> AdamState:
+    """`function` of the Gaussians' and the parameters' part of both moments."""
+    return dataclasses.replace(moments, mu=function(*moments.mu), nu=function(*moments.nu))

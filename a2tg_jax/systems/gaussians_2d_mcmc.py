@@ -1,0 +1,35 @@
+"""2DGS*-MCMC: plain 2D Gaussians under MCMC densification; also continued, so that equal iterations can be compared."""
+
+import dataclasses
+from typing import ClassVar, Self
+
+from a2tg_jax.appearance import Plain
+from a2tg_jax.systems.stage1 import QUICK_CAP, SMOKE, SMOKE_CAP, McmcConfig, growing_stage, later_stage
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Gaussians2dMcmc(System):
+    """Plain 2D Gaussians, densified by MCMC."""
+
+    stage1_iterations: int = 30_000
+    stage2_iterations: int = 0
+    """Iterations that follow without densification; 0: none."""
+    densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
+
+    name: ClassVar[str] = "gaussians-2d-mcmc"
+
+    def stages(self) -> tuple[Stage, ...]:
+        first = growing_stage(self, self.stage1_iterations, self.densify.events())
+        if not self.stage2_iterations:
+            return (first,)
+        return first, later_stage(self, "continued", Plain(), (), self.stage2_iterations)
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        return {
+            "paper": cls(),
+            "quick": cls(stage1_iterations=2_000, densify=McmcConfig(cap=QUICK_CAP)),
+            "smoke": cls(**SMOKE, densify=McmcConfig(cap=SMOKE_CAP)),
+        }

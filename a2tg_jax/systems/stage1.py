@@ -1,0 +1,82 @@
+"""The first stage that most systems share: plain Gaussians, densified by Monte Carlo or by adaptive density control."""
+
+import dataclasses
+from typing import Any
+
+from a2tg_jax.appearance import Appearance, Plain
+from a2tg_jax.densify import CloneSplitPrune, OpacityReset
+from a2tg_jax.events import Event
+from a2tg_jax.mcmc import Mcmc, Noise
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Rates, Stage
+
+QUICK_CAP = 10_000
+SMOKE: dict[str, Any] = {"stage1_iterations": 200, "initial_gaussians": 800}
+SMOKE_CAP = 1_000
+
+
+@dataclasses.dataclass(frozen=True)
+class McmcConfig:
+    """MCMC densification (3DGS-MCMC)."""
+
+    cap: int = 500_000
+    """Largest number of Gaussians."""
+    is_enabled: bool = True
+    """Relocate and grow."""
+
+    def events(self) -> tuple[Event, ...]:
+        """Noise after every iteration; relocation and growth at their times."""
+        if self.cap < 2:
+            raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
+        return (Noise(), Mcmc(self.cap)) if self.is_enabled else (Noise(),)
+
+
+@dataclasses.dataclass(frozen=True)
+class DensityConfig:
+    """Adaptive density control (3DGS, 2DGS)."""
+
+    cap: int = 500_000
+    """Largest number of Gaussians; so many rows are allocated."""
+    threshold: float = 2e-4
+    """Smallest average gradient, by the position on the screen in units of half an image, that is densified."""
+    least_opacity: float = 0.05
+    """Fainter Gaussians are pruned."""
+    reset_opacity: float = 0.01
+    """No Gaussian stays more opaque, every max(500, n/10) of n iterations until n/2."""
+
+    def events(self) -> tuple[Event, ...]:
+        """Clone, split and prune; reset opacities."""
+        if self.cap < 2:
+            raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
+        density = CloneSplitPrune(self.cap, threshold=self.threshold, least_opacity=self.least_opacity)
+        return (density, OpacityReset(self.reset_opacity))
+
+
+def rates_of(system: System, params: Any = 0.0) -> Rates:
+    """The learning rates of a system, with those of what its splats show."""
+    return Rates(system.rates.of_gaussians(), params, system.rates.means_final_factor)
+
+
+def growing_stage(
+    system: System,
+    iterations: int,
+    events: tuple[Event, ...],
+    appearance: Appearance = Plain(),  # noqa: B008 - frozen
+    params_rate: Any = 0.0,
+    name: str = "gaussians",
+) -> Stage:
+    """A first stage, in which the degree of spherical harmonics rises."""
+    terms, rates = system.loss.terms(), rates_of(system, params_rate)
+    return Stage(name, appearance, events, terms, rates, iterations, raises_sh_degree=True)
+
+
+def later_stage(
+    system: System,
+    name: str,
+    appearance: Appearance,
+    events: tuple[Event, ...],
+    iterations: int,
+    params_rate: Any = 0.0,
+) -> Stage:
+    """A second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
+    return Stage(name, appearance, events, system.loss.terms(), rates_of(system, params_rate), iterations)

@@ -1,0 +1,49 @@
+"""Textured Gaussians*: every texture k×k from the start of the second stage, no events."""
+
+import dataclasses
+from typing import ClassVar, Self
+
+from a2tg_jax.appearance import Textured, TextureOptions
+from a2tg_jax.systems.stage1 import QUICK_CAP, SMOKE, SMOKE_CAP, McmcConfig, growing_stage, later_stage
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+
+
+@dataclasses.dataclass(frozen=True)
+class FixedTextureConfig:
+    """Textures of one size."""
+
+    side: int = 4
+    """k: every texture is k×k texels, 1 to 16."""
+    rate: float = 2.5e-3
+    """Adam's learning rate of the texels."""
+    lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
+    """How textures are read."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TexturedGaussians(System):
+    """MCMC densification, then a second stage with textures of one size."""
+
+    stage1_iterations: int = 30_000
+    stage2_iterations: int = 30_000
+    densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
+    texture: FixedTextureConfig = dataclasses.field(default_factory=FixedTextureConfig)
+
+    name: ClassVar[str] = "textured-gaussians"
+
+    def stages(self) -> tuple[Stage, ...]:
+        side = self.texture.side
+        if not 1 <= side <= 16:
+            raise ValueError(f"texture.side must lie in 1..16; got {side}")
+        textured = Textured((side, side), self.texture.lookup)
+        first = growing_stage(self, self.stage1_iterations, self.densify.events())
+        return first, later_stage(self, "textures", textured, (), self.stage2_iterations, self.texture.rate)
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        return {
+            "paper": cls(),
+            "quick": cls(stage1_iterations=2_000, stage2_iterations=1_000, densify=McmcConfig(cap=QUICK_CAP)),
+            "smoke": cls(**SMOKE, stage2_iterations=120, densify=McmcConfig(cap=SMOKE_CAP)),
+        }

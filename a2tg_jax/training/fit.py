@@ -1,0 +1,128 @@
+"""Training from photographs: every stage of a system, one from the result of the other."""
+
+import dataclasses
+
+from a2tg_jax.data.scene import Scene
+from a2tg_jax.model import Model
+from a2tg_jax.origin import BLACK, WHITE, Color, Origin
+from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.loop import OnCheckpoint, StageRun
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Background
+from a2tg_jax.training.start import initial_model
+
+BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
+"""On which a model is looked at, by what was behind it while it was trained."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StageResult:
+    """What one stage leaves."""
+
+    name: str
+    model: Model
+    """The Gaussians that exist, in the normalised world of the scene, with its cameras."""
+    history: History
+    seconds: float
+    """Training time, compilation included."""
+    num_regrown: int
+    """How often the tile lists needed more room, each time at the price of a compilation."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FitResult:
+    """What training leaves."""
+
+    system: System
+    stages: tuple[StageResult, ...]
+    """Those that were trained; the earlier ones are missing where training was resumed in a later one."""
+
+    @property
+    def model(self) -> Model:
+        """The last stage's model."""
+        return self.stages[-1].model
+
+    @property
+    def history(self) -> History:
+        """Of all the stages."""
+        first, *others = (stage.history for stage in self.stages)
+        for other in others:
+            first = first.followed_by(other)
+        return first
+
+    @property
+    def seconds(self) -> float:
+        """Training time in all, compilation included."""
+        return sum(stage.seconds for stage in self.stages)
+
+    @property
+    def num_regrown(self) -> int:
+        """How often the tile lists needed more room."""
+        return sum(stage.num_regrown for stage in self.stages)
+
+
+def fit(
+    scene: Scene,
+    system: System,
+    *,
+    resume: Checkpoint | None = None,
+    on_checkpoint: OnCheckpoint | None = None,
+    checkpoint_every: int | None = None,
+    progress: bool = True,
+) -> FitResult:
+    """Trains a scene: every stage of a system, each from the result of the one before.
+
+    Args:
+      scene: from `load_scene` or `synthetic_scene`.
+      system: what happens, and every number, such as `A2tg.preset("quick")`.
+      resume: a checkpoint of the same system to go on from.
+      on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
+        iteration takes over the state's buffers, so save it there and then, or copy it.
+      checkpoint_every: None: at the end of each stage only.
+      progress: show a progress bar.
+
+    Raises:
+      ValueError: if the options contradict each other or the checkpoint, or the loss stops being finite.
+    """
+    system.check()
+    first = 0 if resume is None else resume.stage
+    results: list[StageResult] = []
+    for index in range(first, len(system.stages())):
+        result = fit_stage(
+            scene,
+            system,
+            index,
+            results[-1].model if results else None,
+            resume=resume if index == first else None,
+            on_checkpoint=on_checkpoint,
+            checkpoint_every=checkpoint_every,
+            progress=progress,
+        )
+        results.append(result)
+    return FitResult(system, tuple(results))
+
+
+def fit_stage(
+    scene: Scene,
+    system: System,
+    index: int,
+    start: Model | None = None,
+    *,
+    resume: Checkpoint | None = None,
+    on_checkpoint: OnCheckpoint | None = None,
+    checkpoint_every: int | None = None,
+    progress: bool = True,
+) -> StageResult:
+    """Trains one stage of a system. Arguments as in `fit`.
+
+    Args:
+      index: which stage, from 0.
+      start: the model to start from; None: Gaussians at the scene's points.
+    """
+    system.check()
+    if start is None and resume is None:
+        start = initial_model(scene, system)
+    run = StageRun(scene, system, index, start, resume)
+    run.train(on_checkpoint, checkpoint_every, progress)
+    model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
+    return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)

@@ -1,0 +1,233 @@
+"""The training loop of one stage, on the host, top to bottom: steps, host events, checkpoints, history.
+
+The host launches up to `LAUNCHED` steps before it waits for the device. A step that could not be taken made all behind
+it idle (`step.TrainState.status`), so they are launched again once its cause is mended.
+"""
+
+import dataclasses
+import time
+import warnings
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from a2tg_jax.appearance.base import BYTES_PER_FLOAT
+from a2tg_jax.data.scene import Scene
+from a2tg_jax.events import HostEvent, StepEvent
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
+from a2tg_jax.training.batches import BatchOrder, PhotoStore
+from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.options import System
+from a2tg_jax.training.progress import ProgressBar
+from a2tg_jax.training.start import padded
+from a2tg_jax.training.step import (
+    FINE,
+    IMPOSSIBLE,
+    NOT_FINITE,
+    OVERFLOW,
+    StepInfo,
+    StepSettings,
+    TrainState,
+    initial_state,
+    jitted_step,
+)
+
+LAUNCHED = 10
+"""Steps between two waits for the device."""
+LOG_EVERY = 10
+PLANNED_VIEWS = 64
+GROWTH_ROOM = 1.5
+"""How many times the pairs of the first image the lists of a stage have room for."""
+
+OnCheckpoint = Callable[[Checkpoint], None]
+
+
+def read(infos: list[StepInfo]) -> list[StepInfo]:
+    """The scalars of some steps as numbers of the host: the one place where the loop waits for the device."""
+    return jax.device_get(infos)
+
+
+class StageRun:
+    """One stage under way: the state, and what the host keeps beside it."""
+
+    def __init__(self, scene: Scene, system: System, index: int, start: Model | None, resume: Checkpoint | None = None):
+        """Args:
+        scene: its training views are trained on.
+        system: the options.
+        index: which of its stages, from 0.
+        start: the model to start from, all of whose rows exist; None where `resume` is given.
+        resume: a checkpoint of this stage.
+        """
+        self.views, self.system, self.index = scene.train, system, index
+        self.stage = system.stages()[index]
+        self.clock = self.stage.clock()
+        self.history, self.earlier_seconds = History.empty(), 0.0
+        if resume is not None:
+            _check_resume(resume, system, index)
+            self.state: TrainState = jax.tree.map(jnp.array, resume.state)
+            self.history, self.earlier_seconds = resume.history, resume.history.last_seconds
+        elif start is not None:
+            # Steps take over the buffers they are given: the caller keeps his own.
+            self.state = initial_state(self.stage, padded(jax.tree.map(jnp.array, start), self.stage, system))
+        else:
+            raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
+        self.scene_scale = jnp.asarray(scene.scale, jnp.float32)
+        self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
+        self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1)
+        self.photographs = PhotoStore(self.views)
+        self.capacities: dict[tuple[int, int], int] = {}
+        self.started = time.perf_counter()
+        self.num_regrown = self.num_refused = 0
+
+    @property
+    def seconds(self) -> float:
+        return self.earlier_seconds + time.perf_counter() - self.started
+
+    @property
+    def model(self) -> Model:
+        """The Gaussians that exist, and what they show."""
+        return self.state.model.live
+
+    def train(self, on_checkpoint: OnCheckpoint | None, checkpoint_every: int | None, progress: bool) -> None:
+        """Runs the stage to its end."""
+        iteration, end = int(self.state.iteration), self.stage.iterations
+        with ProgressBar(self.stage.name, iteration, end, is_shown=progress) as bar:
+            while iteration < end:
+                stop = self._next_stop(iteration, checkpoint_every)
+                for info in self.steps(iteration + 1, stop):
+                    iteration += 1
+                    self._log(iteration, info)
+                    bar.update(info, self.history)
+                if iteration == stop:
+                    self._host_events(iteration)
+                    is_due = checkpoint_every is not None and iteration % checkpoint_every == 0
+                    if on_checkpoint is not None and (is_due or iteration == end):
+                        on_checkpoint(Checkpoint(self.system, self.index, self.state, self.history))
+        if self.num_refused:
+            warnings.warn(
+                f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
+                f"have been added, all {self.state.model.gaussians.num:,} rows being taken: raise densify.cap",
+                stacklevel=2,
+            )
+
+    def _next_stop(self, iteration: int, checkpoint_every: int | None) -> int:
+        """The iteration after which the host has something to do."""
+        stops = [iteration + LAUNCHED - iteration % LAUNCHED, self.stage.iterations]
+        stops += [due for due in self._due_on_host() if due > iteration]
+        if checkpoint_every is not None:
+            stops.append(iteration + checkpoint_every - iteration % checkpoint_every)
+        return min(stops)
+
+    def _due_on_host(self) -> list[int]:
+        """The iterations of all host events, and those after which a step event is past."""
+        count = self.stage.iterations
+        due: list[int] = []
+        for event, times in zip(self.stage.events, self.clock.times, strict=True):
+            if isinstance(event, HostEvent):
+                due += event.iterations(count)
+            elif times is not None and event.statistic and times.last < count:
+                due.append(times.last)
+        return due
+
+    def steps(self, first: int, last: int) -> list[StepInfo]:
+        """Iterations `first` to `last`, or up to the one that could not be taken, whose cause is mended."""
+        launched = [self._launch(iteration) for iteration in range(first, last + 1)]
+        infos = read(launched)
+        taken = [info for info in infos if info.status == FINE]
+        self.num_refused += sum(int(info.num_refused) for info in taken)
+        if len(taken) < len(infos):
+            self._mend(first + len(taken), infos[len(taken)])
+        return taken
+
+    def _launch(self, iteration: int) -> StepInfo:
+        indices = self.order.indices(iteration)
+        photographs, views = self.photographs.batch(indices)
+        how = StepSettings(self._settings(self._size(iteration)), self.system.background)
+        self.state, info = jitted_step()(
+            how, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
+        )
+        return info
+
+    def _size(self, iteration: int) -> tuple[int, int]:
+        height, width = self.views[self.order.indices(iteration)[0]].image.shape[:2]
+        return height, width
+
+    def _mend(self, iteration: int, info: StepInfo) -> None:
+        """Makes more room for the tile lists; refuses to go on for every other reason."""
+        self.state = dataclasses.replace(self.state, status=jnp.zeros((), jnp.int32))
+        if info.status == OVERFLOW:
+            self.num_regrown += 1
+            size = self._size(iteration)
+            self.capacities[size] = _shared_capacity(size, capacity_for(int(float(info.num_pairs) * GROWTH_ROOM)))
+            return
+        where = f"at iteration {iteration} of stage {self.stage.name}"
+        if info.status == NOT_FINITE:
+            names = ", ".join(self.views[index].name for index in self.order.indices(iteration))
+            raise ValueError(
+                f"loss or gradient is not finite {where}, view {names}: lower the learning rates, or look for a "
+                "damaged camera or image; the state before it is unharmed"
+            )
+        assert info.status == IMPOSSIBLE
+        reasons = [event.impossible for event in self.stage.events if isinstance(event, StepEvent) and event.impossible]
+        raise ValueError(f"training cannot go on {where}: {'; or '.join(reasons)}")
+
+    def _log(self, iteration: int, info: StepInfo) -> None:
+        if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
+            model = self.state.model
+            num_floats = model.appearance.num_floats(model.layout, int(info.num_live))
+            self.history = self.history.with_point(
+                self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
+                BYTES_PER_FLOAT * num_floats / 1e6, self.seconds,
+            )  # fmt: skip
+
+    def _host_events(self, iteration: int) -> None:
+        """The host events that follow an iteration; events that are past forget what they have gathered."""
+        for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
+            state = self.state.events[place]
+            if isinstance(event, HostEvent):
+                due = event.iterations(self.stage.iterations)
+                if iteration not in due:
+                    continue
+                change = event.apply(due.index(iteration) + 1, len(due), self.state.model, self.state.moments, state)
+                self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
+                self._keep(place, None if iteration == due[-1] else change.state)
+            elif times is not None and event.statistic and iteration == times.last:
+                self._keep(place, None)
+
+    def _keep(self, place: int, gathered) -> None:
+        events = list(self.state.events)
+        events[place] = gathered
+        self.state = dataclasses.replace(self.state, events=tuple(events))
+
+    def _settings(self, size: tuple[int, int]) -> RenderSettings:
+        """Render settings with the capacity for views of a size, planned before the first of them."""
+        settings = RenderSettings(tile_size=self.system.tile_size, sh_degree=self.system.sh_degree)
+        if size not in self.capacities:
+            views = [view for view in self.views if view.image.shape[:2] == size]
+            live = self.model
+            sample = views[:: -(-len(views) // PLANNED_VIEWS)]
+            pairs = max(pairs_of_view(live.gaussians, view.camera, live.rule, settings) for view in sample)
+            growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
+            self.capacities[size] = _shared_capacity(size, capacity_for(int(pairs * GROWTH_ROOM * growth)))
+        return dataclasses.replace(settings, capacity=self.capacities[size])
+
+
+_compiled_capacities: dict[tuple[int, int], set[int]] = {}
+"""Capacities that steps of this process have been compiled for, by image size; no result depends on them."""
+
+
+def _shared_capacity(size: tuple[int, int], needed: int) -> int:
+    """The least capacity that suffices and is compiled already, where it is not twice as large; else a new one."""
+    known = _compiled_capacities.setdefault(size, set())
+    capacity = min((room for room in known if needed <= room <= 2 * needed), default=needed)
+    known.add(capacity)
+    return capacity
+
+
+def _check_resume(resume: Checkpoint, system: System, index: int) -> None:
+    if resume.stage != index:
+        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
+    if resume.system != system:
+        raise ValueError("the checkpoint was made with another configuration: resume with checkpoint.system")

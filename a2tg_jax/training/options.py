@@ -1,0 +1,147 @@
+"""Options that every system has: views, initial Gaussians, loss, learning rates, the seed."""
+
+import dataclasses
+from typing import Any, ClassVar, Literal, Self
+
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Weights of the photometric loss and of the optional terms (0 is off, the paper's setting)."""
+
+    ssim_weight: float = 0.2
+    """w in (1 - w)·L1 + w·(1 - SSIM)."""
+    normal_weight: float = 0.0
+    """Normal consistency of 2DGS: rendered normals against the normals of the rendered depth."""
+    distortion_weight: float = 0.0
+    """Depth distortion of 2DGS."""
+    opacity_weight: float = 0.0
+    """Mean opacity of the live Gaussians (3DGS-MCMC uses 0.01)."""
+    scale_weight: float = 0.0
+    """Mean scale of the live Gaussians (3DGS-MCMC uses 0.01)."""
+
+    def terms(self) -> tuple:
+        """The loss terms whose weight is not 0."""
+        optional = (
+            Term(normals, self.normal_weight, has_geometry=True),
+            Term(distortion, self.distortion_weight, has_geometry=True),
+            Term(opacity, self.opacity_weight),
+            Term(scale, self.scale_weight),
+        )
+        first = Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
+        return (first, *(term for term in optional if term.weight))
+
+
+@dataclasses.dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rate per field."""
+
+    means: float = 1.6e-4
+    """Times scene_scale; decays exponentially over each stage."""
+    means_final_factor: float = 0.01
+    """The means' rate at the end of a stage over that at its start."""
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    logit_opacities: float = 5e-2
+    sh_degree0: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+
+    def of_gaussians(self) -> Gaussians:
+        """One rate per field of the Gaussians; the means' is that of the first iteration, without scene_scale."""
+        import jax.numpy as jnp
+
+        sh = jnp.full((1, 16, 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
+        fields: Any = (self.means, self.quats, self.log_scales, self.logit_opacities, sh)
+        return Gaussians(*fields)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class System:
+    """A method of training as a value: its fields are its options, `stages` says what happens.
+
+    A system of one's own derives from this, adds fields, and composes its stages; the command line takes it as
+    `--system package.module:NAME`. Fields are numbers, texts, tuples of them, and dataclasses of such fields.
+    """
+
+    batch_size: int = 1
+    """Views per iteration."""
+    initial_gaussians: int | None = None
+    """Gaussians to start from; None: all the points, at most the cap."""
+    initial_opacity: float = 0.1
+    """Opacity of the Gaussians that training starts from."""
+    background: Literal["black", "white", "random"] = "black"
+    """Behind everything, where photographs are transparent too."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics, 0 to 3."""
+    seed: int = 0
+    tile_size: int = 8
+    """Side of a tile in pixels; results do not depend on it."""
+    loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    rates: LearningRates = dataclasses.field(default_factory=LearningRates)
+
+    name: ClassVar[str] = ""
+    """What the command line calls the system."""
+
+    def stages(self) -> tuple[Stage, ...]:
+        """What is trained, one stage after the other.
+
+        Raises:
+          ValueError: if options contradict each other.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must compose its stages")
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """The options of a preset: "paper", "quick" or "smoke".
+
+        Raises:
+          ValueError: if there is no such preset.
+        """
+        presets = cls.presets()
+        if name not in presets:
+            raise ValueError(f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {name!r}")
+        return presets[name]
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        """All presets by name; "paper" is what the fields default to."""
+        return {"paper": cls()}
+
+    def check(self) -> None:
+        """Refuses what cannot be trained before any time is spent.
+
+        Raises:
+          ValueError: naming the option, what was wanted and what came.
+        """
+        if self.batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1; got {self.batch_size}")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree must lie in 0..3; got {self.sh_degree}")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
+        if self.initial_gaussians is not None and self.initial_gaussians < 2:
+            raise ValueError(f"initial_gaussians must be at least 2; got {self.initial_gaussians}")
+        stages = self.stages()
+        if not stages:
+            raise ValueError(f"{type(self).__name__} has no stages")
+        for stage in stages:
+            stage.check()
+
+
+def like(kind: type[System], other: System) -> System:
+    """A system of a kind that has the options of another, wherever both have an option of that name and type."""
+    return _like(kind(), other)
+
+
+def _like(value: Any, other: Any) -> Any:
+    names = {field.name for field in dataclasses.fields(other)}
+    changes = {}
+    for field in dataclasses.fields(value):
+        if field.name not in names:
+            continue
+        own, others = getattr(value, field.name), getattr(other, field.name)
+        changes[field.name] = _like(own, others) if dataclasses.is_dataclass(own) else others
+    return dataclasses.replace(value, **changes)

@@ -1,0 +1,111 @@
+"""Systems by name: those of this library, and others as package.module:NAME."""
+
+import importlib
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.training.options import System
+
+SYSTEMS = {
+    "a2tg": "a2tg_jax.systems.a2tg:A2tg",
+    "gaussians-2d": "a2tg_jax.systems.gaussians_2d:Gaussians2d",
+    "gaussians-2d-mcmc": "a2tg_jax.systems.gaussians_2d_mcmc:Gaussians2dMcmc",
+    "textured-gaussians": "a2tg_jax.systems.textured_gaussians:TexturedGaussians",
+    "supergaussians": "a2tg_jax.systems.supergaussians:SuperGaussians",
+    "bbsplat": "a2tg_jax.systems.bbsplat:BBSplat",
+}
+"""Where the systems of this library are; each is imported where it is asked for."""
+
+
+def find_system(reference: str) -> System:
+    """The system of a name, or of package.module:NAME, with its own defaults; the module is imported.
+
+    Raises:
+      ValueError: if there is no such system.
+    """
+    path, _, attribute = SYSTEMS.get(reference, reference).partition(":")
+    if not attribute:
+        raise ValueError(
+            f"there is no system {reference!r}; the systems are {', '.join(SYSTEMS)}, "
+            "and your own as package.module:NAME"
+        )
+    try:
+        found = getattr(importlib.import_module(path), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"the system {reference!r} cannot be imported: {error}") from error
+    if isinstance(found, type) and issubclass(found, System):
+        return found()
+    if not isinstance(found, System):
+        raise ValueError(f"{reference!r} is no system: it must be a subclass or an instance of a2tg_jax.System")
+    return found
+
+
+def reference_of(system: System) -> str:
+    """The name of a system's class, by which `find_system` finds it."""
+    reference = f"{type(system).__module__}:{type(system).__qualname__}"
+    return next((name for name, own in SYSTEMS.items() if own == reference), reference)
+
+
+def system_to_dict(system: System) -> dict[str, Any]:
+    """A system and all its options as JSON-able values."""
+    return {"name": reference_of(system), "options": config_to_dict(system)}
+
+
+def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | None = None) -> System:
+    """The system that `system_to_dict` was given.
+
+    A file makes this program import none but its own modules: the class of another system is looked for among the
+    modules that are imported already, unless it is given.
+
+    Args:
+      data: name and options.
+      where: what the errors call the file.
+      kind: the class.
+
+    Raises:
+      ValueError: if the class is not known, or an option is missing, unknown or of another type.
+    """
+    name, options = data["name"], data["options"]
+    if kind is None and name in SYSTEMS:
+        kind = type(find_system(name))
+    if kind is None:
+        module, _, attribute = str(name).partition(":")
+        kind = getattr(sys.modules.get(module), attribute, None)
+    if not (isinstance(kind, type) and issubclass(kind, System)):
+        raise ValueError(f"{where}: is of the system {name!r}, which is not known here: import its module first")
+    return config_from_dict(kind, options, f"{where}: options")
+
+
+def with_changes(system: System, changes: Mapping[str, Any], where: str) -> System:
+    """The system with some of its options changed, given as nested dictionaries as a configuration file has them.
+
+    Raises:
+      ValueError: if an option is unknown or of another type; it is named.
+    """
+    return config_from_dict(type(system), _merged(config_to_dict(system), changes), where)
+
+
+def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for name, change in changes.items():
+        is_group = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
+        merged[name] = _merged(values[name], change) if is_group else change
+    return merged
+
+
+def differences(system: System) -> dict[str, Any]:
+    """The options in which a system differs from its class's defaults, nested."""
+    return _differences(config_to_dict(system), config_to_dict(type(system)()))
+
+
+def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    changed: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            inner = _differences(value, defaults[name])
+            changed |= {name: inner} if inner else {}
+        elif value != defaults[name]:
+            changed[name] = value
+    return changed

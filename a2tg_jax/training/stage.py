@@ -1,0 +1,115 @@
+"""A stage: an appearance, events, loss terms, rates and a length. A system is a sequence of stages."""
+
+import dataclasses
+import math
+from typing import Any, Literal, NamedTuple, Protocol
+
+import jax
+from jax import Array
+
+from a2tg_jax.appearance import Appearance
+from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderOutput
+from a2tg_jax.training.terms import Target
+
+Background = Literal["black", "white", "random"]
+
+
+class LossTerm(Protocol):
+    """A part of the loss, a pytree of its numbers."""
+
+    @property
+    def has_geometry(self) -> bool:
+        """Whether it reads depth, normals or distortion."""
+        ...
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        """Its value, the weight included."""
+        ...
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates."""
+
+    gaussians: Gaussians
+    """One per field, a number or an array that broadcasts; the means' in units of scene_scale."""
+    params: Any = 0.0
+    """Of what the splats show: one for all, or a prefix of the parameters' tree."""
+    means_final_factor: float = 0.01
+    """The means' rate decays exponentially to this share of it over the stage."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A part of training with one appearance, one loss and one schedule. A pytree: its numbers are traced."""
+
+    name: str = dataclasses.field(metadata={"static": True})
+    """A short word, unique in its system."""
+    appearance: Appearance = dataclasses.field(metadata={"static": True})
+    """What the splats show."""
+    events: tuple[Event, ...]
+    """Densification, noise, textures that grow, in the order in which they happen."""
+    losses: tuple[LossTerm, ...]
+    """What is minimised: their sum."""
+    rates: Rates
+    iterations: int
+    """Views seen, times the batch size."""
+    raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
+    """Begins with degree 0 and adds one after every thirtieth of the stage."""
+
+    @property
+    def statistic(self):
+        """The statistic of the gradients that its events want, or None."""
+        wanted = {event.statistic for event in self.events} - {None}
+        return next(iter(wanted), None)
+
+    def check(self) -> None:
+        """Refuses what cannot be trained.
+
+        Raises:
+          ValueError: naming the option, what was wanted and what came.
+        """
+        if self.iterations < 1:
+            raise ValueError(f"a stage must have at least 1 iteration; {self.name!r} has {self.iterations}")
+        kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
+        if len(kinds) > 1:
+            raise ValueError(f"the events of one stage must want one statistic; those of {self.name!r} want {kinds}")
+        for event in self.events:
+            if isinstance(event, HostEvent):
+                event.iterations(self.iterations)
+
+    def clock(self) -> "Clock":
+        """What the step has to know of the schedule (host)."""
+        return Clock(
+            num_iterations=self.iterations,
+            per_iteration=1.0 / self.iterations,
+            log_decay=math.log(self.rates.means_final_factor),
+            sh_interval=max(1, round(self.iterations / 30)),
+            times=tuple(_times(event, self.iterations) for event in self.events),
+        )
+
+
+class Clock(NamedTuple):
+    """The schedule of a stage as numbers, traced in the step."""
+
+    num_iterations: int
+    per_iteration: float
+    """1 / num_iterations."""
+    log_decay: float
+    """Logarithm of the means' final factor."""
+    sh_interval: int
+    """Iterations between two degrees."""
+    times: tuple[Times | None, ...]
+    """Of every event; None where it happens after every iteration, or on the host."""
+
+
+def _times(event: Event, num_iterations: int) -> Times | None:
+    if not isinstance(event, StepEvent):
+        return None
+    times = event.times(num_iterations)
+    return None if times == EVERY_ITERATION else times

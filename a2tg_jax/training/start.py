@@ -1,0 +1,62 @@
+"""What training starts from: Gaussians at a scene's points, and rows for all that events can add."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from a2tg_jax.data.scene import Scene
+from a2tg_jax.gaussians import Gaussians, init_from_points
+from a2tg_jax.model import Model
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+
+NO_ROW_LOG_SCALE = -10.0
+"""Logarithm of the scales, and logit of the opacity, of rows that do not exist yet."""
+KEY_OF_PARAMETERS = 0x7E8E1
+
+
+def initial_model(scene: Scene, system: System) -> Model:
+    """Gaussians at the scene's points, as many as the first stage has room for."""
+    num = system.initial_gaussians or len(scene.points)
+    caps = [cap for event in system.stages()[0].events if (cap := getattr(event, "cap", None)) is not None]
+    num = min(num, *caps) if caps else num
+    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity))
+
+
+def padded(model: Model, stage: Stage, system: System) -> Model:
+    """The model with the appearance of a stage and with rows for all that its events can add.
+
+    What the model shows already is kept where its appearance is the stage's, and allocated anew where it is not.
+
+    Raises:
+      ValueError: if Gaussians were to be added to a model whose textures have grown.
+    """
+    num = model.gaussians.num
+    room = max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
+    gaussians = _with_rows(model.gaussians, room)
+    params, layout = model.params, model.layout
+    if model.appearance != stage.appearance or room > num:
+        key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS)
+        params, layout = stage.appearance.allocate(key, gaussians)
+    if model.appearance == stage.appearance and room > num:
+        was: Any = jax.tree.structure(model.params)
+        if jax.tree.structure(params) != was:
+            raise ValueError(f"stage {stage.name!r} would add Gaussians to a model whose textures have grown already")
+        params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
+    return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+
+
+def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
+    """The Gaussians, followed by rows that do not exist yet."""
+    num = room - gaussians.num
+    if num == 0:
+        return gaussians
+    empty = Gaussians(
+        means=jnp.zeros((num, 3)),
+        quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]]), (num, 1)),
+        log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE),
+        logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE),
+        sh=jnp.zeros((num, 16, 3)),
+    )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)

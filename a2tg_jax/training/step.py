@@ -1,0 +1,247 @@
+"""One training step, jitted once per image size and stage: render, loss, gradients, Adam, events.
+
+What cannot be taken, because the tile lists overflowed or a number is not finite, leaves the state as it was, with a
+status that makes all further steps idle: the host may look at it some steps later and lose nothing.
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.model import Model
+from a2tg_jax.optim import AdamState, adam_init, adam_update
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.training.batches import Photographs
+from a2tg_jax.training.stage import Background, Clock, Stage
+from a2tg_jax.training.terms import Target
+
+FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE = range(4)
+"""The status of a state: why it did not take the last step."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrainState:
+    """All that training changes; everything else follows from the system and the iteration."""
+
+    model: Model
+    moments: AdamState
+    """Adam's memory of (gaussians, params)."""
+    events: tuple[Any, ...]
+    """What each event has gathered; None for one that is past."""
+    iteration: Array
+    """int32, iterations of this stage done so far."""
+    status: Array
+    """int32: FINE, OVERFLOW, NOT_FINITE or IMPOSSIBLE."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StepSettings:
+    """What a compiled step is made for besides its stage; hashable."""
+
+    render: RenderSettings
+    """With a capacity."""
+    background: Background
+
+
+class StepInfo(NamedTuple):
+    """Scalars about a step, for the host."""
+
+    loss: Array
+    psnr: Array
+    """Mean over the views, in dB."""
+    num_pairs: Array
+    """The most pairs among the views: what the capacity must hold."""
+    status: Array
+    """After the step."""
+    num_live: Array
+    num_refused: Array
+    """Gaussians that events wanted to add, for which there was no room."""
+
+
+def initial_state(stage: Stage, model: Model) -> TrainState:
+    """The state before the first iteration of a stage."""
+    return TrainState(
+        model=model,
+        moments=adam_init((model.gaussians, model.params)),
+        events=tuple(event.init(model) for event in stage.events),
+        iteration=jnp.zeros((), jnp.int32),
+        status=jnp.zeros((), jnp.int32),
+    )
+
+
+@functools.cache
+def jitted_step():
+    """`train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
+    return jax.jit(train_step, static_argnums=0, donate_argnums=3)
+
+
+def train_step(
+    how: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
+    scene_scale: Array, key: Array,
+) -> tuple[TrainState, StepInfo]:  # fmt: skip
+    """One iteration.
+
+    Args:
+      how: static.
+      stage: its numbers are traced.
+      clock: `stage.clock()`.
+      state: donated.
+      photographs: of one image size.
+      views: [V] int32, which of them are looked at.
+      scene_scale: factor of the means' learning rate.
+      key: of the stage; each iteration folds in its number.
+    """
+    iteration = state.iteration + 1
+    num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
+    keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
+    batch = jax.tree.map(lambda x: x[views], photographs)
+    backgrounds = _backgrounds(keys[0], how.background, views.shape[0])
+    found = _gradients(how, stage, clock, state, batch, backgrounds, iteration)
+    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads)
+
+    progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
+    decay = jnp.exp(clock.log_decay * progress)
+    rate = (stage.rates.gaussians.means * decay).astype(scene_scale.dtype) * scene_scale
+    model, moments = _updated(stage, state, grads, rate)
+    now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
+    seen = _seen(batch, found)
+    model, moments, events, info = _events(stage, clock, now, seen, model, moments, state.events)
+
+    status = _status(found, grads, model, info)
+    status = jnp.where(state.status == FINE, status, state.status)
+    new = TrainState(model, moments, events, iteration, status)
+    chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, dataclasses.replace(state, status=status))
+    return chosen, StepInfo(
+        loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
+        num_live=chosen.model.num_live, num_refused=jnp.asarray(info.num_refused),
+    )  # fmt: skip
+
+
+class _ViewGradients(NamedTuple):
+    """Per view [V, ...]."""
+
+    loss: Array
+    psnr: Array
+    num_pairs: Array
+    is_overflow: Array
+    grads: tuple[Gaussians, Any]
+    statistic: Array | None
+    """[V, N, 4]."""
+
+
+def _gradients(how: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration):
+    """Loss and gradients of every view, one after the other."""
+    height, width = batch.images.shape[1:3]
+    model, highest = state.model, how.render.sh_degree
+    degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
+    is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
+    tap = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if is_gathering else None
+    has_geometry = any(term.has_geometry for term in stage.losses)
+
+    def one_view(view):
+        viewmat, K, image, alpha, background = view
+        target = Target(Camera(viewmat, K, width, height), _over(image, alpha, background), background)
+
+        def loss(gaussians, params, tap):
+            shown = dataclasses.replace(model, gaussians=gaussians, params=params)
+            output, num_pairs = render_traced(
+                gaussians, target.camera, shown.rule, background, how.render,
+                has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, tap=tap,
+                statistic=stage.statistic,
+            )  # fmt: skip
+            value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
+            error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
+            return value, (error, num_pairs, output.overflow)
+
+        differentiate = jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)
+        (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, tap)
+        return _ViewGradients(value, -10 * jnp.log10(error), num_pairs, overflow, grads[:2], grads[2])
+
+    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, batch.images, batch.alphas, backgrounds))
+
+
+def _over(image: Array, alpha: Array | None, background: Array) -> Array:
+    """A photograph as floats, over the background where it is transparent."""
+    color = image.astype(background.dtype) / 255
+    if alpha is None:
+        return color
+    weight = alpha.astype(background.dtype)[..., None] / 255
+    return weight * color + (1 - weight) * background[None, None, :]
+
+
+def _backgrounds(key: Array, kind: Background, num: int) -> Array:
+    if kind == "random":
+        return jax.random.uniform(key, (num, 3))
+    return jnp.full((num, 3), 1.0 if kind == "white" else 0.0)
+
+
+def _seen(batch: Photographs, found: _ViewGradients) -> Seen | None:
+    """What events observe; None where nothing is gathered."""
+    if found.statistic is None:
+        return None
+    height, width = batch.images.shape[1:3]
+    cameras = Camera(batch.viewmats, batch.Ks, width, height)
+    return Seen(cameras, found.statistic[..., :3], found.statistic[..., 3] > 0)
+
+
+def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
+    """Model and moments after Adam, with the parameters projected to where they belong."""
+    model = state.model
+    rates = dataclasses.replace(stage.rates.gaussians, means=rate_of_means)
+    step = adam_update((model.gaussians, model.params), grads, state.moments, (rates, stage.rates.params))
+    gaussians, params = step.params
+    return dataclasses.replace(model, gaussians=gaussians, params=stage.appearance.project(params)), step.state
+
+
+def _events(stage: Stage, clock: Clock, now: Now, seen: Seen | None, model: Model, moments: AdamState, states):
+    """What the events gather, and what those inside the step do."""
+    infos, left, at = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)), [], 0
+    for event, times, state in zip(stage.events, clock.times, states, strict=True):
+        if state is not None and event.statistic and seen is not None:
+            state = event.observe(state, model, seen)
+        if isinstance(event, StepEvent):
+            own = now._replace(keys=now.keys[at : at + event.num_keys])
+            at += event.num_keys
+            model, moments, state, info = _at_its_times(event, times, own, model, moments, state)
+            possible = infos.is_possible & info.is_possible
+            infos = EventInfo(possible, infos.num_refused + info.num_refused)
+        left.append(state)
+    return model, moments, tuple(left), infos
+
+
+def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: AdamState, state):
+    """The change that an event makes, if it is due; events that are past make none."""
+    if times is None:
+        return event.apply(now, model, moments, state)
+    if state is None:
+        return model, moments, state, EventInfo()
+
+    def happen(carry):
+        change = event.apply(now, *carry)
+        info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))
+        return change.model, change.moments, change.state, info
+
+    def wait(carry):
+        return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
+
+    return jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
+
+
+def _status(found: _ViewGradients, grads, model: Model, info: EventInfo) -> Array:
+    """Why a step may not be taken, the first reason that holds."""
+    is_finite = _all_finite((found.loss, grads, model.gaussians, model.params))
+    status = jnp.where(info.is_possible, FINE, IMPOSSIBLE)
+    status = jnp.where(is_finite, status, NOT_FINITE)
+    return jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
+
+
+def _all_finite(tree) -> Array:
+    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])

@@ -1,0 +1,83 @@
+"""Loss terms: what a stage minimises is the sum of them, each times its weight.
+
+A term is a frozen dataclass registered as a pytree, whose numbers are traced; `Term` makes one of any function.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.events import event, static
+from a2tg_jax.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderOutput
+
+
+class Target(NamedTuple):
+    """What a render is compared with."""
+
+    camera: Camera
+    image: Array
+    """[H, W, 3] the photograph, over the background where it is transparent."""
+    background: Array
+    """[3]."""
+
+
+LossFunction = Callable[[Model, Target, RenderOutput], Array]
+
+
+@event
+class Term:
+    """A function of model, target and render, times a weight."""
+
+    function: LossFunction = static()
+    weight: float = 1.0
+    has_geometry: bool = static(default=False)
+    """The function reads depth, normals or distortion, which are composited only where a term needs them."""
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        return self.weight * self.function(model, target, output)
+
+
+@event
+class Photometric:
+    """(1 − w)·L1 + w·(1 − SSIM), the loss of 3DGS."""
+
+    ssim_weight: float = 0.2
+
+    has_geometry = False
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        return photometric_loss(output.color, target.image, ssim_weight=self.ssim_weight)
+
+
+def l1(model: Model, target: Target, output: RenderOutput) -> Array:
+    """Mean absolute difference."""
+    return photometric_loss(output.color, target.image, ssim_weight=0)
+
+
+def normals(model: Model, target: Target, output: RenderOutput) -> Array:
+    """Normal consistency of 2DGS."""
+    return normal_consistency(output.normal, output.depth, output.alpha, target.camera)
+
+
+def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
+    """Depth distortion of 2DGS."""
+    return jnp.mean(output.distortion)
+
+
+def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
+    """Mean opacity of the live Gaussians (3DGS-MCMC)."""
+    return mean_opacity(model.gaussians, _num_live(model))
+
+
+def scale(model: Model, target: Target, output: RenderOutput) -> Array:
+    """Mean scale of the live Gaussians (3DGS-MCMC)."""
+    return mean_scale(model.gaussians, _num_live(model))
+
+
+def _num_live(model: Model) -> Array | int:
+    return model.gaussians.num if model.num_live is None else model.num_live
