@@ -115,8 +115,7 @@ def render_appearance(
     check_gaussians(gaussians)
     check_camera(camera)
     check_background(background)
-    if settings.capacity is None:
-        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings, num_live))
+    settings = with_capacity(settings, gaussians, camera, rule, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
     output, _ = _jitted_render()(gaussians, camera, rule, background, settings, num_live=num_live)
     return output
@@ -279,14 +278,24 @@ def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 
 
-def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings, num_live=None) -> int:
+def with_capacity(
+    settings: RenderSettings, gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any = None
+) -> RenderSettings:
+    """The settings; where they lack a capacity with one for this view, which an eager call can find.
+
+    Raises:
+      ValueError: under jit or vmap without a capacity.
+    """
+    if settings.capacity is not None:
+        return settings
     gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
         )
-    return capacity_for(pairs_of_view(gaussians, camera, rule, settings, num_live))
+    pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
+    return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
 def _primal_value(x):

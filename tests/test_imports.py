@@ -21,7 +21,7 @@ LAYERS = (
     {"compositor", "losses"},
     {"render", "optim", "metrics"},
     {"model"},
-    {"io", "renderer"},
+    {"io", "renderer", "gradients"},
     {"events", "sharing"},
     {"adapt", "mcmc"},
     {"densify"},
