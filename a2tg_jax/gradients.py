@@ -12,6 +12,7 @@ from a2tg_jax.cameras import Camera, check_camera
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import safe_norm
+from a2tg_jax.pixel import Statistic
 from a2tg_jax.render import RenderOutput, RenderSettings, check_background, render_traced, with_capacity
 
 
@@ -25,7 +26,8 @@ class ViewGradients(NamedTuple):
     params: Any
     """Its gradient in what they show."""
     norms: Array
-    """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection)."""
+    """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection), or of
+    another statistic."""
     is_visible: Array
     """[N] whether the Gaussian was composited at one pixel at least."""
     output: RenderOutput
@@ -43,6 +45,7 @@ def view_gradients(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     has_geometry: bool = True,
     sh_degree: Any = None,
+    statistic: Statistic = "position",
 ) -> ViewGradients:
     """Renders a view and differentiates any loss of it, in one pass; meant for jit.
 
@@ -58,6 +61,7 @@ def view_gradients(
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
       has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
       sh_degree: overrides the settings' by a value that may be traced.
+      statistic: of which position on its way to the screen (`pixel.positional_gradient`).
 
     Raises:
       ValueError: if an argument has another shape than it must have, or under jit without a capacity.
@@ -73,12 +77,12 @@ def view_gradients(
         shown = dataclasses.replace(model, gaussians=gaussians, params=params)
         output, num_pairs = render_traced(
             gaussians, camera, shown.rule, jnp.asarray(background, dtype), settings,
-            has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, tap=tap,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, tap=tap, statistic=statistic,
         )  # fmt: skip
         return loss(shown, output), (output, num_pairs)
 
     tap = jnp.zeros((model.gaussians.num, 4), dtype)
     differentiate = jax.value_and_grad(of_parameters, argnums=(0, 1, 2), has_aux=True)
-    (value, (output, num_pairs)), (gaussians, params, statistic) = differentiate(model.gaussians, model.params, tap)
-    norms, is_visible = safe_norm(statistic[:, :3]), statistic[:, 3] > 0
+    (value, (output, num_pairs)), (gaussians, params, found) = differentiate(model.gaussians, model.params, tap)
+    norms, is_visible = safe_norm(found[:, :3]), found[:, 3] > 0
     return ViewGradients(value, gaussians, params, norms, is_visible, output, num_pairs)

@@ -96,9 +96,10 @@ def render_image(
       settings: static choices. An eager call, also under `jax.grad`, needs no capacity and never overflows.
 
     Raises:
-      ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, or if the layout
-        is of another number of Gaussians.
+      ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, if the layout
+        is of another number of Gaussians, or if an argument has another shape than it must have.
     """
+    check_gaussians(gaussians)
     rule = appearance_of(gaussians, textures, layout, settings)
     return render_appearance(gaussians, camera, rule, background=background, settings=settings)
 
@@ -116,6 +117,8 @@ def render_appearance(
     check_gaussians(gaussians)
     check_camera(camera)
     check_background(background)
+    if num_live is not None:
+        check_shape("num_live", num_live, ())
     settings = with_capacity(settings, gaussians, camera, rule, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
     output, _ = _jitted_render()(gaussians, camera, rule, background, settings, num_live=num_live)
@@ -227,11 +230,11 @@ def plan_render(
         raise ValueError("cameras must be one camera at least; got none")
     if not head_room >= 1:
         raise ValueError(f"head_room must be at least 1; got {head_room}")
+    check_gaussians(gaussians)
     if rule is None:
         rule = appearance_of(gaussians, textures, layout, settings)
     elif textures is not None or layout is not None:
         raise ValueError("rule already says what the splats show: give it, or textures and layout")
-    check_gaussians(gaussians)
     for camera in cameras:
         check_camera(camera)
     most = max(pairs_of_view(gaussians, camera, rule, settings) for camera in cameras)
