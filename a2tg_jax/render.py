@@ -253,10 +253,10 @@ def appearance_of(
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is None or layout is None:
-        return PlainRule(settings.texture.max_alpha)
+        return PlainRule(max_alpha=settings.texture.max_alpha)
     check_textures(textures, layout, gaussians.num)
     if gaussians.num == 0:
-        return PlainRule(settings.texture.max_alpha)
+        return PlainRule(max_alpha=settings.texture.max_alpha)
     return textured_rule(textures, layout, settings.texture)
 
 

@@ -14,7 +14,7 @@ from a2tg_jax.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.model import Model
 from a2tg_jax.optim import adam_init
 
-NUM, LIVE, SCENE_SCALE = 40, 25, 2.0
+NUM, LIVE, SCENE_SCALE = 60, 25, 2.0
 
 
 def random_model(seed: int) -> Model:
@@ -68,11 +68,11 @@ def twin_plan(event: CloneSplitPrune, model: Model, gradients, iteration: int, n
 @pytest.mark.parametrize("seed", range(3))
 def test_plan_is_that_of_the_twin(seed, cap, iteration):
     model = random_model(seed)
-    gradients = np.random.default_rng(seed).uniform(0, 4e-4, NUM).astype(np.float32)
+    gradients = np.random.default_rng(seed).uniform(0, 8e-4, NUM).astype(np.float32)
     event = CloneSplitPrune(cap)
     edit, refused = jax.jit(event.plan)(now(iteration), model, jnp.asarray(gradients))
     kept, cloned, split, wanted_refused = twin_plan(event, model, gradients, iteration, 30_000, NUM)
-    assert kept and cloned and split
+    assert kept and (cloned | split)
     for mask, rows in ((edit.is_kept, kept), (edit.is_cloned, cloned), (edit.is_split, split)):
         assert set(np.flatnonzero(np.asarray(mask)).tolist()) == rows
     assert int(refused) == wanted_refused

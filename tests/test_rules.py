@@ -163,7 +163,7 @@ def test_numbers_of_another_shape_are_refused():
 def test_a_largest_alpha_of_one_is_refused():
     scene = draw_scene(4, num=3, width=8, height=8)
     with pytest.raises(ValueError, match=r"max_alpha .* is 1\.0"):
-        rendered(scene, PlainRule(1.0), dtype="float32")
+        rendered(scene, PlainRule(max_alpha=1.0), dtype="float32")
 
 
 @pytest.mark.parametrize("compositor", ["native", "xla", "pallas"])

@@ -81,7 +81,7 @@ class AppearanceRule:
 class PlainRule(AppearanceRule):
     """Plain 2DGS; also what a rule without images derives from."""
 
-    max_alpha: float = dataclasses.field(default=0.99, metadata={"static": True})
+    max_alpha: float = dataclasses.field(default=0.99, kw_only=True, metadata={"static": True})
 
     @property
     def table(self) -> Array:  # type: ignore[override]

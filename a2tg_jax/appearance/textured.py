@@ -111,6 +111,8 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
 
 def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> Textures:
     """RGB residuals and alpha factors as they are seen, from the texels that are trained."""
+    if options.rgb == "signed" and options.alpha == "projected":
+        return textures
     divisor = _largest_alpha(textures, layout) + 1e-6 if options.alpha == "global-maximum" else None
 
     def shown(texels: Array) -> Array:
