@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from oracle import DEFAULT_RULES
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
@@ -34,7 +35,7 @@ def test_gradients_are_those_of_the_image_and_the_statistic_is_the_oracles():
     np.testing.assert_allclose(found.value, value, rtol=1e-12)
     for ours, wanted in zip(jax.tree.leaves(found[1:3]), jax.tree.leaves((gaussians, params)), strict=True):
         np.testing.assert_allclose(ours, wanted, rtol=1e-9, atol=1e-12)
-    expected = oracle.mean_gradient_statistic(scene, cotangent)
+    expected = oracle.gradient_statistic(scene, cotangent, DEFAULT_RULES, "position")
     np.testing.assert_allclose(found.norms, np.linalg.norm(expected, axis=1), rtol=1e-8, atol=1e-10 * expected.max())
     is_seen = np.count_nonzero(oracle.render(scene).weights, axis=(1, 2)) > 0
     np.testing.assert_array_equal(found.is_visible, is_seen)

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
     {"numerics", "startup", "bilinear", "checks"},
     {"gaussians", "cameras", "sh"},
-    {"geometry"},
+    {"geometry", "sharing"},
     {"texture", "tiles", "data"},
     {"appearance", "transform", "paths", "origin"},
     {"pixel"},
@@ -22,7 +22,7 @@ LAYERS = (
     {"render", "optim", "metrics"},
     {"model"},
     {"io", "renderer", "gradients"},
-    {"events", "sharing"},
+    {"events"},
     {"adapt", "mcmc"},
     {"densify"},
     {"training"},
