@@ -35,6 +35,8 @@ from a2tg_jax.events import event as event
 from a2tg_jax.events import static as static
 from a2tg_jax.gaussians import Gaussians as Gaussians
 from a2tg_jax.gaussians import init_from_points as init_from_points
+from a2tg_jax.gradients import ViewGradients as ViewGradients
+from a2tg_jax.gradients import view_gradients as view_gradients
 from a2tg_jax.io.model import load_model as load_model
 from a2tg_jax.io.model import save_model as save_model
 from a2tg_jax.io.ply import load_ply as load_ply
