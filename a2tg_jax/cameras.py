@@ -4,7 +4,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+
+from a2tg_jax.checks import check_floats, short_repr
 
 
 @jax.tree_util.register_dataclass
@@ -25,6 +28,21 @@ class Camera:
     def center(self) -> Array:
         """[3] position of the camera in the world, −Rcᵀt."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def check_camera(camera: Camera, name: str = "camera") -> None:
+    """Raises ValueError, naming the field, unless the matrices have their shapes and the image a size."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{name} must be a Camera; got {type(camera).__name__}")
+    check_floats(f"{name}.viewmat", camera.viewmat, (4, 4))
+    check_floats(f"{name}.K", camera.K, (3, 3))
+    for side in ("width", "height"):
+        value = getattr(camera, side)
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name}.{side} must be a positive number of pixels; got {value!r}")
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:

@@ -1,25 +1,24 @@
 """Image quality and speed of a trained model on given views."""
 
 import dataclasses
-import functools
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
+from a2tg_jax.appearance import Textured
 from a2tg_jax.cameras import Camera
 from a2tg_jax.data import View, view_image
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.metrics import load_lpips, lpips, psnr, ssim
-from a2tg_jax.render import RenderSettings, appearance_of, plan_render, render_traced
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Color
+from a2tg_jax.render import RenderSettings, appearance_of
+from a2tg_jax.renderer import Renderer
 from a2tg_jax.texture import AtlasLayout, Textures
-
-Color = tuple[float, float, float]
-BLACK: Color = (0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +68,12 @@ class Evaluation:
 
 def evaluate(
     views: Sequence[View],
-    gaussians: Gaussians,
+    gaussians: Gaussians | Model,
     textures: Textures | None = None,
     layout: AtlasLayout | None = None,
     *,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
-    background: Color = BLACK,
+    background: Color | None = None,
     lpips_weights: str | os.PathLike | None = None,
     num_renders: int = 0,
 ) -> Evaluation:
@@ -82,27 +81,30 @@ def evaluate(
 
     Args:
       views: at least one.
-      gaussians, textures, layout, settings: what `render_image` takes; the capacity is found here.
-      background: RGB behind the Gaussians, and behind photographs with an alpha channel.
+      gaussians, textures, layout, settings: what `render_image` takes; the capacity is found here. Or a model, alone.
+      background: RGB behind the Gaussians, and behind photographs with an alpha channel; None is the model's own, or
+        black.
       lpips_weights: a weights file for LPIPS; None leaves it out.
       num_renders: return the images of the first so many views, too.
 
     Raises:
-      ValueError: if there are no views.
+      ValueError: if there are no views, or a model is given with textures.
       FileNotFoundError: if `lpips_weights` is not there.
     """
     if not views:
         raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
     weights = None if lpips_weights is None else load_lpips(lpips_weights)
+    model = _model_of(gaussians, textures, layout, settings)
+    background = model.background if background is None else background
     cameras = [view.camera for view in views]
-    draw = compiled_renderer(cameras, gaussians, textures, layout, settings=settings, background=background)
+    renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
     psnr_and_ssim = jax.jit(lambda image, target: (psnr(image, target), ssim(image, target)))
     per_view: list[ViewMetrics] = []
     seconds: list[float] = []
     renders: list[np.ndarray] = []
     for view in views:
-        image, target = draw(view.camera), jnp.asarray(view_image(view, background))
-        seconds.append(_seconds_to_draw(draw, view.camera))
+        image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
+        seconds.append(_seconds_to_draw(renderer, view.camera))
         decibels, similarity = psnr_and_ssim(image, target)
         distance = None if weights is None else float(lpips(image, target, weights))
         per_view.append(ViewMetrics(view.name, float(decibels), float(similarity), distance))
@@ -112,49 +114,20 @@ def evaluate(
     return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
 
 
-def compiled_renderer(
-    cameras: Iterable[Camera],
-    gaussians: Gaussians,
-    textures: Textures | None = None,
-    layout: AtlasLayout | None = None,
-    *,
-    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
-    background: Color = BLACK,
-) -> Callable[[Camera], Array]:
-    """A function that draws the model's colours [H, W, 3] from any of `cameras`, compiled once per image size (host).
-
-    Models of equal shapes, seen by the same cameras, share what is compiled.
-
-    Raises:
-      ValueError: from the function returned, if a camera that was not among `cameras` needs more room.
-    """
-    planned = plan_render(gaussians, list(cameras), textures, layout, settings=settings)
-    draw = _jitted_renderer(planned, background)
-
-    def checked(camera: Camera) -> Array:
-        color, overflow = draw(camera, gaussians, textures, layout)
-        if bool(overflow):
-            raise ValueError("a camera needs more room than those planned for; give it to compiled_renderer too")
-        return color
-
-    return checked
+def _model_of(gaussians: Gaussians | Model, textures, layout, settings: RenderSettings) -> Model:
+    """The one value that all these are."""
+    if isinstance(gaussians, Model):
+        if textures is not None or layout is not None:
+            raise ValueError("textures and layout are part of a model: give the model alone")
+        return gaussians
+    appearance_of(gaussians, textures, layout, settings)
+    if textures is None:
+        return Model(gaussians)
+    return Model(gaussians, textures, layout, appearance=Textured(options=settings.texture))
 
 
-@functools.lru_cache(maxsize=8)
-def _jitted_renderer(settings: RenderSettings, background: Color) -> Callable[..., tuple[Array, Array]]:
-    """The colour and the overflow flag at a planned capacity."""
-
-    def draw(camera, gaussians, textures, layout):
-        rule = appearance_of(gaussians, textures, layout, settings)
-        color = jnp.asarray(background, gaussians.means.dtype)
-        output, _ = render_traced(gaussians, camera, rule, color, settings, has_geometry=False)
-        return output.color, output.overflow
-
-    return jax.jit(draw)
-
-
-def _seconds_to_draw(draw: Callable[[Camera], Array], camera: Camera) -> float:
-    """Time of one image; `draw` has drawn this size before."""
+def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:
+    """Time of one image; the renderer has drawn this size before."""
     start = time.perf_counter()
-    jax.block_until_ready(draw(camera))
+    jax.block_until_ready(renderer(camera))
     return time.perf_counter() - start

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial import cKDTree
 
+from a2tg_jax.checks import check_floats, dtype_of, short_repr
 from a2tg_jax.numerics import safe_divide, safe_sqrt
 
 FLOATS_PER_GAUSSIAN = 58
@@ -52,6 +53,23 @@ class Gaussians:
     def __getitem__(self, rows) -> "Gaussians":
         """The Gaussians of the given rows (slice, mask or index array)."""
         return jax.tree.map(lambda x: x[rows], self)
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
+    """Raises ValueError, naming the field, unless all fields have their shapes and one float dtype."""
+    if not isinstance(gaussians, Gaussians):
+        raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
+    check_floats(f"{name}.means", gaussians.means, ("N", 3))
+    num, dtype = gaussians.num, dtype_of(gaussians.means)
+    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, 16, 3)}
+    for field, shape in shapes.items():
+        value = getattr(gaussians, field)
+        check_floats(f"{name}.{field}", value, shape)
+        if dtype_of(value) != dtype:
+            raise ValueError(f"{name}.{field} must be {dtype} as the means are; got {dtype_of(value)}")
 
 
 def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:

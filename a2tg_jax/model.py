@@ -7,9 +7,15 @@ import jax
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, Plain
+from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
 from a2tg_jax.appearance.base import BYTES_PER_FLOAT
+from a2tg_jax.cameras import Camera
+from a2tg_jax.checks import short_repr
+from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.origin import BLACK, Origin
+from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
+from a2tg_jax.transform import transform_gaussians
 
 
 @jax.tree_util.register_dataclass
@@ -27,24 +33,28 @@ class Model:
     """int32; None where all rows exist."""
     appearance: Appearance = dataclasses.field(default_factory=Plain, metadata={"static": True})
     """What the splats show."""
+    origin: Origin | None = dataclasses.field(default=None, metadata={"static": True})
+    """Where it was trained; None where that is not known."""
 
     @property
     def rule(self) -> AppearanceRule:
         """What the renderer is given."""
-        return self.appearance.rule(self.params, self.layout)
+        return PlainRule() if self.gaussians.num == 0 else self.appearance.rule(self.params, self.layout)
+
+    @property
+    def live(self) -> "Model":
+        """The model of the rows that exist, and no others (host)."""
+        if self.num_live is None:
+            return self
+        params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
+        return dataclasses.replace(
+            self, gaussians=self.gaussians[: self.num], params=params, layout=layout, num_live=None
+        )
 
     @property
     def num(self) -> int:
         """Gaussians that exist (host)."""
         return self.gaussians.num if self.num_live is None else int(self.num_live)
-
-    @property
-    def live(self) -> "Model":
-        """The rows that exist alone (host)."""
-        if self.num_live is None:
-            return self
-        params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
-        return Model(self.gaussians[: self.num], params, layout, appearance=self.appearance)
 
     @property
     def num_bytes(self) -> int:
@@ -61,3 +71,41 @@ class Model:
         """Bytes that exist in the buffers only (host)."""
         allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.params))
         return int(allocated) + BYTES_PER_FLOAT * 58 * self.num - self.num_bytes
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB behind everything: the origin's, or black."""
+        return BLACK if self.origin is None else self.origin.background
+
+    def render(
+        self,
+        camera: Camera,
+        *,
+        background: Any = None,
+        settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    ) -> RenderOutput:
+        """What a camera sees; as `render_appearance`, of the rows that exist.
+
+        Args:
+          camera: the view.
+          background: [3] colour; None is the model's own.
+          settings: static choices; how textures are read is the appearance's, not theirs.
+        """
+        background = self.background if background is None else background
+        return render_appearance(
+            self.gaussians, camera, self.rule, background=background, settings=settings, num_live=self.num_live
+        )
+
+    def transform(self, similarity: Similarity) -> "Model":
+        """The same model in the world that `similarity` leads to, its cameras carried along (host).
+
+        What the splats show is theirs and stays as it is.
+        """
+        return dataclasses.replace(
+            self,
+            gaussians=transform_gaussians(self.gaussians, similarity),
+            origin=None if self.origin is None else self.origin.moved(similarity),
+        )
+
+    def __repr__(self) -> str:
+        return short_repr(self)

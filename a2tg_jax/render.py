@@ -15,14 +15,15 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
-from a2tg_jax.cameras import Camera
+from a2tg_jax.cameras import Camera, check_camera
+from a2tg_jax.checks import check_shape
 from a2tg_jax.compositor import Compositing, Splats, composite
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose
 from a2tg_jax.sh import sh_colors
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
 
 HEAD_ROOM = 1.25
@@ -108,13 +109,27 @@ def render_appearance(
     *,
     background: Any = (0, 0, 0),
     settings: RenderSettings = RenderSettings(),
+    num_live: Array | int | None = None,
 ) -> RenderOutput:
-    """As `render_image`, of splats that show what `rule` says."""
+    """As `render_image`, of splats that show what `rule` says; only the first `num_live` rows, where that is given."""
+    check_gaussians(gaussians)
+    check_camera(camera)
+    check_background(background)
     if settings.capacity is None:
-        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings))
+        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings, num_live))
     background = jnp.asarray(background, gaussians.means.dtype)
-    output, _ = _jitted_render()(gaussians, camera, rule, background, settings)
+    output, _ = _jitted_render()(gaussians, camera, rule, background, settings, num_live=num_live)
     return output
+
+
+def check_background(background: Any) -> None:
+    """Raises ValueError unless it is one colour."""
+    if np.ndim(background) == 3:
+        raise ValueError(
+            f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
+            "render on black and add (1 - output.alpha[..., None]) * image"
+        )
+    check_shape("background", background, (3,))
 
 
 @functools.cache
@@ -187,22 +202,43 @@ def plan_render(
     textures: Textures | None = None,
     layout: AtlasLayout | None = None,
     *,
+    rule: AppearanceRule | None = None,
+    head_room: float = HEAD_ROOM,
     settings: RenderSettings = RenderSettings(),
 ) -> RenderSettings:
     """The settings with a capacity that suffices for every one of the cameras, with head room (host).
 
+    Args:
+      gaussians: N Gaussians.
+      cameras: one or more.
+      textures, layout: their textures; neither, and the splats are plain 2DGS.
+      rule: what the splats show, instead of textures.
+      head_room: factor, at least 1, on the pairs of the fullest view.
+      settings: all but the capacity.
+
     Raises:
-      ValueError: if called under a transformation, where shapes cannot be chosen.
+      ValueError: if there is no camera, if both textures and a rule are given, or if called under a transformation,
+        where shapes cannot be chosen.
     """
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-    rule = appearance_of(gaussians, textures, layout, settings)
+    if not cameras:
+        raise ValueError("cameras must be one camera at least; got none")
+    if not head_room >= 1:
+        raise ValueError(f"head_room must be at least 1; got {head_room}")
+    if rule is None:
+        rule = appearance_of(gaussians, textures, layout, settings)
+    elif textures is not None or layout is not None:
+        raise ValueError("rule already says what the splats show: give it, or textures and layout")
+    check_gaussians(gaussians)
+    for camera in cameras:
+        check_camera(camera)
     most = max(pairs_of_view(gaussians, camera, rule, settings) for camera in cameras)
-    return dataclasses.replace(settings, capacity=capacity_for(most))
+    return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 
-def capacity_for(pairs: int) -> int:
+def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
     """A capacity with head room for so many pairs, rounded up so that few distinct shapes occur."""
-    return max(1024, -(-int(pairs * HEAD_ROOM) // 1024) * 1024)
+    return max(1024, -(-int(pairs * head_room) // 1024) * 1024)
 
 
 def appearance_of(
@@ -213,17 +249,18 @@ def appearance_of(
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is None or layout is None:
         return PlainRule()
-    if layout.num != gaussians.num:
-        raise ValueError(f"layout is of {layout.num} textures, but there are {gaussians.num} gaussians")
+    check_textures(textures, layout, gaussians.num)
     if gaussians.num == 0:
         return PlainRule()
     return textured_rule(textures, layout, settings.texture)
 
 
-def pairs_of_view(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
-    """(splat, tile) pairs of one view, before the outline test (host)."""
+def pairs_of_view(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """(splat, tile) pairs of one view, of the first `num_live` rows, before the outline test (host)."""
     try:
-        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane))
+        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
@@ -233,20 +270,23 @@ def _jitted_count():
     return jax.jit(_count_pairs, static_argnums=(3, 4))
 
 
-def _count_pairs(gaussians, camera, rule, tile_size, near_plane):
+def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     M, _ = homographies(gaussians, camera)
-    bounds = screen_bounds(M, rule.cutoff(gaussians.opacities), near_plane)
+    cutoff = rule.cutoff(gaussians.opacities)
+    if num_live is not None:
+        cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
+    bounds = screen_bounds(M, cutoff, near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 
 
-def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings) -> int:
-    gaussians, camera, rule = jax.tree.map(_primal_value, (gaussians, camera, rule))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule))):
+def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings, num_live=None) -> int:
+    gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
         )
-    return capacity_for(pairs_of_view(gaussians, camera, rule, settings))
+    return capacity_for(pairs_of_view(gaussians, camera, rule, settings, num_live))
 
 
 def _primal_value(x):

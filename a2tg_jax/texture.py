@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.checks import check_floats, check_shape, short_repr
+
 MAX_SIDE = 16
 NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)
 
@@ -24,6 +26,9 @@ class Textures:
 
     buckets: tuple[Array, ...]
     """Bucket b is [capacity_b, Tv_b, Tu_b, 4]."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @jax.tree_util.register_dataclass
@@ -52,6 +57,24 @@ class AtlasLayout:
     def num_texels(self) -> int:
         """Texels in use, padding not counted (host)."""
         return int(np.prod(self.sizes, axis=1).sum())
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def check_textures(textures: Textures, layout: AtlasLayout, num: int) -> None:
+    """Raises ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians."""
+    if not isinstance(textures, Textures) or not isinstance(layout, AtlasLayout):
+        kinds = f"{type(textures).__name__} and {type(layout).__name__}"
+        raise ValueError(f"textures and layout must be Textures and their AtlasLayout; got {kinds}")
+    if layout.num != num:
+        raise ValueError(f"layout is of {layout.num} textures, but there are {num} gaussians")
+    check_shape("layout.row", layout.row, (num,))
+    if len(textures.buckets) != len(layout.resolutions):
+        counts = f"{len(textures.buckets)} buckets, and the layout {len(layout.resolutions)} sizes"
+        raise ValueError(f"textures must have one bucket for each size of the layout; they have {counts}")
+    for index, (bucket, size) in enumerate(zip(textures.buckets, layout.resolutions, strict=True)):
+        check_floats(f"textures.buckets[{index}]", bucket, ("capacity", *size, 4))
 
 
 def bucket_capacity(count: int) -> int:
@@ -123,6 +146,20 @@ def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
     for array, bucket, row in zip(arrays, np.asarray(layout.bucket), np.asarray(layout.row), strict=True):
         filled[bucket][row] = array
     return Textures(tuple(jnp.asarray(bucket) for bucket in filled)), layout
+
+
+def first_textures(textures: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
+    """The textures of the first `num` Gaussians, in buckets of their own (host)."""
+    new, capacities = plan_layout(layout.sizes[:num])
+    old_rows = np.asarray(layout.row)[:num]
+    buckets = []
+    for index, (capacity, resolution) in enumerate(zip(capacities, new.resolutions, strict=True)):
+        source = np.asarray(textures.buckets[layout.resolutions.index(resolution)])
+        filled = np.tile(np.asarray(NEUTRAL_TEXEL, source.dtype), (capacity, *resolution, 1))
+        is_member = np.asarray(new.bucket) == index
+        filled[np.asarray(new.row)[is_member]] = source[old_rows[is_member]]
+        buckets.append(jnp.asarray(filled))
+    return Textures(tuple(buckets)), new
 
 
 def texture_arrays(textures: Textures, layout: AtlasLayout) -> list[np.ndarray]:

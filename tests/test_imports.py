@@ -11,15 +11,17 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"config", "numerics", "startup", "bilinear"},
+    {"config", "numerics", "startup", "bilinear", "checks"},
     {"gaussians", "cameras", "sh"},
     {"geometry"},
     {"texture", "tiles", "data"},
-    {"appearance", "io", "paths"},
-    {"pixel", "model"},
+    {"appearance", "transform", "paths", "origin"},
+    {"pixel"},
     {"kernels"},
     {"compositor", "losses"},
     {"render", "optim", "metrics"},
+    {"model"},
+    {"io", "renderer"},
     {"adapt", "mcmc", "schedule"},
     {"step"},
     {"batches", "checkpoint"},

@@ -15,12 +15,13 @@ from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
-from a2tg_jax.io.model import Model, load_model, save_model
+from a2tg_jax.io.model import save_model
 from a2tg_jax.io.ply import ATTRIBUTES, load_ply, save_ply
-from a2tg_jax.io.transform import sh_rotation, transform_gaussians
+from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
 from a2tg_jax.sh import sh_basis
-from a2tg_jax.texture import texture_arrays, textures_from_arrays
+from a2tg_jax.texture import textures_from_arrays
+from a2tg_jax.transform import sh_rotation, transform_gaussians
 
 
 def some_gaussians(num: int = 7, seed: int = 0) -> Gaussians:
@@ -223,24 +224,6 @@ def test_npz_without_header_is_refused(tmp_path):
         read_archive(tmp_path / "other.npz")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_archive(tmp_path / "nowhere.npz")
-
-
-# Models
-
-
-def test_model_round_trip(tmp_path):
-    rng = np.random.default_rng(0)
-    arrays = [rng.normal(size=(tv, tu, 4)).astype(np.float32) for tv, tu in [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2)]]
-    save_model(tmp_path / "m.npz", Model(some_gaussians(5), *textures_from_arrays(arrays)))
-    loaded = load_model(tmp_path / "m.npz")
-    assert_same(loaded.gaussians, some_gaussians(5))
-    for array, again in zip(arrays, texture_arrays(loaded.textures, loaded.layout), strict=True):
-        np.testing.assert_array_equal(array, again)
-
-
-def test_model_without_textures(tmp_path):
-    save_model(tmp_path / "m.npz", Model(some_gaussians()))
-    assert load_model(tmp_path / "m.npz").textures is None
 
 
 # Configurations

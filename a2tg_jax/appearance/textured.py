@@ -15,7 +15,14 @@ from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
-from a2tg_jax.texture import AtlasLayout, Textures, allocate_textures, texture_arrays, textures_from_arrays
+from a2tg_jax.texture import (
+    AtlasLayout,
+    Textures,
+    allocate_textures,
+    first_textures,
+    texture_arrays,
+    textures_from_arrays,
+)
 
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
@@ -142,9 +149,7 @@ class Textured(Appearance):
         return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
 
     def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
-        if num == layout.num:
-            return params, layout
-        return textures_from_arrays(texture_arrays(params, layout)[:num])
+        return (params, layout) if num == layout.num else first_textures(params, layout, num)
 
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
         """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""

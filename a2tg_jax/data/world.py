@@ -42,6 +42,10 @@ class Similarity:
         moved[:3, 3] = self.scale * viewmat[:3, 3] - moved[:3, :3] @ self.translation
         return moved
 
+    def then(self, other: "Similarity") -> "Similarity":
+        """This similarity, and after it another."""
+        return Similarity(self.scale * other.scale, other.rotation @ self.rotation, other.apply(self.translation))
+
     def inverse(self) -> "Similarity":
         """The way back: brings results (points, lengths, directions, cameras) to the original world."""
         return Similarity(1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)

@@ -1,62 +1,177 @@
-"""Trained models: Gaussians and their textures in one archive, without padding."""
+"""Models on disk: Gaussians, what they show and where they were trained, in one archive, without padding.
+
+The header names the class of the appearance and holds its options. Reading a file imports nothing: a class that is not
+this package's must be handed over, or its module be imported already.
+"""
 
 import dataclasses
+import json
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax import appearance as built_in
+from a2tg_jax.appearance import Appearance, Plain, Textured
+from a2tg_jax.checks import check_shape
+from a2tg_jax.data.world import Similarity
+from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.texture import AtlasLayout, Textures, texture_arrays, textures_from_arrays
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
 
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-
-
-@dataclasses.dataclass(frozen=True)
-class Model:
-    """What a training stage leaves behind, live Gaussians only, in the normalised world."""
-
-    gaussians: Gaussians
-    """N Gaussians."""
-    textures: Textures | None = None
-    """Their textures; None for plain 2D Gaussians."""
-    layout: AtlasLayout | None = None
-    """Where the texture of each Gaussian lies; None exactly where `textures` is."""
+APPEARANCE, ORIGIN = "appearance/", "origin/"
+"""What the names of their arrays begin with."""
 
 
 def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
-    """Writes a model: the five arrays of the Gaussians, and, if textured, `sizes` [N, 2] and `texels` [M, 4].
+    """Writes the rows of a model that exist, with its appearance and its origin.
 
-    `texels` holds the textures one after the other, each row by row. `header` is kept along (JSON-able values).
+    Args:
+      path: the file, by custom *.npz; an older one is replaced once the new one is whole.
+      model: any model.
+      header: JSON-able values to keep along; `read_archive_header` returns them.
+
+    Raises:
+      ValueError: if a field of the Gaussians has another shape than it must have, or the options of the appearance
+        cannot be written as JSON.
     """
+    check_gaussians(model.gaussians, "model.gaussians")
+    model = model.live
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
-    if model.textures is not None and model.layout is not None:
-        texels = [array.reshape(-1, 4) for array in texture_arrays(model.textures, model.layout)]
-        arrays |= {"sizes": model.layout.sizes, "texels": np.concatenate(texels)}
-    write_archive(path, header or {}, arrays, format=FORMAT)
+    shown = model.appearance.arrays(model.params, model.layout)
+    arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}
+    described = {**(header or {}), "appearance": _appearance_to_dict(model.appearance)}
+    if model.origin is not None:
+        described["origin"] = {"names": list(model.origin.names), "background": list(model.origin.background)}
+        arrays |= {ORIGIN + name: array for name, array in _origin_arrays(model.origin).items()}
+    write_archive(path, described, arrays, format=FORMAT)
 
 
-def load_model(path: str | os.PathLike) -> Model:
+def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance]] = ()) -> Model:
     """The model that `save_model` wrote.
+
+    A model of version 0.1.0, which knew one kind of textures, gets them with the default options.
+
+    Args:
+      path: the file.
+      appearances: classes of appearances that are not this package's.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not a model, is damaged, or is of another version.
+      ValueError: if it is not a model, is damaged, is of another version, or shows a class that is not known here.
     """
-    _, arrays = read_archive(path, format=FORMAT)
-    missing = [name for name in FIELDS if name not in arrays]
-    if missing or ("sizes" in arrays) != ("texels" in arrays):
-        raise ValueError(f"{path}: lacks the array {', '.join(missing) or 'sizes or texels'}")
-    gaussians = Gaussians(**{name: jnp.asarray(arrays[name]) for name in FIELDS})
-    if "sizes" not in arrays:
-        return Model(gaussians)
-    sizes = arrays["sizes"]
-    pieces = np.split(arrays["texels"], np.cumsum(sizes.prod(axis=1))[:-1])
-    textures, layout = textures_from_arrays(
-        [piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)]
+    header, arrays = read_archive(path, format=FORMAT)
+    try:
+        return _model_of(header, arrays, appearances)
+    except KeyError as error:
+        raise ValueError(f"{os.fspath(path)}: the model lacks {error}; it is damaged or of another version") from error
+    except (TypeError, IndexError, AttributeError) as error:
+        raise ValueError(f"{os.fspath(path)}: the model is damaged or of another version ({error})") from error
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from error
+
+
+def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances) -> Model:
+    gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
+    check_gaussians(gaussians)
+    gaussians = jax.tree.map(jnp.asarray, gaussians)
+    shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
+    if "appearance" in header:
+        appearance = _appearance_from_dict(header["appearance"], appearances)
+    else:
+        shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
+        appearance = Textured() if shown else Plain()
+    params, layout = appearance.from_arrays(shown)
+    _check_rows(appearance, params, layout, gaussians.num)
+    origin = _origin_of(header["origin"], arrays) if "origin" in header else None
+    return Model(gaussians, params, layout, appearance=appearance, origin=origin)
+
+
+def _check_rows(appearance: Appearance, params: Any, layout: Any, num: int) -> None:
+    """Raises ValueError unless floats are shown, by as many rows as there are Gaussians."""
+    for leaf in jax.tree.leaves(params):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(f"the parameters of {type(appearance).__name__} must be floats; got {leaf.dtype}")
+    has_rows = not jax.tree.leaves(layout)
+    found = {leaf.shape[0] for leaf in jax.tree.leaves(params)} if has_rows else {getattr(layout, "num", num)}
+    if found - {num}:
+        raise ValueError(f"{type(appearance).__name__} is of {min(found - {num})} rows, but there are {num} Gaussians")
+
+
+# Appearances
+
+
+def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
+    kind = type(appearance)
+    options = config_to_dict(appearance)
+    try:
+        is_kept = config_from_dict(kind, json.loads(json.dumps(options, allow_nan=False))) == appearance
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
+    if not is_kept:
+        raise ValueError(f"the options of {kind.__name__} do not come back from JSON: {options}")
+    return {"module": kind.__module__, "name": kind.__qualname__, "options": options}
+
+
+def _appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
+    kind = _known_class(data["module"], data["name"], appearances)
+    return config_from_dict(kind, data["options"], f"options of {kind.__name__}")
+
+
+def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]) -> type[Appearance]:
+    """The class that a file names: one that was handed over, this package's, or one of a module already imported."""
+    given = [kind for kind in appearances if kind.__qualname__ == name]
+    found: Any = given[0] if given else None
+    if found is None and module.partition(".")[0] == __name__.partition(".")[0]:
+        found = getattr(built_in, name, None)
+    if found is None:
+        found = getattr(sys.modules.get(module), name, None)
+    if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
+        return found
+    raise ValueError(
+        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
+        f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
     )
-    return Model(gaussians, textures, layout)
+
+
+# Origins
+
+
+def _origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
+    world = origin.transform
+    return {
+        "viewmats": origin.viewmats,
+        "Ks": origin.Ks,
+        "sizes": origin.sizes,
+        "is_test": origin.is_test,
+        "scale": np.asarray(world.scale, np.float64),
+        "rotation": np.asarray(world.rotation, np.float64),
+        "translation": np.asarray(world.translation, np.float64),
+    }
+
+
+def _origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
+    names, (red, green, blue) = data["names"], data["background"]
+    num = len(names)
+    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
+    shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+    for name, shape in shapes.items():
+        check_shape(ORIGIN + name, arrays[ORIGIN + name], shape)
+    viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[ORIGIN + name] for name in shapes)
+    return Origin(
+        viewmats=viewmats,
+        Ks=Ks,
+        sizes=sizes,
+        names=tuple(names),
+        is_test=is_test,
+        transform=Similarity(float(scale), rotation, translation),
+        background=(float(red), float(green), float(blue)),
+    )

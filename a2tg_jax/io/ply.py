@@ -16,7 +16,7 @@ import numpy as np
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.io.atomic import replacing
-from a2tg_jax.io.transform import transform_gaussians
+from a2tg_jax.transform import transform_gaussians
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" for i in range(45))

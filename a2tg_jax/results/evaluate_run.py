@@ -1,14 +1,17 @@
 """Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 
 from a2tg_jax.config import TrainConfig
 from a2tg_jax.data import Scene, View, view_image
-from a2tg_jax.evaluation import BLACK, Color, compiled_renderer, evaluate
-from a2tg_jax.io.model import Model, load_model
+from a2tg_jax.evaluation import evaluate
+from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import save_ply
-from a2tg_jax.metrics import padding_bytes, parameter_bytes
+from a2tg_jax.model import Model
+from a2tg_jax.origin import BLACK, Color
+from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import PHASES, Phase, RunFolder, write_json
 from a2tg_jax.results.history import read_history
@@ -26,6 +29,7 @@ from a2tg_jax.results.pictures import (
 from a2tg_jax.results.record import RunRecord, read_record
 from a2tg_jax.results.report import Comparison, write_report
 from a2tg_jax.results.summary import PhaseResult, RunResult, metrics_json, per_view_json
+from a2tg_jax.texture import AtlasLayout
 from a2tg_jax.training import render_settings
 
 WHITE: Color = (1.0, 1.0, 1.0)
@@ -81,22 +85,19 @@ def _seconds(run: RunFolder, phase: Phase) -> float:
 def _measure(model: Model, scene: Scene, config: TrainConfig, seconds: float, lpips_weights) -> PhaseResult:
     found = evaluate(
         (*scene.test, *scene.train),
-        *(model.gaussians, model.textures, model.layout),
+        model,
         settings=render_settings(config),
         background=background_of(config),
         lpips_weights=lpips_weights,
         num_renders=len(scene.test or scene.train),
     )
-    padding = 0
-    if model.textures is not None and model.layout is not None:
-        padding = padding_bytes(model.textures, model.layout)
     return PhaseResult(
         train=found[len(scene.test) :],
         test=found[: len(scene.test)] if scene.test else None,
-        num_gaussians=model.gaussians.num,
-        num_texels=0 if model.layout is None else model.layout.num_texels,
-        megabytes=parameter_bytes(model.gaussians, model.layout) / 1e6,
-        padding_megabytes=padding / 1e6,
+        num_gaussians=model.num,
+        num_texels=model.layout.num_texels if isinstance(model.layout, AtlasLayout) else 0,
+        megabytes=model.num_bytes / 1e6,
+        padding_megabytes=model.num_padding_bytes / 1e6,
         seconds=seconds,
     )
 
@@ -105,15 +106,17 @@ def _write_figures(run: RunFolder, record: RunRecord, models: Mapping[Phase, Mod
     histories = {phase: read_history(run.history(phase)) for phase in models}
     save_figure(run.own(run.figures / "curves.png"), curves_figure(histories))
     textured = models.get("stage2")
-    if textured is None or textured.textures is None or textured.layout is None:
+    if textured is None or not isinstance(textured.layout, AtlasLayout):
         return
     save_figure(run.own(run.figures / "sizes.png"), sizes_figure(textured.layout.sizes))
     cameras = [view.camera for view in (*scene.test, *scene.train)]
-    colored = colored_by_resolution(textured.gaussians, textured.textures, textured.layout)
+    gaussians, textures, _ = colored_by_resolution(textured.gaussians, textured.params, textured.layout)
+    colored = dataclasses.replace(textured, gaussians=gaussians, params=textures)
     background = background_of(record.config)
-    draw = compiled_renderer(cameras, *colored, settings=render_settings(record.config), background=background)
+    renderer = Renderer(colored, settings=render_settings(record.config), background=background, has_geometry=False)
+    picture = to_uint8(renderer(cameras[0]).color)
     num_levels = int(texel_levels(textured.layout).max()) + 1
-    save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(to_uint8(draw(cameras[0])), num_levels))
+    save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels))
 
 
 def _compare(views: tuple[View, ...], index: int, result: RunResult) -> Comparison:

@@ -10,9 +10,9 @@ from tqdm import tqdm
 
 from a2tg_jax.cameras import Camera
 from a2tg_jax.data import Scene
-from a2tg_jax.evaluation import compiled_renderer
 from a2tg_jax.io.model import load_model
 from a2tg_jax.paths import smooth_path
+from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.evaluate_run import background_of
 from a2tg_jax.results.folder import Phase, RunFolder
 from a2tg_jax.results.pictures import picture_name, save_picture, to_uint8
@@ -42,14 +42,15 @@ def render_frames(
         raise FileNotFoundError(f"{run.path} has no finished {phase}; go on with a2tg train … --resume")
     record, model = read_record(run), load_model(run.model(phase))
     cameras = dict(_cameras(record.source.load(), route, num_frames))
-    draw = compiled_renderer(
-        cameras.values(),
-        *(model.gaussians, model.textures, model.layout),
+    renderer = Renderer(
+        model,
+        cameras=cameras.values(),
         settings=render_settings(record.config),
         background=background_of(record.config),
+        has_geometry=False,
     )
     for name, camera in tqdm(cameras.items(), desc="frames", unit="frame"):
-        save_picture(out / name, to_uint8(draw(camera)))
+        save_picture(out / name, to_uint8(renderer(camera).color))
     return [out / name for name in cameras]
 
 

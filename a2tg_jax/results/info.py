@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.io.model import load_model
-from a2tg_jax.metrics import parameter_bytes
 from a2tg_jax.results.folder import Phase, RunFolder, read_json
 from a2tg_jax.results.record import RunRecord, read_record
+from a2tg_jax.texture import AtlasLayout
 
 
 def describe_run(run: RunFolder) -> str:
@@ -32,8 +32,8 @@ def _describe_phase(run: RunFolder, record: RunRecord, phase: Phase, measured: d
     if not run.model(phase).is_file():
         return title + _progress(run.checkpoints(phase))
     model = load_model(run.model(phase))
-    parts = [f"{model.gaussians.num:,} Gaussians", f"{parameter_bytes(model.gaussians, model.layout) / 1e6:.2f} MB"]
-    if model.layout is not None:
+    parts = [f"{model.gaussians.num:,} Gaussians", f"{model.num_bytes / 1e6:.2f} MB"]
+    if isinstance(model.layout, AtlasLayout):
         sizes, counts = np.unique(model.layout.sizes, axis=0, return_counts=True)
         parts.append("textures " + ", ".join(f"{tv}×{tu}: {n:,}" for (tv, tu), n in zip(sizes, counts, strict=True)))
     if measured:

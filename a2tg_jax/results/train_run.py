@@ -2,14 +2,18 @@
 
 import functools
 
+from a2tg_jax.appearance import Textured
 from a2tg_jax.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from a2tg_jax.config import TrainConfig
 from a2tg_jax.data import Scene
-from a2tg_jax.io.model import Model, load_model, save_model
+from a2tg_jax.io.model import load_model, save_model
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.results.evaluate_run import background_of
 from a2tg_jax.results.folder import Phase, RunFolder
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import read_record
-from a2tg_jax.training import FitResult, fit_stage1, fit_stage2
+from a2tg_jax.training import FitResult, fit_stage1, fit_stage2, texture_options
 
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Iterations."""
@@ -33,7 +37,16 @@ def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
         if not run.model(phase).is_file():
             result = _train_phase(run, phase, scene, record.phase_config(phase), progress)
             write_history(run.own(run.history(phase)), result.history)
-            save_model(run.own(run.model(phase)), Model(result.gaussians, result.textures, result.layout))
+            save_model(run.own(run.model(phase)), _model_of(result, scene))
+
+
+def _model_of(result: FitResult, scene: Scene) -> Model:
+    """What a phase leaves behind."""
+    origin = Origin.of_scene(scene, background_of(result.config))
+    if result.textures is None:
+        return Model(result.gaussians, origin=origin)
+    appearance = Textured(options=texture_options(result.config))
+    return Model(result.gaussians, result.textures, result.layout, appearance=appearance, origin=origin)
 
 
 def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config: TrainConfig, progress: bool) -> FitResult:

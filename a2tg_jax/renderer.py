@@ -1,0 +1,114 @@
+"""A renderer for cameras that move: room for the tile lists is allocated on the host and kept while it suffices."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.cameras import Camera, check_camera
+from a2tg_jax.gaussians import Gaussians, check_gaussians
+from a2tg_jax.model import Model
+from a2tg_jax.render import (
+    RenderOutput,
+    RenderSettings,
+    capacity_for,
+    check_background,
+    pairs_of_view,
+    render_traced,
+)
+
+FIRST_ROOM = 1.5
+"""Head room over the first view of a size, where no other cameras are known."""
+GROWTH = 2
+"""The least factor by which room grows."""
+
+Size = tuple[int, int]
+
+
+class Renderer:
+    """Draws one model from any camera.
+
+    Each image size is compiled for a capacity. A view that needs more is drawn again with at least twice the room, so
+    that a long flight compiles a few times only, and no camera is refused. Models of equal shapes share what is
+    compiled.
+
+        renderer = Renderer(model)
+        for camera in smooth_path(cameras, 200):
+            image = renderer(camera).color
+    """
+
+    def __init__(
+        self,
+        model: Model | Gaussians,
+        rule: AppearanceRule | None = None,
+        *,
+        cameras: Iterable[Camera] = (),
+        background: Any = None,
+        settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+        has_geometry: bool = True,
+    ):
+        """Prepares to draw.
+
+        Args:
+          model: a model; or Gaussians, of which all rows show.
+          rule: what the Gaussians show; None is plain 2DGS. A model says it itself.
+          cameras: room is made for these at once; others may come.
+          background: [3] colour; None is the model's own, or black.
+          settings: all but the capacity, which is found.
+          has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
+
+        Raises:
+          ValueError: if a rule is given beside a model, or an argument has another shape than it must have.
+        """
+        if isinstance(model, Model) and rule is not None:
+            raise ValueError("rule: a model says itself what its splats show; give Gaussians with a rule")
+        model = model if isinstance(model, Model) else Model(model)
+        background = model.background if background is None else background
+        check_background(background)
+        check_gaussians(model.gaussians)
+        self._gaussians, self._num_live = model.gaussians, model.num_live
+        self._rule = model.rule if rule is None else rule
+        self._background = jnp.asarray(background, model.gaussians.means.dtype)
+        self._settings, self._has_geometry = settings, has_geometry
+        self.capacities: dict[Size, int] = {}
+        """Room for (splat, tile) pairs by image size, (width, height)."""
+        self._plan(list(cameras))
+
+    def __call__(self, camera: Camera) -> RenderOutput:
+        """What a camera sees (host); never an overflow."""
+        check_camera(camera)
+        size = camera.width, camera.height
+        if size not in self.capacities:
+            self.capacities[size] = capacity_for(self._num_pairs(camera), FIRST_ROOM)
+        output, pairs = self._draw(camera)
+        while bool(output.overflow):
+            self.capacities[size] = max(capacity_for(int(pairs)), GROWTH * self.capacities[size])
+            output, pairs = self._draw(camera)
+        return output
+
+    def _plan(self, cameras: list[Camera]) -> None:
+        """Room for all these cameras."""
+        for camera in cameras:
+            check_camera(camera)
+            size = camera.width, camera.height
+            self.capacities[size] = max(self.capacities.get(size, 0), capacity_for(self._num_pairs(camera)))
+
+    def _num_pairs(self, camera: Camera) -> int:
+        return pairs_of_view(self._gaussians, camera, self._rule, self._settings, self._num_live)
+
+    def _draw(self, camera: Camera):
+        settings = dataclasses.replace(self._settings, capacity=self.capacities[camera.width, camera.height])
+        return _jitted_draw()(
+            self._gaussians, camera, self._rule, self._background, settings,
+            has_geometry=self._has_geometry, num_live=self._num_live,
+        )  # fmt: skip
+
+
+@functools.cache
+def _jitted_draw() -> Callable[..., Any]:
+    """`render_traced`, jitted; its cache counts the compilations."""
+    return jax.jit(render_traced, static_argnums=4, static_argnames="has_geometry")

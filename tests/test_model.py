@@ -1,0 +1,328 @@
+"""Models as values: saved and loaded, moved, cut to the rows that exist, rendered without their photographs."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes_random import as_camera, as_gaussians, draw_scene
+from test_io import assert_same, some_gaussians, some_world
+
+from a2tg_jax.appearance import Appearance, PlainRule, Textured, TextureOptions
+from a2tg_jax.cameras import Camera
+from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
+from a2tg_jax.io.model import FORMAT, load_model, save_model
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.render import RenderSettings, render_appearance, render_image
+from a2tg_jax.texture import texture_arrays, textures_from_arrays
+
+SIZES = [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2), (1, 1), (3, 5)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tint(Appearance):
+    """A colour of its own for each splat: an appearance from elsewhere."""
+
+    strength: float = 0.5
+    channels: tuple[int, ...] = (0, 1, 2)
+    name: str | None = None
+
+    def allocate(self, key, gaussians):
+        return {"tint": jnp.full((gaussians.num, 3), self.strength)}, ()
+
+    def rule(self, params, layout):
+        return PlainRule()
+
+
+def some_textures(num: int = 7):
+    rng = np.random.default_rng(3)
+    sizes = [SIZES[i % len(SIZES)] for i in range(num)]
+    return [rng.uniform(size=(*size, 4)).astype(np.float32) for size in sizes]
+
+
+def some_origin(num: int = 3) -> Origin:
+    cameras = [as_camera(draw_scene(seed, width=20 + seed), "float32") for seed in range(num)]
+    names = [f"{index}.png" for index in range(num)]
+    return Origin.of_cameras(
+        cameras, names, is_test=[True] + [False] * (num - 1), transform=some_world(), background=(0.1, 0.2, 0.3)
+    )
+
+
+def textured_model() -> Model:
+    appearance = Textured(start=(2, 2), options=TextureOptions.official())
+    return Model(some_gaussians(), *textures_from_arrays(some_textures()), appearance=appearance, origin=some_origin())
+
+
+def assert_same_model(found: Model, wanted: Model) -> None:
+    assert found.appearance == wanted.appearance and found.origin == wanted.origin
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+# Files
+
+
+def test_round_trip(tmp_path):
+    save_model(tmp_path / "m.npz", textured_model(), {"note": "kept"})
+    assert_same_model(load_model(tmp_path / "m.npz"), textured_model())
+    assert read_archive_header(tmp_path / "m.npz", format=FORMAT)["note"] == "kept"
+
+
+def test_round_trip_without_textures_and_origin(tmp_path):
+    save_model(tmp_path / "m.npz", Model(some_gaussians()))
+    assert_same_model(load_model(tmp_path / "m.npz"), Model(some_gaussians()))
+
+
+def test_a_loaded_model_shows_the_same_without_photographs(tmp_path):
+    scene = draw_scene(4)
+    camera = as_camera(scene, "float32")
+    textures, layout = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
+    background = tuple(scene.background.tolist())
+    model = Model(
+        as_gaussians(scene, "float32"), textures, layout, appearance=Textured(),
+        origin=Origin.of_cameras([camera], background=background),
+    )  # fmt: skip
+    save_model(tmp_path / "m.npz", model)
+    loaded = load_model(tmp_path / "m.npz")
+    expected = render_image(model.gaussians, camera, textures, layout, background=background)
+    np.testing.assert_array_equal(loaded.render(loaded.origin.cameras[0]).color, expected.color)
+
+
+def test_only_rows_that_exist_are_kept(tmp_path):
+    model = dataclasses.replace(textured_model(), num_live=jnp.asarray(4, jnp.int32))
+    save_model(tmp_path / "m.npz", model)
+    loaded = load_model(tmp_path / "m.npz")
+    assert loaded.num == 4 and loaded.num_live is None
+    assert_same(loaded.gaussians, some_gaussians()[:4])
+    for array, again in zip(some_textures()[:4], texture_arrays(loaded.params, loaded.layout), strict=True):
+        np.testing.assert_array_equal(array, again)
+    assert loaded.num_bytes == model.num_bytes == 232 * 4 + 16 * (1 + 8 + 4 + 4)
+
+
+@pytest.mark.parametrize("num", [0, 1])
+def test_few_gaussians(tmp_path, num):
+    model = Model(some_gaussians(num), *textures_from_arrays(some_textures(num)), appearance=Textured())
+    save_model(tmp_path / "m.npz", model)
+    assert_same_model(load_model(tmp_path / "m.npz"), model)
+    camera = as_camera(draw_scene(0), "float32")
+    assert np.isfinite(load_model(tmp_path / "m.npz").render(camera).color).all()
+
+
+def test_a_model_of_the_first_version(tmp_path):
+    gaussians, arrays = some_gaussians(), some_textures()
+    fields = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(gaussians)}
+    write_archive(tmp_path / "plain.npz", {}, fields, format=FORMAT)
+    assert_same_model(load_model(tmp_path / "plain.npz"), Model(gaussians))
+    sizes, texels = np.array(SIZES), np.concatenate([array.reshape(-1, 4) for array in arrays])
+    write_archive(tmp_path / "textured.npz", {}, fields | {"sizes": sizes, "texels": texels}, format=FORMAT)
+    wanted = Model(gaussians, *textures_from_arrays(arrays), appearance=Textured())
+    assert_same_model(load_model(tmp_path / "textured.npz"), wanted)
+
+
+# Appearances from elsewhere
+
+
+def tinted_model(**options) -> Model:
+    params, layout = Tint(**options).allocate(jax.random.key(0), some_gaussians())
+    return Model(some_gaussians(), params, layout, appearance=Tint(**options))
+
+
+def test_an_appearance_of_an_imported_module_is_found(tmp_path):
+    save_model(tmp_path / "m.npz", tinted_model(strength=0.25, channels=(2, 1), name="red"))
+    assert_same_model(load_model(tmp_path / "m.npz"), tinted_model(strength=0.25, channels=(2, 1), name="red"))
+
+
+def of_another_program(path) -> None:
+    """Renames the class's module in the file to one that was never imported."""
+    header, arrays = read_archive(path, format=FORMAT)
+    header["appearance"]["module"] = "antigravity"
+    write_archive(path, {k: v for k, v in header.items() if k not in ("format", "version")}, arrays, format=FORMAT)
+
+
+def test_a_file_imports_nothing_and_says_what_to_do(tmp_path):
+    save_model(tmp_path / "m.npz", tinted_model())
+    of_another_program(tmp_path / "m.npz")
+    with pytest.raises(ValueError, match=r"m\.npz: .*Tint .*antigravity.*import that module.*appearances=\(Tint,\)"):
+        load_model(tmp_path / "m.npz")
+    assert_same_model(load_model(tmp_path / "m.npz", appearances=(Tint,)), tinted_model())
+
+
+def test_options_that_a_file_cannot_keep_are_refused(tmp_path):
+    model = dataclasses.replace(tinted_model(), appearance=Tint(name=object()))
+    with pytest.raises(ValueError, match="options of Tint cannot be kept"):
+        save_model(tmp_path / "m.npz", model)
+    assert not list(tmp_path.iterdir())
+
+
+# Damage
+
+
+def edit(change):
+    """A spoiler that changes header and arrays of a whole file."""
+
+    def spoil(path):
+        header, arrays = read_archive(path, format=FORMAT)
+        header = {k: v for k, v in header.items() if k not in ("format", "version")}
+        change(header, arrays)
+        write_archive(path, header, arrays, format=FORMAT)
+
+    return spoil
+
+
+def with_header(text: str):
+    """A spoiler that replaces the header by any text."""
+
+    def spoil(path):
+        _, arrays = read_archive(path, format=FORMAT)
+        np.savez(path, header=np.frombuffer(text.encode(), np.uint8), **arrays)
+
+    return spoil
+
+
+def changed(*names_and_functions):
+    """A spoiler that passes arrays through functions."""
+    pairs = list(zip(names_and_functions[::2], names_and_functions[1::2], strict=True))
+    return edit(lambda header, arrays: arrays.update({name: function(arrays[name]) for name, function in pairs}))
+
+
+def head(**values) -> str:
+    return json.dumps({"format": FORMAT, "version": 1, **values})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: path.write_bytes(path.read_bytes()[:-30]), "damaged"),
+        (lambda path: path.write_bytes(b""), "damaged"),
+        (with_header("[1, 2]"), "damaged"),
+        (with_header(head(note=float("nan"))), "damaged"),
+        (with_header("[" * 100_000), "damaged"),
+        (with_header(head(appearance=3)), "damaged"),
+        (with_header(head(appearance={"name": "Textured"})), "lacks 'module'"),
+        (changed("means", lambda x: x[:, :2]), r"gaussians\.means must be \[N, 3\]; got \[7, 2\]"),
+        (changed("means", lambda x: x[0, 0]), r"gaussians\.means must be \[N, 3\]"),
+        (changed("sh", lambda x: x[:, :1]), r"gaussians\.sh must be \[7, 16, 3\]; got \[7, 1, 3\]"),
+        (changed("quats", lambda x: x.astype(np.int32)), r"gaussians\.quats must be floats"),
+        (changed("quats", lambda x: x.astype(str)), "must be floats"),
+        (edit(lambda header, arrays: arrays.pop("quats")), "lacks 'quats'"),
+        (edit(lambda header, arrays: arrays.pop("appearance/texels")), "texels of textures is missing"),
+        (changed("appearance/texels", lambda x: x[1:]), "disagree"),
+        (changed("appearance/texels", lambda x: x.astype(np.int32)), "must be floats"),
+        (changed("appearance/sizes", lambda x: -x), "unknown dimension"),
+        (changed("appearance/sizes", lambda x: x.astype(float)), "damaged"),
+        (changed("appearance/sizes", lambda x: x.ravel()), "disagree"),
+        (
+            edit(lambda _, a: a.update({"appearance/sizes": np.ones((2, 2), int), "appearance/texels": np.eye(2, 4)})),
+            "of 2 rows, but there are 7 Gaussians",
+        ),
+        (edit(lambda header, _: header["appearance"].update(name="Curtains")), "Curtains.*not known here"),
+        (edit(lambda header, _: header["appearance"].update(name="jax.numpy")), "not known here"),
+        (edit(lambda header, _: header["appearance"].update(module="os", name="system")), "not known here"),
+        (edit(lambda header, _: header["appearance"]["options"].update(start="big")), r"Textured\.start must be"),
+        (edit(lambda header, _: header["appearance"]["options"].pop("start")), r"Textured\.start is missing"),
+        (changed("origin/Ks", lambda x: x[1:]), r"origin/Ks must be \[3, 3, 3\]"),
+        (edit(lambda header, _: header["origin"].update(background=[0, 1])), "bad.npz: .*unpack"),
+        (edit(lambda header, _: header["origin"].update(background="red")), "bad.npz: .*float"),
+        (edit(lambda header, _: header.update(origin=None)), "damaged"),
+    ],
+)
+def test_whatever_is_wrong_is_one_error_that_names_the_file(tmp_path, spoil, message):
+    path = tmp_path / "bad.npz"
+    save_model(path, textured_model())
+    spoil(path)
+    with pytest.raises(ValueError, match=message) as raised:
+        load_model(path)
+    assert "bad.npz" in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_flipped_bits_are_found_or_do_no_harm(tmp_path, seed):
+    path, rng = tmp_path / "bits.npz", np.random.default_rng(seed)
+    save_model(path, textured_model())
+    whole = path.read_bytes()
+    for place in rng.integers(len(whole), size=100):
+        data = bytearray(whole)
+        data[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(bytes(data))
+        try:
+            assert_same_model(load_model(path), textured_model())
+        except ValueError as error:
+            assert "bits.npz" in str(error)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_model(tmp_path / "nowhere.npz")
+
+
+def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
+    gaussians = dataclasses.replace(some_gaussians(), sh=jnp.zeros((7, 1, 3)))
+    with pytest.raises(ValueError, match=r"model\.gaussians\.sh must be \[7, 16, 3\]; got \[7, 1, 3\]"):
+        save_model(tmp_path / "m.npz", Model(gaussians))
+
+
+# The value
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_moved_model_shows_the_same_to_its_cameras():
+    scene = draw_scene(9)
+    textures, layout = textures_from_arrays(scene.textures)
+    origin = Origin.of_cameras([as_camera(scene, "float64")])
+    model = Model(as_gaussians(scene, "float64"), textures, layout, appearance=Textured(), origin=origin)
+    moved = model.transform(some_world())
+
+    def first_view(model: Model):
+        viewmat, K = jnp.asarray(model.origin.viewmats[0]), jnp.asarray(model.origin.Ks[0])
+        return model.render(
+            Camera(viewmat, K, *model.origin.sizes[0].tolist()), settings=RenderSettings(near_plane=1e-3)
+        )
+
+    before, after = first_view(model), first_view(moved)
+    np.testing.assert_allclose(after.color, before.color, atol=1e-9)
+    assert before.alpha.mean() > 0.2
+
+
+def test_moves_compose():
+    model, first, second = textured_model(), some_world(1), some_world(2)
+    twice, once = model.transform(first).transform(second), model.transform(first.then(second))
+    np.testing.assert_allclose(twice.gaussians.means, once.gaussians.means, atol=1e-5)
+    np.testing.assert_allclose(twice.origin.viewmats, once.origin.viewmats, atol=1e-12)
+    np.testing.assert_allclose(twice.origin.transform.translation, once.origin.transform.translation, atol=1e-12)
+    back = twice.transform(twice.origin.transform.inverse()).origin.transform
+    np.testing.assert_allclose(back.scale, 1.0)
+    np.testing.assert_allclose(back.rotation, np.eye(3), atol=1e-12)
+
+
+def test_dead_rows_do_not_show():
+    scene = draw_scene(4)
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    spoiled = jax.tree.map(lambda x: x.at[10:].set(jnp.nan), gaussians)
+    model = Model(spoiled, num_live=jnp.asarray(10, jnp.int32))
+    expected = render_appearance(gaussians[:10], camera, PlainRule())
+    np.testing.assert_array_equal(model.render(camera).color, expected.color)
+    np.testing.assert_array_equal(model.live.render(camera).color, expected.color)
+
+
+def test_a_model_is_a_pytree_whose_origin_is_no_leaf():
+    model = textured_model()
+    again = jax.jit(lambda model: jax.tree.map(lambda x: x, model))(model)
+    assert_same_model(again, model)
+    assert jax.tree.structure(model) == jax.tree.structure(textured_model())
+    assert hash(some_origin()) == hash(some_origin()) != hash(some_origin(2))
+
+
+def test_reprs_are_short():
+    model = textured_model()
+    camera = as_camera(draw_scene(0), "float32")
+    assert repr(model.gaussians).startswith(
+        "Gaussians(means=float32[7, 3], quats=float32[7, 4], log_scales=float32[7, 2]"
+    )
+    assert repr(camera) == "Camera(viewmat=float32[4, 4], K=float32[3, 3], width=43, height=30)"
+    assert "float32[2, 1, 1, 4]" in repr(model.params) and "int32[7]" in repr(model.layout)
+    assert "Textured(start=(2, 2)" in repr(model) and "3 cameras, 1 of them for testing" in repr(model)
+    assert len(repr(model)) < 900
