@@ -16,6 +16,7 @@ from a2tg_jax.data.world import Similarity
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
+WHITE: Color = (1.0, 1.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"config", "numerics", "startup", "bilinear", "checks"},
+    {"numerics", "startup", "bilinear", "checks"},
     {"gaussians", "cameras", "sh"},
     {"geometry"},
     {"texture", "tiles", "data"},
@@ -22,11 +22,11 @@ LAYERS = (
     {"render", "optim", "metrics"},
     {"model"},
     {"io", "renderer"},
-    {"adapt", "mcmc", "schedule"},
-    {"step"},
-    {"batches", "checkpoint"},
-    {"progress", "evaluation"},
+    {"events", "sharing"},
+    {"adapt", "mcmc"},
+    {"densify"},
     {"training"},
+    {"systems", "evaluation"},
     {"results"},
     {"cli"},
 )

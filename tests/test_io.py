@@ -2,42 +2,26 @@
 
 import dataclasses
 import json
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_values import assert_same, some_gaussians, some_world
 
 from a2tg_jax.cameras import Camera
-from a2tg_jax.config import DensifyConfig, TextureConfig, TrainConfig
-from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.model import save_model
 from a2tg_jax.io.ply import ATTRIBUTES, load_ply, save_ply
 from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
 from a2tg_jax.render import render_image
 from a2tg_jax.sh import sh_basis
 from a2tg_jax.texture import textures_from_arrays
 from a2tg_jax.transform import sh_rotation, transform_gaussians
-
-
-def some_gaussians(num: int = 7, seed: int = 0) -> Gaussians:
-    rng = np.random.default_rng(seed)
-    draw = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)  # noqa: E731
-    return Gaussians(draw(num, 3), draw(num, 4), draw(num, 2) - 2, draw(num), 0.3 * draw(num, 16, 3))
-
-
-def some_world(seed: int = 1) -> Similarity:
-    rng = np.random.default_rng(seed)
-    return Similarity(1.7, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
-
-
-def assert_same(a: Gaussians, b: Gaussians, atol: float = 0.0) -> None:
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(np.asarray(x), np.asarray(y), atol=atol, rtol=0)
 
 
 def write_ply(path, names, rows, encoding="binary_little_endian") -> None:
@@ -98,9 +82,50 @@ def test_ply_of_3d_gaussians_warns(tmp_path):
         assert load_ply(tmp_path / "g.ply").num == 2
 
 
+def test_flat_ellipsoids_show_the_same_whichever_axis_is_thin(tmp_path):
+    """The same splats with their axes cycled, so that the first or the second is thin, are the same splats."""
+    gaussians, camera = (
+        some_gaussians(30),
+        Camera(jnp.eye(4).at[2, 3].set(5), jnp.diag(jnp.array([30.0, 30, 1])), 32, 24),
+    )
+    camera = dataclasses.replace(camera, K=camera.K.at[:2, 2].set(jnp.array([16.0, 12])))
+    gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + 1)
+    save_ply(tmp_path / "flat.ply", gaussians, third_scale=True)
+    header, data = (tmp_path / "flat.ply").read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property float ")]
+    rows = np.frombuffer(data, "<f4").reshape(30, 62).copy()
+    scales, quats = ([names.index(f"{kind}_{i}") for i in range(n)] for kind, n in (("scale", 3), ("rot", 4)))
+    expected = render_image(gaussians, camera)
+    for turn in range(3):
+        order = np.roll(np.arange(3), turn)
+        turned = rows.copy()
+        turned[:, scales] = rows[:, scales][:, order]
+        axes = Rotation.from_quat(rows[:, quats], scalar_first=True).as_matrix()[:, :, order]
+        turned[:, quats] = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+        write_ply(tmp_path / "turned.ply", names, turned)
+        found = render_image(load_ply(tmp_path / "turned.ply"), camera)
+        np.testing.assert_allclose(found.color, expected.color, atol=1e-4)
+        np.testing.assert_allclose(found.alpha, expected.alpha, atol=1e-4)
+    assert expected.alpha.mean() > 0.2
+
+
+def test_third_scale_round_trip(tmp_path):
+    save_ply(tmp_path / "g.ply", some_gaussians(), third_scale=True)
+    assert_same(load_ply(tmp_path / "g.ply"), some_gaussians())
+
+
+def test_ply_of_a_model_is_in_its_original_world(tmp_path):
+    world = some_world()
+    model = Model(some_gaussians(), num_live=jnp.asarray(5, jnp.int32), origin=Origin.of_cameras([], transform=world))
+    save_ply(tmp_path / "model.ply", model)
+    save_ply(tmp_path / "gaussians.ply", some_gaussians()[:5], transform=world)
+    assert (tmp_path / "model.ply").read_bytes() == (tmp_path / "gaussians.ply").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (lambda path: path.write_bytes(b"ply\nelement vertex -3\n"), "announces -3 of vertex"),
         (lambda path: path.write_bytes(b"not a ply\n"), "is not a PLY file"),
         (lambda path: path.write_bytes(b"ply\nformat ascii 1.0\n"), "save it as binary_little_endian"),
         (lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\n"), "header does not end"),
@@ -229,37 +254,51 @@ def test_npz_without_header_is_refused(tmp_path):
 # Configurations
 
 
+@dataclasses.dataclass(frozen=True)
+class Cake:
+    """An option of options."""
+
+    layers: int = 3
+    sugar: float = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Every kind of option."""
+
+    cake: Cake = Cake()
+    times: tuple[float, ...] | None = None
+    background: Literal["black", "white"] = "black"
+    seed: int = 0
+    budget: float | None = None
+
+
 @pytest.mark.parametrize(
-    "config",
-    [
-        TrainConfig.paper(),
-        TrainConfig.quick(),
-        TrainConfig(texture=TextureConfig(upscale_at=(0.1, 0.5), budget_mb=3)),
-    ],
+    "config", [Options(), Options(Cake(2), (0.1, 0.5), "white", 7, 3), Options(cake=Cake(sugar=0.5), budget=2.5)]
 )
 def test_config_round_trip(config):
     text = json.dumps(config_to_dict(config))
-    assert config_from_dict(TrainConfig, json.loads(text)) == config
+    assert config_from_dict(Options, json.loads(text)) == config
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda data: data.update(colour=1), "config.colour is not a field of TrainConfig"),
-        (lambda data: data["densify"].pop("cap"), "config.densify.cap is missing"),
-        (lambda data: data["densify"].update(cap="many"), "config.densify.cap must be int; got 'many'"),
+        (lambda data: data.update(colour=1), "config.colour is not a field of Options"),
+        (lambda data: data["cake"].pop("layers"), "config.cake.layers is missing"),
+        (lambda data: data["cake"].update(layers="many"), "config.cake.layers must be int; got 'many'"),
         (lambda data: data.update(background="green"), "config.background must be .*'green'"),
         (lambda data: data.update(seed=True), "config.seed must be int; got True"),
-        (lambda data: data.update(loss=3), "config.loss must hold the fields of LossConfig; got 3"),
+        (lambda data: data.update(cake=3), "config.cake must hold the fields of Cake; got 3"),
     ],
 )
 def test_bad_config_names_the_field(spoil, message):
-    data = config_to_dict(TrainConfig.paper())
+    data = config_to_dict(Options())
     spoil(data)
     with pytest.raises(ValueError, match=message):
-        config_from_dict(TrainConfig, data)
+        config_from_dict(Options, data)
 
 
 def test_flat_names_are_those_of_the_command_line():
-    leaves = flatten_config(TrainConfig(densify=DensifyConfig(cap=7)))
-    assert leaves["densify.cap"] == 7 and leaves["seed"] == 0
+    leaves = flatten_config(Options(Cake(7)))
+    assert leaves["cake.layers"] == 7 and leaves["seed"] == 0

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
-from test_io import assert_same, some_gaussians, some_world
+from small_values import assert_same, some_gaussians, some_world
 
 from a2tg_jax.appearance import Appearance, PlainRule, Textured, TextureOptions
 from a2tg_jax.cameras import Camera

@@ -73,7 +73,7 @@ class Appearance:
         return dataclasses.replace(gaussians, logit_opacities=limited), params
 
     def first_rows(self, params: Any, layout: Any, num: int) -> tuple[Any, Any]:
-        """Parameters and layout of the first `num` Gaussians (host)."""
+        """Parameters and layout of the first `num` rows (host)."""
         return jax.tree.map(lambda x: x[:num], params), layout
 
     # Files.

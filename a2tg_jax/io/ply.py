@@ -3,6 +3,8 @@
 x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 rot_0..3, little-endian float32: opacities as logits,
 scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all of red,
 then green, then blue. Textures have no place in this format.
+
+Programs made for 3DGS want a third scale, scale_2, of the axis along the normal.
 """
 
 import os
@@ -14,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.model import Model
 from a2tg_jax.transform import transform_gaussians
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -23,34 +26,60 @@ SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" 
 SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
+THIRD_SCALE = "scale_2"
+THICKNESS = 1e-3
+"""Third scale of a flat Gaussian in a file, as a share of its shorter one."""
+AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
+"""Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
 NUMPY_TYPES = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")
 OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
 PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
 
 
-def save_ply(path: str | os.PathLike, gaussians: Gaussians, transform: Similarity | None = None) -> None:
+def save_ply(
+    path: str | os.PathLike,
+    gaussians: Gaussians | Model,
+    transform: Similarity | None = None,
+    *,
+    third_scale: bool = False,
+) -> None:
     """Writes Gaussians as 2DGS does, normals along the splats' own.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
-      gaussians: N Gaussians.
+      gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show.
       transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
-        brought back to the original world first, SH included. None writes them as they are.
+        brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
+        model back to the original world of its origin, where it has one.
+      third_scale: write scale_2, too, a thousandth of the shorter scale, for viewers of 3DGS files.
+
+    Raises:
+      ValueError: if a field of the Gaussians has another shape than it must have.
     """
+    if isinstance(gaussians, Model):
+        model = gaussians.live
+        gaussians = model.gaussians
+        transform = model.origin.transform if transform is None and model.origin is not None else transform
+    check_gaussians(gaussians)
     if transform is not None:
         gaussians = transform_gaussians(gaussians, transform.inverse())
-    sh = np.asarray(gaussians.sh)
+    sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
+    names = list(ATTRIBUTES)
+    if third_scale:
+        names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
+        third = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
+        log_scales = np.concatenate([log_scales, third], axis=1)
     columns = [
         np.asarray(gaussians.means),
         np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
         sh[:, 0],
         sh[:, 1:].transpose(0, 2, 1).reshape(-1, 45),
         np.asarray(gaussians.logit_opacities)[:, None],
-        np.asarray(gaussians.log_scales),
+        log_scales,
         np.asarray(gaussians.quats),
     ]
-    properties = "".join(f"property float {name}\n" for name in ATTRIBUTES)
+    properties = "".join(f"property float {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {gaussians.num}\n{properties}end_header\n"
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
@@ -61,7 +90,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     """Reads Gaussians from a PLY file of 2DGS, or of a program that uses its attribute names.
 
     Fewer SH degrees than 3 are filled up with zeros; further attributes are left aside. A 3DGS file (scale_2) holds
-    ellipsoids, another primitive: its third axis is dropped, with a warning.
+    ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning where that is more
+    than a thousandth of the others.
 
     Returns:
       float32 Gaussians in the world of the file.
@@ -96,6 +126,8 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype]:
                 raise ValueError(f"{path}: is a PLY in {encoding}; save it as binary_little_endian")
             case ["element", name, number]:
                 elements.append(name)
+                if not number.isdecimal():
+                    raise ValueError(f"{path}: announces {number} of {name}; a number is wanted")
                 count = int(number) if name == "vertex" else count
             case ["property", kind, name] if elements == ["vertex"] and kind in PLY_TYPES:
                 fields.append((name, PLY_TYPES[kind]))
@@ -112,9 +144,6 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         raise ValueError(f"{path}: has no attribute {', '.join(missing)}; a PLY of 2D Gaussians is wanted")
-    if "scale_2" in names:
-        message = f"{path}: holds 3D Gaussians (scale_2), another primitive; their third axis is dropped"
-        warnings.warn(message, stacklevel=3)
     rest = [name for name in SH_REST if name in names]
     if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
@@ -127,10 +156,43 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     if rest:
         per_channel = columns(rest).reshape(len(vertices), 3, -1)
         sh[:, 1 : 1 + per_channel.shape[2]] = per_channel.transpose(0, 2, 1)
+    quats, log_scales = columns(QUATS), columns(SCALES)
+    if THIRD_SCALE in names:
+        quats, log_scales = _without_thinnest_axis(quats, columns((*SCALES, THIRD_SCALE)), path)
     return Gaussians(
         means=jnp.asarray(columns(MEANS)),
-        quats=jnp.asarray(columns(QUATS)),
-        log_scales=jnp.asarray(columns(SCALES)),
+        quats=jnp.asarray(quats),
+        log_scales=jnp.asarray(log_scales),
         logit_opacities=jnp.asarray(vertices["opacity"].astype(np.float32)),
         sh=jnp.asarray(sh),
+    )
+
+
+def _without_thinnest_axis(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3] whose thinnest axis is made the normal and dropped.
+
+    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
+    """
+    thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
+    kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
+    dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
+    num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
+    if num_thick:
+        message = f"{path}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
+        warnings.warn(message, stacklevel=4)
+    return _quaternion_product(quats, AXES_TO_NORMAL[thinnest]), kept
+
+
+def _quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """[N, 4] wxyz: the second rotation, and after it the first."""
+    w, x, y, z = first.T
+    a, b, c, d = second.T
+    return np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=-1,
     )

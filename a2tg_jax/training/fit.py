@@ -4,10 +4,15 @@ import dataclasses
 
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.model import Model
+from a2tg_jax.origin import BLACK, WHITE, Color, Origin
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.loop import OnCheckpoint, StageRun
 from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
+
+BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
+"""On which a model is looked at, by what was behind it while it was trained."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -16,7 +21,7 @@ class StageResult:
 
     name: str
     model: Model
-    """The Gaussians that exist, in the normalised world of the scene."""
+    """The Gaussians that exist, in the normalised world of the scene, with its cameras."""
     history: History
     seconds: float
     """Training time, compilation included."""
@@ -119,4 +124,5 @@ def fit_stage(
         start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume)
     run.train(on_checkpoint, checkpoint_every, progress)
-    return StageResult(run.stage.name, run.model, run.history, run.seconds, run.num_regrown)
+    model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
+    return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)
