@@ -106,7 +106,7 @@ def _common_options(system: System) -> list:
 
 def _is_equal(a: Stage, b: Stage) -> bool:
     """Whether two stages are equal in everything, arrays included."""
-    if jax.tree.structure(a) != jax.tree.structure(b):
+    (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
+    if structure != other:  # type: ignore[operator]
         return False
-    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in leaves)
+    return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))
