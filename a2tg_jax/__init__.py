@@ -1,6 +1,7 @@
 """Adaptive anisotropic textured Gaussians as a functional JAX library: the public names."""
 
 from a2tg_jax.adapt import GradientStatistics as GradientStatistics
+from a2tg_jax.adapt import Upscale as Upscale
 from a2tg_jax.adapt import event_budget as event_budget
 from a2tg_jax.adapt import next_sizes as next_sizes
 from a2tg_jax.adapt import reallocate as reallocate
@@ -21,7 +22,16 @@ from a2tg_jax.data import run_sfm as run_sfm
 from a2tg_jax.data import synthetic_scene as synthetic_scene
 from a2tg_jax.data import view_image as view_image
 from a2tg_jax.data.world import Similarity as Similarity
+from a2tg_jax.densify import CloneSplitPrune as CloneSplitPrune
+from a2tg_jax.densify import OpacityReset as OpacityReset
 from a2tg_jax.evaluation import evaluate as evaluate
+from a2tg_jax.events import Change as Change
+from a2tg_jax.events import EventInfo as EventInfo
+from a2tg_jax.events import HostEvent as HostEvent
+from a2tg_jax.events import StepEvent as StepEvent
+from a2tg_jax.events import Times as Times
+from a2tg_jax.events import event as event
+from a2tg_jax.events import static as static
 from a2tg_jax.gaussians import Gaussians as Gaussians
 from a2tg_jax.gaussians import init_from_points as init_from_points
 from a2tg_jax.io.model import load_model as load_model
@@ -30,6 +40,8 @@ from a2tg_jax.io.ply import load_ply as load_ply
 from a2tg_jax.io.ply import save_ply as save_ply
 from a2tg_jax.losses import normal_consistency as normal_consistency
 from a2tg_jax.losses import photometric_loss as photometric_loss
+from a2tg_jax.mcmc import Mcmc as Mcmc
+from a2tg_jax.mcmc import Noise as Noise
 from a2tg_jax.mcmc import grow as grow
 from a2tg_jax.mcmc import perturb as perturb
 from a2tg_jax.mcmc import relocate as relocate
@@ -51,14 +63,33 @@ from a2tg_jax.render import render_image as render_image
 from a2tg_jax.renderer import Renderer as Renderer
 from a2tg_jax.startup import configure_cpu as configure_cpu
 from a2tg_jax.systems.a2tg import A2tg as A2tg
+from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig
+from a2tg_jax.systems.gaussians_2d import Gaussians2d as Gaussians2d
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc as Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import DensityConfig as DensityConfig
+from a2tg_jax.systems.stage1 import McmcConfig as McmcConfig
+from a2tg_jax.systems.stage1 import rates_of as rates_of
+from a2tg_jax.systems.textured_gaussians import TexturedGaussians as TexturedGaussians
 from a2tg_jax.texture import AtlasLayout as AtlasLayout
 from a2tg_jax.texture import Textures as Textures
 from a2tg_jax.texture import allocate_textures as allocate_textures
 from a2tg_jax.texture import texture_arrays as texture_arrays
 from a2tg_jax.texture import textures_from_arrays as textures_from_arrays
 from a2tg_jax.training import Checkpoint as Checkpoint
+from a2tg_jax.training import FitResult as FitResult
 from a2tg_jax.training import History as History
+from a2tg_jax.training import LearningRates as LearningRates
+from a2tg_jax.training import LossConfig as LossConfig
+from a2tg_jax.training import Rates as Rates
+from a2tg_jax.training import Stage as Stage
+from a2tg_jax.training import StageResult as StageResult
+from a2tg_jax.training import System as System
+from a2tg_jax.training import Target as Target
+from a2tg_jax.training import Term as Term
+from a2tg_jax.training import find_system as find_system
 from a2tg_jax.training import fit as fit
+from a2tg_jax.training import fit_stage as fit_stage
+from a2tg_jax.training import like as like
 from a2tg_jax.training import load_checkpoint as load_checkpoint
 from a2tg_jax.training import save_checkpoint as save_checkpoint
 from a2tg_jax.transform import transform_gaussians as transform_gaussians

@@ -6,6 +6,7 @@ The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select`
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import safe_divide, safe_norm
 from a2tg_jax.optim import AdamState
-from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
+from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, plan_layout
 
 BYTES_PER_TEXEL = 16
 PAPER_ITERATIONS = 30_000
@@ -57,6 +58,10 @@ class ReallocateResult(NamedTuple):
     layout: AtlasLayout
     moments: Any
     """As given, carried along with the texels."""
+
+
+_compiled_shapes: set[Shape] = set()
+"""Shapes that steps of this process have been compiled for. They change padding only, never a result."""
 
 
 @event
@@ -122,8 +127,9 @@ class Upscale(HostEvent):
         mask &= np.arange(layout.num) < num
         new_sizes = np.where(mask[:, None], proposed, layout.sizes)
         (mu_gaussians, mu), (nu_gaussians, nu) = moments.mu, moments.nu
-        rebuilt = reallocate(model.params, layout, new_sizes, (mu, nu))
+        rebuilt = reallocate(model.params, layout, new_sizes, (mu, nu), tuple(_compiled_shapes))
         mu, nu = rebuilt.moments
+        _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
         moments = dataclasses.replace(moments, mu=(mu_gaussians, mu), nu=(nu_gaussians, nu))
         model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
         return Change(model, moments, self.init(model))
@@ -243,7 +249,9 @@ def event_budget(total_bytes: float, current_bytes: float, event_index: int, num
     return int((total_bytes - current_bytes) // (num_events - event_index + 1))
 
 
-def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None) -> ReallocateResult:
+def reallocate(
+    textures: Textures, layout: AtlasLayout, new_sizes, moments=None, known: Sequence[Shape] = ()
+) -> ReallocateResult:
     """Rebuilds the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
     Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding
@@ -254,6 +262,7 @@ def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None)
       layout: their layout, of N Gaussians.
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
       moments: any pytree of `Textures`, such as (mu, nu) of Adam.
+      known: shapes of buckets to prefer (`texture.plan_layout`).
 
     Raises:
       ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
@@ -261,7 +270,7 @@ def reallocate(textures: Textures, layout: AtlasLayout, new_sizes, moments=None)
     new_sizes = np.asarray(new_sizes)
     if new_sizes.shape != (layout.num, 2):
         raise ValueError(f"new_sizes must be [{layout.num}, 2]; got {new_sizes.shape}")
-    new_layout, capacities = plan_layout(new_sizes)
+    new_layout, capacities = plan_layout(new_sizes, known)
     moves = _plan_moves(layout, new_layout)
 
     def rebuild(tree: Textures, padding: tuple[float, ...]) -> Textures:

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax import bilinear, pixel
-from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.bilinear import Image
 from a2tg_jax.kernels.choice import Compositor
 from a2tg_jax.numerics import pixel_sum, spread
@@ -38,6 +38,8 @@ class Splats(NamedTuple):
     """[N]."""
     normals: Array
     """[N, 3] in the world, facing the camera."""
+    numbers: Array
+    """[N, K] what else the appearance rule knows of them."""
 
 
 class Compositing(NamedTuple):
@@ -47,8 +49,8 @@ class Compositing(NamedTuple):
     near_plane: float
     has_geometry: bool
     """Depth, squared depth and normals are composited beside the colour."""
-    has_statistic: bool
-    """The backward pass also yields the absolute positional gradient."""
+    statistic: pixel.Statistic | None
+    """What densification asks of the backward pass, if anything."""
     compositor: Compositor
     """Native loops, Pallas kernels, or XLA."""
     tile_batch: int
@@ -71,19 +73,23 @@ class _Tile(NamedTuple):
     end: Array
 
 
-def composite(how: Compositing, splats: Splats, rule: AppearanceRule, lists: TileLists, jacobian: Array, tap: Array):
+def composite(
+    how: Compositing, splats: Splats, rule: AppearanceRule, cutoff: Array, lists: TileLists, jacobian: Array, tap: Array
+) -> tuple[Array, Array]:
     """Channels [D, H, W] and final transmittance [H, W]; D is red, green, blue(, depth, depth², normal x, y, z).
 
     Args:
       how: static choices.
       splats: N splats.
-      rule: what they show.
+      rule: what they show. Its table is differentiated; of its other arrays none is read but the images.
+      cutoff: [N] squared distance beyond which each splat need not be looked at.
       lists: the splats of each tile.
       jacobian: [3, 3] ∂M[:, 2]/∂μ = K·Rc, used by the statistic alone.
-      tap: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are Σ_pixels |∂L/∂μ| per component, through
-        the Gaussian factor only, column 3 the number of pixels in which the splat was composited.
+      tap: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
+        `pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
     """
-    channels, transmittance = _composite_tiles(how, splats, rule.table, rule, lists, jacobian, tap)
+    arrays = splats, rule.table, rule.images, cutoff, lists, jacobian, tap
+    channels, transmittance = _composite_tiles(how, StaticRule.of(rule), *arrays)
     return _assemble(channels, how.grid), _assemble(transmittance, how.grid)
 
 
@@ -97,23 +103,23 @@ def _assemble(tiles: Array, grid: TileGrid) -> Array:
     return image.reshape(*inner, grid.rows * size, grid.columns * size)[..., : grid.height, : grid.width]
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _composite_tiles(how, splats, params, rule, lists, jacobian, tap):
-    return _forward(how, splats, params, rule, lists)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _composite_tiles(how, rule, splats, table, images, cutoff, lists, jacobian, tap):
+    return _forward(how, rule, splats, table, images, cutoff, lists)
 
 
-def _composite_tiles_fwd(how, splats, params, rule, lists, jacobian, tap):
-    channels, transmittance = _forward(how, splats, params, rule, lists)
-    return (channels, transmittance), (splats, params, rule, lists, jacobian, tap, channels, transmittance)
+def _composite_tiles_fwd(how, rule, splats, table, images, cutoff, lists, jacobian, tap):
+    seen = _forward(how, rule, splats, table, images, cutoff, lists)
+    return seen, (splats, table, images, cutoff, lists, jacobian, tap, *seen)
 
 
-def _composite_tiles_bwd(how, residuals, cotangents):
-    splats, params, rule, lists, jacobian, tap, channels, transmittance = residuals
+def _composite_tiles_bwd(how, rule, residuals, cotangents):
+    *arrays, channels, transmittance = residuals
     g, g_transmittance = cotangents
     behind = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
     backward = _backward if how.compositor == "xla" else _accelerated(how).backward
-    d_splats, d_params, d_tap = backward(how, splats, params, rule, lists, jacobian, tap, g, behind)
-    return d_splats, d_params, None, None, None, d_tap
+    d_splats, d_table, d_tap = backward(how, rule, *arrays, g, behind)
+    return d_splats, d_table, None, None, None, None, d_tap
 
 
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
@@ -130,19 +136,21 @@ def _accelerated(how: Compositing) -> ModuleType:
     return pallas
 
 
-def _forward(how: Compositing, splats: Splats, params: Array, rule, lists: TileLists) -> tuple[Array, Array]:
+def _forward(
+    how: Compositing, static: StaticRule, splats: Splats, table: Array, images: Image | None, cutoff, lists: TileLists
+) -> tuple[Array, Array]:
     """Channels [groups, G, D, P] and transmittance [groups, G, P]."""
     if how.compositor != "xla":
-        return _accelerated(how).forward(how, splats, params, rule, lists)
-    ids, dtype = _padded_ids(lists), splats.M.dtype
+        return _accelerated(how).forward(how, static, splats, table, images, cutoff, lists)
+    rule, ids, dtype = static.rule, _padded_ids(lists), splats.M.dtype
 
     def group(index):
         tiles, start = _tiles_of_group(how, lists, index, dtype)
-        add_block = _over_tiles(functools.partial(_block, how, rule, params), how.tile_batch)
+        add_block = _over_tiles(functools.partial(_block, how, rule, table), how.tile_batch)
 
         def step(carry):
             at, light, is_live, channels = carry
-            added, light, is_live = add_block(_gather(splats, rule, _block_ids(ids, at)), at, tiles, light, is_live)
+            added, light, is_live = add_block(_gather(splats, images, _block_ids(ids, at)), at, tiles, light, is_live)
             return at + BLOCK, light, is_live, channels + added
 
         pixels = how.grid.tile_size**2
@@ -153,32 +161,35 @@ def _forward(how: Compositing, splats: Splats, params: Array, rule, lists: TileL
     return jax.lax.map(group, jnp.arange(how.num_groups, dtype=jnp.int32))
 
 
-def _backward(how: Compositing, splats: Splats, params: Array, rule, lists: TileLists, jacobian, tap, g, behind):
-    """The cotangents of splats, parameters and tap, given those of the channels, g [groups, G, D, P], and what they
+def _backward(
+    how: Compositing, static: StaticRule, splats: Splats, table: Array, images: Image | None, cutoff, lists: TileLists,
+    jacobian, tap, g, behind,
+):  # fmt: skip
+    """The cotangents of splats, table and tap, given those of the channels, g [groups, G, D, P], and what they
     make of the whole list, `behind` [groups, G, P]."""
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
-    totals = packed, jnp.zeros_like(params), jnp.zeros_like(tap)
-    ids = _padded_ids(lists)
+    totals = packed, jnp.zeros_like(table), jnp.zeros_like(tap)
+    rule, ids = static.rule, _padded_ids(lists)
 
     def group(index, totals):
         tiles, start = _tiles_of_group(how, lists, index, splats.M.dtype)
-        pull_back = _over_tiles(functools.partial(_block_vjp, how, rule, params, jacobian), how.tile_batch)
+        pull_back = _over_tiles(functools.partial(_block_vjp, how, rule, table, jacobian), how.tile_batch)
 
         def step(carry):
             at, light, is_live, behind, totals = carry
             block_ids = _block_ids(ids, at)
-            rows = _gather(splats, rule, block_ids)
+            rows = _gather(splats, images, block_ids)
             light, is_live, behind, d_rows = pull_back(rows, at, tiles, light, is_live, behind, g[index])
             return at + BLOCK, light, is_live, behind, _accumulate(totals, block_ids, d_rows)
 
         carry = (start, *_initial_light(how, tiles), behind[index], totals)
         return jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)[-1]
 
-    packed, d_params, d_tap = jax.lax.fori_loop(jnp.int32(0), jnp.int32(how.num_groups), group, totals)
+    packed, d_table, d_tap = jax.lax.fori_loop(jnp.int32(0), jnp.int32(how.num_groups), group, totals)
     pieces = jnp.split(packed, np.cumsum(widths)[:-1], axis=1)
     d_splats = Splats(*(piece.reshape(leaf.shape) for piece, leaf in zip(pieces, splats, strict=True)))
-    return d_splats, d_params, d_tap
+    return d_splats, d_table, d_tap
 
 
 def _initial_light(how: Compositing, tiles: _Tile) -> tuple[Array, Array]:
@@ -223,24 +234,24 @@ def _block_ids(ids: Array, at: Array) -> Array:
     return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK, dtype=jnp.int32)[None, :], ids.shape[0] - 1)]
 
 
-def _gather(splats: Splats, rule: AppearanceRule, ids: Array):
+def _gather(splats: Splats, images: Image | None, ids: Array):
     """The splats [G, B, ...] of some ids [G, B], and their images."""
     flat = ids.reshape(-1)
-    rows = jax.tree.map(lambda x: x[flat], (splats, rule.images))
+    rows = jax.tree.map(lambda x: x[flat], (splats, images))
     return jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
 
 
 def _accumulate(totals, ids: Array, d_rows):
     """Adds the cotangents of one block a tile to the totals; those of the splats are packed in one row each."""
     flat = ids.reshape(-1)
-    splats, params, tap = totals
+    splats, table, tap = totals
     d_splats, d_tap, d_texels = d_rows
     packed = jnp.concatenate([leaf.reshape(flat.shape[0], -1) for leaf in d_splats], axis=1)
     splats = splats.at[flat].add(packed)
     if d_texels is not None:
         entries, addends = d_texels
-        params = params.at[entries.reshape(-1)].add(addends.reshape(-1, params.shape[1]))
-    return splats, params, tap if d_tap is None else tap.at[flat].add(d_tap.reshape(flat.shape[0], -1))
+        table = table.at[entries.reshape(-1)].add(addends.reshape(-1, table.shape[1]))
+    return splats, table, tap if d_tap is None else tap.at[flat].add(d_tap.reshape(flat.shape[0], -1))
 
 
 def _pixels_of_tile(size: int, dtype) -> tuple[Array, Array]:
@@ -252,18 +263,19 @@ def _pixels_of_tile(size: int, dtype) -> tuple[Array, Array]:
 def _split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
     """Splats [B, ...] as the numbers that `pixel` wants, each [B], or spread over [B, num] pixels."""
     put = (lambda x: x) if num is None else functools.partial(spread, num=num)
-    three = lambda x: tuple(put(x[:, k]) for k in range(3))  # noqa: E731
+    several = lambda x: tuple(put(x[:, k]) for k in range(x.shape[1]))  # noqa: E731
     M = tuple(tuple(splats.M[:, i, k] for k in range(3)) for i in range(3))
-    normal = three(splats.normals) if has_geometry else None
-    return pixel.Splat(M, put(splats.opacities), three(splats.colors), normal)  # type: ignore[arg-type]
+    normal = several(splats.normals) if has_geometry else None
+    numbers = several(splats.numbers)
+    return pixel.Splat(M, put(splats.opacities), several(splats.colors), normal, numbers)  # type: ignore[arg-type]
 
 
-def _hits(how: Compositing, splats: Splats, tile: _Tile) -> pixel.Hit:
+def _hits(how: Compositing, rule, splats: Splats, tile: _Tile) -> pixel.Hit:
     """Where the rays of a tile's pixels meet the splats of a block; each [B, P]."""
     x, y = _pixels_of_tile(how.grid.tile_size, splats.M.dtype)
     planes = pixel.planes_of(_split(splats, False).M, tile.x, tile.y)
     planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
-    return pixel.intersect(planes, x, y, how.near_plane)
+    return pixel.intersect(planes, x, y, how.near_plane, rule.has_low_pass)
 
 
 class _Read(NamedTuple):
@@ -277,13 +289,13 @@ class _Read(NamedTuple):
     """[B, P] each."""
 
 
-def _read(rule, params: Array, images: Image | None, hit: pixel.Hit) -> _Read | None:
+def _read(rule, table: Array, images: Image | None, hit: pixel.Hit) -> _Read | None:
     """None where the rule has no images."""
     if images is None:
         return None
     image = jax.tree.map(lambda x: x[:, None], images)
     taps = bilinear.taps(image, *rule.texel(image, hit.u, hit.v))
-    texels = params[jnp.stack([tap.entry for tap in taps])]
+    texels = table[jnp.stack([tap.entry for tap in taps])]
     sample = bilinear.interpolate(taps, tuple(tuple(jnp.moveaxis(texel, -1, 0)) for texel in texels))
     return _Read(image, taps, sample)
 
@@ -295,7 +307,7 @@ def _show(how: Compositing, rule, splats: Splats, hit: pixel.Hit, values, at, ti
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
 
-def _block(how: Compositing, rule, params: Array, rows, at, tile: _Tile, light, is_live):
+def _block(how: Compositing, rule, table: Array, rows, at, tile: _Tile, light, is_live):
     """Composites one block of B splats over one tile.
 
     Args:
@@ -307,8 +319,8 @@ def _block(how: Compositing, rule, params: Array, rows, at, tile: _Tile, light, 
       Channels added [D, P], and transmittance and live pixels after the block.
     """
     splats, images = rows
-    hit = _hits(how, splats, tile)
-    shown = _show(how, rule, splats, hit, _values(_read(rule, params, images, hit)), at, tile)
+    hit = _hits(how, rule, splats, tile)
+    shown = _show(how, rule, splats, hit, _values(_read(rule, table, images, hit)), at, tile)
 
     def add_splat(carry, alpha):
         weight, light, is_live = pixel.absorb(alpha, *carry)
@@ -326,20 +338,20 @@ def _sum_rows(x: Array) -> Array:
     return x[0]
 
 
-def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, light, is_live, behind, g):
+def _block_vjp(how: Compositing, rule, table: Array, jacobian, rows, at, tile, light, is_live, behind, g):
     """One block of the backward pass over one tile: the state after it, and the cotangents of its rows.
 
     `behind` [P] is g·(what this block and all behind it add) + g_T·T_final; g is [D, P].
     """
     splats, images = rows
-    read = _read(rule, params, images, _hits(how, splats, tile))
+    read = _read(rule, table, images, _hits(how, rule, splats, tile))
     image, sample = (None, None) if read is None else (read.image, read.sample)
 
     def of_floats(splats, values, log_tap):
-        hit = _hits(how, splats, tile)
+        hit = _hits(how, rule, splats, tile)
         return _show(how, rule, splats, hit, pixel.values_at(rule, image, sample, hit, values), at, tile, log_tap)
 
-    log_tap = jnp.zeros((BLOCK, light.shape[0]), light.dtype) if how.has_statistic else None
+    log_tap = jnp.zeros((BLOCK, light.shape[0]), light.dtype) if how.statistic else None
     shown, pull_back = jax.vjp(of_floats, splats, _values(read), log_tap)
     g = g[:, None]
     seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
@@ -351,7 +363,7 @@ def _block_vjp(how: Compositing, rule, params: Array, jacobian, rows, at, tile, 
     carry, (weights, d_alpha) = jax.lax.scan(add_splat, (light, is_live, behind), (shown.alpha, seen))
     d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(how.num_channels)))
     d_splats, d_values, d_log = pull_back(d_shown)
-    d_tap = _statistic(how, jacobian, splats, tile, d_log, weights) if how.has_statistic else None
+    d_tap = _statistic(how, rule, jacobian, splats, tile, d_log, weights) if how.statistic else None
     return *carry, (d_splats, d_tap, _d_texels(read, d_values))
 
 
@@ -367,10 +379,11 @@ def _d_texels(read: _Read | None, d_values: tuple[Array, ...]) -> tuple[Array, A
     return jnp.stack([tap.entry for tap in read.taps]), jnp.stack(per_tap)
 
 
-def _statistic(how: Compositing, jacobian, splats: Splats, tile: _Tile, d_log: Array, weights: Array) -> Array:
-    """[B, 4]: Σ_pixels |∂L/∂μ| per world component, through the Gaussian factor only, and the pixels composited."""
+def _statistic(how: Compositing, rule, jacobian, splats: Splats, tile: _Tile, d_log: Array, weights: Array) -> Array:
+    """[B, 4]: Σ_pixels of the statistic, and the pixels composited."""
+    assert how.statistic is not None
     x, y = _pixels_of_tile(how.grid.tile_size, d_log.dtype)
     M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
-    near_plane = how.near_plane
-    components = pixel.absolute_gradient(M, x, y, tile.x, tile.y, d_log, jacobian, near_plane)
+    at_pixel = M, x, y, tile.x, tile.y, d_log, jacobian
+    components = pixel.positional_gradient(how.statistic, *at_pixel, how.near_plane, rule.has_low_pass)
     return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_log.dtype))], axis=1)

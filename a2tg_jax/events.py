@@ -7,7 +7,7 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 """
 
 import dataclasses
-from typing import Any, ClassVar, Literal, NamedTuple, dataclass_transform
+from typing import Any, ClassVar, NamedTuple, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,7 @@ from jax import Array
 from a2tg_jax.cameras import Camera
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
-
-Statistic = Literal["position", "screen", "center"]
-"""What is summed over pixels of the gradient by a Gaussian's position (`render.render_traced`)."""
+from a2tg_jax.pixel import Statistic
 
 
 class Times(NamedTuple):
@@ -107,7 +105,8 @@ class StepEvent(Event):
 
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
-    impossible: ClassVar[str] = "an event found that training cannot go on"
+    impossible: ClassVar[str] = ""
+    """Why training cannot go on where `EventInfo.is_possible` is False, and what to do."""
 
     def times(self, num_iterations: int) -> Times:
         """When it happens in a stage of so many iterations (host)."""

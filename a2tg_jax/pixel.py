@@ -6,7 +6,7 @@ rendered; `compositor` runs it over arrays, `kernels` compiles it into loops, an
 M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of a splat, g the cotangent of the channels.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +17,11 @@ from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.bilinear import Image, Sample, follow
 
 MIN_ALPHA = 1 / 255
-MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
 
 Triple = tuple[Array, Array, Array]
+Statistic = Literal["position", "screen", "center"]
+"""What densification asks of the backward pass (`positional_gradient`)."""
 
 
 class Splat(NamedTuple):
@@ -32,6 +33,8 @@ class Splat(NamedTuple):
     color: Triple
     normal: Triple | None
     """In the world, facing the camera; None where only colour is composited."""
+    numbers: tuple[Array, ...] = ()
+    """What else its appearance rule knows of it."""
 
 
 class Planes(NamedTuple):
@@ -56,8 +59,12 @@ class Hit(NamedTuple):
     """In standard deviations; (0, 0) without a hit."""
     v: Array
     rho: Array
-    """min(u² + v², 2·|(x, y) − c|²), the squared distance that the falloff sees."""
+    """min(u² + v², 2·|(x, y) − c|²), the squared distance that the falloff sees. Without the low-pass filter u² + v²,
+    infinite without a hit."""
     depth: Array
+    """Of the hit; of the mean where the low-pass filter decides."""
+    is_ray: Array
+    """Whether the hit decides ρ, not the low-pass filter."""
 
 
 class Shown(NamedTuple):
@@ -90,8 +97,8 @@ def planes_of(M: tuple[Triple, Triple, Triple], x: Array, y: Array) -> Planes:
     )
 
 
-def intersect(planes: Planes, x: Array, y: Array, near_plane: float) -> Hit:
-    """The hit of a pixel's ray, or the low-pass filter where that is nearer (2DGS, equations 10 and 11).
+def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pass: bool = True) -> Hit:
+    """The hit of a pixel's ray, or the low-pass filter where there is one and it is nearer (2DGS, equations 10, 11).
 
     The point is (p₀, p₁)/p₂ and its depth det(M)/p₂; depths below `near_plane` are no hit.
     """
@@ -109,10 +116,13 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float) -> Hit:
     is_hit = ~is_parallel & (depth >= near_plane)
     u, v = jnp.where(is_hit, p0 * inverse, 0.0), jnp.where(is_hit, p1 * inverse, 0.0)
 
+    rho_ray = u * u + v * v
+    if not has_low_pass:
+        return Hit(u, v, jnp.where(is_hit, rho_ray, jnp.inf), jnp.where(is_hit, depth, planes.depth), is_hit)
     dx, dy = x - planes.center_x, y - planes.center_y
-    rho_ray, rho_screen = u * u + v * v, 2 * (dx * dx + dy * dy)
+    rho_screen = 2 * (dx * dx + dy * dy)
     is_ray = is_hit & (rho_ray <= rho_screen)
-    return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth))
+    return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth), is_ray)
 
 
 def values_at(rule: AppearanceRule, image: Image | None, sample: Sample | None, hit: Hit, values: tuple[Array, ...]):
@@ -125,7 +135,7 @@ def values_at(rule: AppearanceRule, image: Image | None, sample: Sample | None, 
 def show(
     rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], log_tap: Array | None = None
 ) -> Shown:
-    """α = min(0.99, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
+    """α = min(rule.max_alpha, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
 
     Args:
       rule: the appearance rule.
@@ -134,11 +144,14 @@ def show(
       values: what the splat's image shows there.
       log_tap: zero, added to the exponent of the falloff, to read the gradient there; or None.
     """
-    residual, factor = rule.shade((), values, hit.u, hit.v)
-    a = splat.opacity * rule.falloff((), hit.rho)
+    residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
+    # No falloff is asked for its slope at infinity, which need not be a number.
+    rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
+    a = splat.opacity * rule.falloff(splat.numbers, rho)
     a = a if factor is None else a * factor
     a = a if log_tap is None else a * jnp.exp(log_tap)
-    alpha = jnp.where(a >= MIN_ALPHA, jnp.where(a < MAX_ALPHA, a, MAX_ALPHA), 0.0)
+    is_shown = a >= MIN_ALPHA if rule.has_low_pass else (a >= MIN_ALPHA) & hit.is_ray
+    alpha = jnp.where(is_shown, jnp.where(a < rule.max_alpha, a, rule.max_alpha), 0.0)
     channels: tuple[Array, ...] = splat.color
     if residual is not None:
         channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
@@ -159,7 +172,7 @@ def absorb_vjp(alpha: Array, light: Array, is_live: Array, behind: Array, shown:
     """`absorb`, and ∂L/∂α, walking front to back.
 
     With B = Σ g·c·α·T over the splats behind + g_T·T_final, all of which is linear in what this splat lets through,
-    ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never exceeds 0.99.
+    ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never reaches 1.
 
     Args:
       alpha, light, is_live: as for `absorb`.
@@ -182,6 +195,7 @@ class Cotangents(NamedTuple):
     opacity: Array
     color: Triple
     normal: Triple | None
+    numbers: tuple[Array, ...]
     values: tuple[Array, ...]
     """Of what the splat's image shows."""
     log_falloff: Array | None
@@ -190,7 +204,7 @@ class Cotangents(NamedTuple):
 
 def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, light, is_live):
     """One splat at one pixel of the forward pass: what it adds to the channels, and light and liveness behind it."""
-    shown = show(rule, splat, intersect(planes, x, y, near_plane), values)
+    shown = show(rule, splat, intersect(planes, x, y, near_plane, rule.has_low_pass), values)
     weight, light, is_live = absorb(shown.alpha, light, is_live)
     return tuple(weight * channel for channel in shown.channels), light, is_live
 
@@ -206,14 +220,14 @@ def composite_vjp(
       weight is positive: elsewhere they may not even be finite.
     """
 
-    def of_floats(planes, opacity, color, normal, values, log_tap):
-        hit = intersect(planes, x, y, near_plane)
+    def of_floats(planes, opacity, color, normal, numbers, values, log_tap):
+        hit = intersect(planes, x, y, near_plane, rule.has_low_pass)
         values = values_at(rule, image, sample, hit, values)
-        return show(rule, Splat(splat.M, opacity, color, normal), hit, values, log_tap)
+        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, log_tap)
 
     log_tap = jnp.zeros_like(light) if has_log else None
     values = () if sample is None else sample.values
-    floats = planes, splat.opacity, splat.color, splat.normal, values, log_tap
+    floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, log_tap
     shown, pull_back = jax.vjp(of_floats, *floats)
     seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
     weight, light, is_live, behind, d_alpha = absorb_vjp(shown.alpha, light, is_live, behind, seen)
@@ -221,23 +235,42 @@ def composite_vjp(
     return (light, is_live, behind), weight, cotangents
 
 
-def absolute_gradient(M, x: Array, y: Array, tile_x, tile_y, d_log: Array, jacobian, near_plane: float) -> Triple:
-    """|∂L/∂μ| at a pixel per world component, through the falloff only; zero where `d_log` is.
+def positional_gradient(
+    statistic: Statistic, M, x: Array, y: Array, tile_x, tile_y, d_log: Array, jacobian, near_plane: float,
+    has_low_pass: bool,
+) -> Triple:  # fmt: skip
+    """What a pixel adds to a statistic of densification, through the falloff only; zero where `d_log` is.
+
+    "position": |∂L/∂μ| per world component (A²TG).
+    "screen": |∂L/∂c| per pixel axis of the projected mean c, where the low-pass filter decides, and 0 (gsplat's
+    `absgrad` of 2D Gaussians).
+    "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, where the hit decides, and 0 (2DGS).
 
     Args:
+      statistic: which.
       M: rows of the homography.
       x, y: the pixel, from the tile's centre (tile_x, tile_y).
       d_log: ∂L/∂(−ρ/2), the gradient of the logarithm of the falloff.
       jacobian: rows of ∂M[:, 2]/∂μ = K·Rc.
+      near_plane, has_low_pass: as for `intersect`.
     """
     axes = tuple((row[0], row[1]) for row in M)
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_log)) for row in M)
 
     def rho(mean):
         rows = tuple((*axes[i], mean[i]) for i in range(3))
-        return intersect(planes_of(rows, tile_x, tile_y), x, y, near_plane).rho
+        hit = intersect(planes_of(rows, tile_x, tile_y), x, y, near_plane, has_low_pass)
+        return hit.rho, hit.is_ray
 
-    _, pull_back = jax.vjp(rho, mean)
+    _, pull_back, is_ray = jax.vjp(rho, mean, has_aux=True)
     (d_mean,) = pull_back(-0.5 * d_log)
-    components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
-    return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
+    if statistic == "position":
+        components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
+        return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
+    # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c where the low-pass filter decides.
+    on_screen = d_mean[0] * mean[2], d_mean[1] * mean[2]
+    if statistic == "center":
+        along_x, along_y = (jnp.where(is_ray, number, 0.0) for number in on_screen)
+    else:
+        along_x, along_y = (jnp.where(is_ray, 0.0, jnp.abs(number)) for number in on_screen)
+    return along_x, along_y, jnp.zeros_like(along_x)

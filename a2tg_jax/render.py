@@ -22,6 +22,7 @@ from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose
+from a2tg_jax.pixel import Statistic
 from a2tg_jax.sh import sh_colors
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
@@ -148,6 +149,7 @@ def render_traced(
     sh_degree: Any = None,
     num_live: Any = None,
     tap: Array | None = None,
+    statistic: Statistic | None = "position",
 ) -> tuple[RenderOutput, Array]:
     """What training differentiates: the output, and how many pairs the view has, for `capacity_for`.
 
@@ -157,7 +159,8 @@ def render_traced(
       has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
       sh_degree: overrides the settings' by a value that may be traced.
       num_live: only the first so many rows show; may be traced.
-      tap: [N, 4] zeros, at which the gradient is the absolute positional gradient (`compositor.composite`).
+      tap: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
+      statistic: which (`pixel.positional_gradient`); not used without a tap.
     """
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     compositor = choose(settings.compositor, settings.tile_size)
@@ -165,7 +168,7 @@ def render_traced(
         grid=grid,
         near_plane=settings.near_plane,
         has_geometry=has_geometry,
-        has_statistic=tap is not None,
+        statistic=None if tap is None else statistic,
         compositor=compositor,
         tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
     )
@@ -181,7 +184,7 @@ def render_traced(
     lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
-    channels, transmittance = composite(how, splats, rule, lists, jacobian, tap)
+    channels, transmittance = composite(how, splats, rule, cutoff, lists, jacobian, tap)
     return _output(how, channels, transmittance, background, lists.overflow), lists.num_pairs
 
 
@@ -248,10 +251,10 @@ def appearance_of(
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is None or layout is None:
-        return PlainRule()
+        return PlainRule(max_alpha=settings.texture.max_alpha)
     check_textures(textures, layout, gaussians.num)
     if gaussians.num == 0:
-        return PlainRule()
+        return PlainRule(max_alpha=settings.texture.max_alpha)
     return textured_rule(textures, layout, settings.texture)
 
 
@@ -272,7 +275,7 @@ def _jitted_count():
 
 def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     M, _ = homographies(gaussians, camera)
-    cutoff = rule.cutoff(gaussians.opacities)
+    cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
         cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
     bounds = screen_bounds(M, cutoff, near_plane)
@@ -311,7 +314,14 @@ def _tile_batch(settings: RenderSettings) -> int:
 def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
     """The N splats, and [N] the squared distance within which each shows; not positive where it shows nowhere."""
     M, normals = homographies(gaussians, camera)
-    opacities = gaussians.opacities
+    opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
+    if opacities.shape != (gaussians.num,) or numbers.shape[:-1] != (gaussians.num,):
+        raise ValueError(
+            f"a rule gives opacities [N] and numbers [N, K] of N = {gaussians.num} gaussians; {type(rule).__name__} "
+            f"gave {opacities.shape} and {numbers.shape}"
+        )
+    if not 0 < rule.max_alpha < 1:
+        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
     is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num) < num_live
@@ -319,4 +329,4 @@ def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) ->
     # Rows that are drawn nowhere may hold anything; a finite stand-in keeps 0 · inf out of the gradients.
     M = jnp.where(is_drawn[:, None, None], M, jnp.eye(3, dtype=M.dtype)[None])
     colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
-    return Splats(M, colors, opacities, normals), cutoff
+    return Splats(M, colors, opacities, normals, numbers), cutoff

@@ -7,6 +7,7 @@ Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from a2tg_jax.checks import check_floats, check_shape, short_repr
 
 MAX_SIDE = 16
 NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)
+KNOWN_SLACK = 1.25
 
 
 @jax.tree_util.register_dataclass
@@ -85,11 +87,28 @@ def bucket_capacity(count: int) -> int:
     return -(-count // granule) * granule
 
 
-def plan_layout(sizes) -> tuple[AtlasLayout, tuple[int, ...]]:
+class Shape(NamedTuple):
+    """What the buckets of textures are, whoever they belong to: programs are compiled for a shape."""
+
+    resolutions: tuple[tuple[int, int], ...]
+    """(Tv, Tu) of each bucket, ascending."""
+    capacities: tuple[int, ...]
+    """Rows of each bucket."""
+
+    @property
+    def num_texels(self) -> int:
+        """Texels in all, padding included."""
+        areas = (height * width for height, width in self.resolutions)
+        return sum(capacity * area for capacity, area in zip(self.capacities, areas, strict=True))
+
+
+def plan_layout(sizes, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[int, ...]]:
     """The layout for textures of the given sizes, and the capacity of each bucket (host).
 
     Args:
       sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+      known: shapes to choose from where the textures fit and it costs at most `KNOWN_SLACK` times the texels: what is
+        compiled for a shape need not be compiled again.
 
     Raises:
       ValueError: if a size is out of range.
@@ -104,12 +123,27 @@ def plan_layout(sizes) -> tuple[AtlasLayout, tuple[int, ...]]:
     starts = np.repeat(np.cumsum(counts) - counts, counts)
     row = np.empty(len(sizes), np.int32)
     row[order] = np.arange(len(sizes)) - starts
+    needed = {(int(code) // 64, int(code) % 64): int(count) for code, count in zip(codes, counts, strict=True)}
+    shape = _choose_shape(needed, known)
+    place = np.asarray([shape.resolutions.index(resolution) for resolution in needed], np.int32)
     layout = AtlasLayout(
-        bucket=jnp.asarray(bucket, jnp.int32),
+        bucket=jnp.asarray(place[bucket] if len(place) else bucket, jnp.int32),
         row=jnp.asarray(row),
-        resolutions=tuple((int(code) // 64, int(code) % 64) for code in codes),
+        resolutions=shape.resolutions,
     )
-    return layout, tuple(bucket_capacity(int(count)) for count in counts)
+    return layout, shape.capacities
+
+
+def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape]) -> Shape:
+    """The smallest known shape with room for so many textures of each resolution, or a new one."""
+    new = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
+
+    def has_room(shape: Shape) -> bool:
+        room = dict(zip(*shape, strict=True))
+        return all(room.get(resolution, 0) >= count for resolution, count in needed.items())
+
+    fitting = [shape for shape in known if has_room(shape) and shape.num_texels <= KNOWN_SLACK * new.num_texels]
+    return min(fitting, key=lambda shape: shape.num_texels, default=new)
 
 
 def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Textures, AtlasLayout]:

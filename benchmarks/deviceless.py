@@ -50,29 +50,29 @@ def programs():
     num, grid = NUM_GAUSSIANS, TileGrid(WIDTH, HEIGHT, TILE_SIZE)
     floats = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
     integers = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.int32)  # noqa: E731
-    splats = Splats(floats(num, 3, 3), floats(num, 3), floats(num), floats(num, 3))
+    splats = Splats(floats(num, 3, 3), floats(num, 3), floats(num), floats(num, 3), floats(num, 0))
     lists = TileLists(integers(NUM_PAIRS), integers(grid.num + 1), floats(), jax.ShapeDtypeStruct((), jnp.bool_))
     textured = TexturedRule(floats(4 * num, 4), (integers(num),) * 3, floats(num), TextureOptions())
 
     for name, rule in (("plain", PlainRule()), ("textured", textured)):
-        for has_statistic in (False, True):
-            how = Compositing(grid, 0.2, False, has_statistic, "pallas", 1)
-            inputs = splats, rule, lists, floats(3, 3), floats(num, 4)
+        for statistic in (None, "position"):
+            how = Compositing(grid, 0.2, False, statistic, "pallas", 1)
+            inputs = splats, rule, floats(num), lists, floats(3, 3), floats(num, 4)
 
             def forward(*inputs, how=how):
                 return composite(how, *inputs)
 
-            def backward(splats, rule, lists, jacobian, tap, how=how):
+            def backward(splats, rule, cutoff, lists, jacobian, tap, how=how):
                 def loss(splats, params, tap):
                     shown = dataclasses.replace(rule, table=params) if params.shape[1] else rule
-                    channels, transmittance = composite(how, splats, shown, lists, jacobian, tap)
+                    channels, transmittance = composite(how, splats, shown, cutoff, lists, jacobian, tap)
                     return jnp.sum(channels) + jnp.sum(transmittance)
 
                 return jax.grad(loss, argnums=(0, 1, 2))(splats, rule.table, tap)
 
-            if not has_statistic:
+            if not statistic:
                 yield f"{name}, forward", forward, inputs
-            yield f"{name}, backward{' with statistic' if has_statistic else ''}", backward, inputs
+            yield f"{name}, backward{' with statistic' if statistic else ''}", backward, inputs
 
 
 def compile_for(target: pathlib.Path, function, inputs):

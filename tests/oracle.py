@@ -19,7 +19,6 @@ Bool = NDArray[np.bool_]
 EXTENT = 3.0
 """A texture covers this many standard deviations on each side of the mean."""
 MIN_ALPHA = 1 / 255
-MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
 
 
@@ -47,7 +46,12 @@ class Rules(NamedTuple):
     uv: str = "texel-centre"
     outside: str = "clamp"
     rgb: str = "signed"
+    alpha: str = "projected"
+    max_alpha: float = 0.99
 
+
+OFFICIAL = Rules(uv="align-corners", outside="identity", rgb="unit", alpha="global-maximum", max_alpha=0.999)
+"""The authors' program."""
 
 DEFAULT_RULES = Rules()
 
@@ -59,9 +63,19 @@ class Hits(NamedTuple):
     v: Float  # [H, W], 0 without a hit
     depth: Float  # [H, W], the mean's where the low-pass filter decides
     rho: Float  # [H, W]
-    rho_gradient: Float  # [H, W, 3] with respect to the mean
+    rho_gradients: dict[str, Float]  # [H, W, 2 or 3] each: what each statistic multiplies by ∂L/∂ρ
     closest_rho: Float  # [H, W], as if every ray in front of or behind the camera could hit
     margin: Float  # [H, W]
+
+
+class Shown(NamedTuple):
+    """What one splat shows where the rays meet it."""
+
+    strength: Float  # [H, W], alpha before the cut at 1/255 and the cap
+    residual: Float  # [H, W, 3], added to its colour
+    margin: Float | float  # [H, W]
+    kink: Float | float  # [H, W]
+    is_relevant: Bool  # [H, W]; elsewhere it is too weak on either side of a decision of where the ray meets it
 
 
 class Layer(NamedTuple):
@@ -73,8 +87,8 @@ class Layer(NamedTuple):
     depth: Float  # [H, W]
     mean_depth: float
     normal: Float  # [3]
-    rho_gradient: Float  # [H, W, 3]
-    texel: Float  # [H, W, 4], what the lookup gave
+    rho_gradients: dict[str, Float]  # as in Hits
+    texel: Float | None  # [H, W, 4], what a lookup gave
     margin: Float  # [H, W]
     kink: Float  # [H, W]
 
@@ -130,8 +144,6 @@ def sh_basis(direction: Float) -> Float:
 
 def lookup(texture: Float, u: Float, v: Float, rules: Rules) -> tuple[Float, Float, Float]:
     """Bilinear texel [H, W, 4] of a [Tv, Tu, 4] texture at (u, v), with its margin and kink."""
-    if rules.rgb == "unit":
-        texture = np.concatenate([np.clip(texture[..., :3], 0, 1), texture[..., 3:]], axis=-1)
     rows, columns, _ = texture.shape
     (x, kink_x), (y, kink_y) = texel_position(u, columns, rules), texel_position(v, rows, rules)
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -145,6 +157,19 @@ def lookup(texture: Float, u: Float, v: Float, rules: Rules) -> tuple[Float, Flo
     largest = np.maximum(abs(u), abs(v))
     texel = np.where((largest > EXTENT)[..., None], [0.0, 0.0, 0.0, 1.0], texel)
     return texel, abs(largest / EXTENT - 1), np.minimum(kink_x, kink_y)
+
+
+def shown_texture(scene: Scene, i: int, rules: Rules) -> Float:
+    """[Tv, Tu, 4] residuals and alpha factors of splat `i` as they are seen."""
+    if scene.textures is None:
+        return np.array([[[0.0, 0.0, 0.0, 1.0]]])
+    texture = scene.textures[i].copy()
+    if rules.rgb == "unit":
+        texture[..., :3] = np.clip(texture[..., :3], 0, 1)
+    if rules.alpha == "global-maximum":
+        largest = max(one[..., 3].max() for one in scene.textures)
+        texture[..., 3] = np.clip(texture[..., 3] / (largest + 1e-6), 0, 1)
+    return texture
 
 
 def texel_position(u: Float, size: int, rules: Rules) -> tuple[Float, Float]:
@@ -195,28 +220,37 @@ def rho_gradients(rays: Rays, M: Float, position_jacobian: Float) -> tuple[Float
     return 2 * uv[..., :1] * du + 2 * uv[..., 1:] * dv, -4 * offset @ dcenter
 
 
-def intersect(M: Float, position_jacobian: Float, width: int, height: int, near: float) -> Hits:
+def intersect(
+    M: Float, position_jacobian: Float, width: int, height: int, near: float, has_low_pass: bool = True
+) -> Hits:
     """Meets the rays of all pixels with one splat; `position_jacobian` [3, 3] is ∂M[:, 2]/∂mean."""
     rays = cross_plane(M, width, height)
     hit_depth = rays.uv @ M[2, :2] + M[2, 2]
     is_hit = rays.is_crossed & (hit_depth >= near)
-    rho2 = 2 * np.sum(rays.offset**2, axis=-1)
+    rho2 = 2 * np.sum(rays.offset**2, axis=-1) if has_low_pass else np.full((height, width), np.inf)
     any_rho3 = np.where(rays.is_crossed, np.sum(rays.uv**2, axis=-1), np.inf)
     rho3 = np.where(is_hit, any_rho3, np.inf)
     is_low_pass = rho3 > rho2
+    branch_of_low_pass = is_low_pass[..., None]
     gradient3, gradient2 = rho_gradients(rays, M, position_jacobian)
+    # By the third column of M instead of the mean; M[2, 2] pixels of the projected mean are one of M[:2, 2].
+    by_column3, _ = rho_gradients(rays, M, np.eye(3))
 
     k, l = rays.k, rays.l  # noqa: E741
     summands = abs(k[..., 0] * l[..., 1]) + abs(k[..., 1] * l[..., 0])
     cancellation = abs(rays.p[..., 2]) / np.maximum(summands, np.finfo(float).tiny)
     with np.errstate(invalid="ignore"):
-        branch = np.where(is_hit, abs(rho3 - rho2) / (rho3 + rho2), np.inf)
+        branch = np.where(is_hit & has_low_pass, abs(rho3 - rho2) / (rho3 + rho2), np.inf)
     return Hits(
         u=np.where(is_hit, rays.uv[..., 0], 0.0),
         v=np.where(is_hit, rays.uv[..., 1], 0.0),
         depth=np.where(is_low_pass, M[2, 2], hit_depth),
         rho=np.where(is_low_pass, rho2, rho3),
-        rho_gradient=np.where(is_low_pass[..., None], gradient2, gradient3),
+        rho_gradients={
+            "position": np.where(branch_of_low_pass, gradient2, gradient3),
+            "screen": np.where(branch_of_low_pass, -4 * rays.offset, 0.0),
+            "center": np.where(branch_of_low_pass, 0.0, by_column3[..., :2] * M[2, 2]),
+        },
         closest_rho=np.minimum(any_rho3, rho2),
         margin=np.min([abs(hit_depth / near - 1), cancellation, branch], axis=0),
     )
@@ -240,34 +274,39 @@ def splat_layer(scene: Scene, i: int, rules: Rules, texel: Float | None = None) 
     """Splat `i` at every pixel; `texel` [H, W, 4] replaces the lookup where given."""
     M, position_jacobian = homography(scene, i)
     hits = intersect(M, position_jacobian, scene.width, scene.height, rules.near)
-    texture = np.array([[[0.0, 0.0, 0.0, 1.0]]]) if scene.textures is None else scene.textures[i]
-    found, lookup_margin, lookup_kink = lookup(texture, hits.u, hits.v, rules)
+    texture = shown_texture(scene, i, rules)
+    found, margin, kink = lookup(texture, hits.u, hits.v, rules)
     texel = found if texel is None else texel
     opacity = 1 / (1 + np.exp(-scene.logit_opacities[i]))
+    is_relevant = opacity * np.exp(-hits.closest_rho / 2) * max(texture[..., 3].max(), 1.0) >= 0.99 * MIN_ALPHA
     strength = opacity * np.exp(-hits.rho / 2) * texel[..., 3]
-    is_visible = (strength >= MIN_ALPHA) & (M[2, 2] >= rules.near)
+    layer = shown_layer(scene, i, rules, hits, Shown(strength, texel[..., :3], margin, kink, is_relevant))
+    return layer._replace(texel=texel)
 
+
+def shown_layer(scene: Scene, i: int, rules: Rules, hits: Hits, shown: Shown) -> Layer:
+    """The layer of splat `i`, given where the rays meet it and what it shows there."""
+    strength, (M, _) = shown.strength, homography(scene, i)
+    is_visible = (strength >= MIN_ALPHA) & (M[2, 2] >= rules.near)
     direction, normal = view_direction(scene, i), rotation_matrix(scene.quats[i])[:, 2]
     facing = direction @ normal
     num_bases = (rules.sh_degree + 1) ** 2
     sh_color = sh_basis(direction)[:num_bases] @ scene.sh[i, :num_bases] + 0.5
 
     constants = np.broadcast_to([[[abs(facing)]], [[abs(M[2, 2] / rules.near - 1)]]], (2, *strength.shape))
-    margins = [*constants, hits.margin, lookup_margin, abs(strength / MIN_ALPHA - 1)]
+    margins = np.broadcast_arrays(*constants, hits.margin, shown.margin, abs(strength / MIN_ALPHA - 1))
     margin = np.min(margins, axis=0) if M[2, 2] >= rules.near else constants[1]
-    # A splat too weak for this pixel on either side of a decision makes the decision irrelevant.
-    is_relevant = opacity * np.exp(-hits.closest_rho / 2) * max(texture[..., 3].max(), 1.0) >= 0.99 * MIN_ALPHA
-    kink = np.minimum(np.minimum(abs(strength / MAX_ALPHA - 1), lookup_kink), abs(sh_color).min())
+    kink = np.minimum(np.minimum(abs(strength / rules.max_alpha - 1), shown.kink), abs(sh_color).min())
     return Layer(
-        alpha=np.where(is_visible, np.minimum(strength, MAX_ALPHA), 0.0),
-        is_capped=strength > MAX_ALPHA,
-        color=np.maximum(sh_color, 0) + texel[..., :3],
+        alpha=np.where(is_visible, np.minimum(strength, rules.max_alpha), 0.0),
+        is_capped=strength > rules.max_alpha,
+        color=np.maximum(sh_color, 0) + shown.residual,
         depth=hits.depth,
         mean_depth=float(M[2, 2]),
         normal=-normal if facing > 0 else normal,
-        rho_gradient=hits.rho_gradient,
-        texel=texel,
-        margin=np.where(is_relevant, margin, np.inf),
+        rho_gradients=hits.rho_gradients,
+        texel=None,
+        margin=np.where(shown.is_relevant, margin, np.inf),
         kink=np.where(is_visible, kink, np.inf),
     )
 
@@ -318,8 +357,13 @@ def render(scene: Scene, rules: Rules = DEFAULT_RULES, texels: list[Float] | Non
     return composite(splat_layers(scene, rules, texels), scene.background)
 
 
-def mean_gradient_statistic(scene: Scene, color_cotangent: Float, rules: Rules = DEFAULT_RULES) -> Float:
-    """[N, 3] sum over pixels of |∂(g·color)/∂mean| through the Gaussian factor exp(-ρ/2) alone, per component.
+def gradient_statistic(
+    scene: Scene, color_cotangent: Float, rules: Rules = DEFAULT_RULES, which: str = "position"
+) -> Float:
+    """[N, 3] sum over pixels of a derivative of g·color through the Gaussian factor exp(-ρ/2) alone.
+
+    "position": |∂/∂mean| per component. "screen": |∂/∂c|, c the projected mean, where the low-pass filter decides, then
+    0. "center": ∂/∂M[0, 2] and ∂/∂M[1, 2] times M[2, 2], where it does not, then 0.
 
     With α the blended opacity, T the transmittance before a splat and B all the light behind it,
     ∂(g·color)/∂α = g·(T·c - B/(1 - α)) and ∂α/∂ρ = -α/2; nothing flows where α is capped. `color_cotangent` is g,
@@ -336,5 +380,6 @@ def mean_gradient_statistic(scene: Scene, color_cotangent: Float, rules: Rules =
         alpha = np.where(is_shown, layer.alpha, 0.5)[..., None]
         by_alpha = np.sum(color_cotangent * (weight * layer.color / alpha - behind / (1 - alpha)), axis=-1)
         by_rho = np.where(is_shown, -0.5 * layer.alpha * by_alpha, 0.0)
-        statistic[i] = np.sum(abs(by_rho[..., None] * layer.rho_gradient), axis=(0, 1))
+        moved = by_rho[..., None] * layer.rho_gradients[which]
+        statistic[i, : moved.shape[-1]] = np.sum(moved if which == "center" else abs(moved), axis=(0, 1))
     return statistic

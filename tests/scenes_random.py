@@ -197,6 +197,9 @@ def draw_smooth_scene(seed: int, width: int = 16, height: int = 12) -> Scene:
         mean, quat = to_world(viewmat, mean, np.array([1, *rng.normal(scale=0.35, size=3)]))
         splats.append((mean, quat, rng.uniform(-4.5, -3.5, 2) if is_small else rng.uniform(-0.3, 0.6, 2)))
     sizes = [(1, 1), (1, 3), (4, 1), (2, 2), (4, 4), (8, 8)]
+    textures = [0.1 + draw_texture(rng, size) * [0.5, 0.5, 0.5, 0.8] for size in sizes]
+    # One alpha is the largest: where several are, a difference quotient sees only one of them move.
+    textures[3][0, 0, 3] = 0.95
     return Scene(
         means=np.array([mean for mean, _, _ in splats]),
         quats=np.array([quat for _, quat, _ in splats]),
@@ -207,7 +210,7 @@ def draw_smooth_scene(seed: int, width: int = 16, height: int = 12) -> Scene:
         K=K,
         width=width,
         height=height,
-        textures=[0.1 + draw_texture(rng, size) * [0.5, 0.5, 0.5, 0.8] for size in sizes],
+        textures=textures,
         background=rng.uniform(0, 1, 3),
     )
 
@@ -240,7 +243,8 @@ def as_textures(scene: Scene, dtype: str) -> tuple[Textures, AtlasLayout] | tupl
 def as_settings(rules: Rules = DEFAULT_RULES, **changes: Any) -> RenderSettings:
     """The oracle's rules as the package's settings, with further fields changed."""
     plain = RenderSettings()
-    texture = dataclasses.replace(plain.texture, uv=rules.uv, outside=rules.outside, rgb=rules.rgb)
+    options = {name: getattr(rules, name) for name in ("uv", "outside", "rgb", "alpha", "max_alpha")}
+    texture = dataclasses.replace(plain.texture, **options)
     return dataclasses.replace(plain, near_plane=rules.near, sh_degree=rules.sh_degree, texture=texture, **changes)
 
 

@@ -183,9 +183,11 @@ def test_any_appearance_rule_is_compiled():
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
 
 
-@pytest.mark.parametrize("has_textures", [False, True])
-def test_pallas_kernels_are_those_of_xla(has_textures):
-    """Interpreted, on a small scene: the image, the gradient, and the absolute positional gradient."""
+@pytest.mark.parametrize(
+    ("has_textures", "statistic"), [(False, "position"), (True, "position"), (False, "screen"), (False, "center")]
+)
+def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
+    """Interpreted, on a small scene: the image, the gradient, and a statistic."""
     scene = draw_scene(4, num=16, width=19, height=13)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
     textures, layout = as_textures(scene, "float32") if has_textures else (None, None)
@@ -193,7 +195,7 @@ def test_pallas_kernels_are_those_of_xla(has_textures):
     def loss(gaussians, textures, tap, compositor):
         settings = RenderSettings(compositor=compositor, capacity=1024)
         rule = appearance_of(gaussians, textures, layout, settings)
-        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, tap=tap)
+        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, tap=tap, statistic=statistic)
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)

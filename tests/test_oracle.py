@@ -7,10 +7,13 @@ from oracle import (
     Rules,
     Scene,
     composite,
+    gradient_statistic,
+    homography,
+    intersect,
     lookup,
-    mean_gradient_statistic,
     render,
     sh_basis,
+    shown_texture,
     splat_layer,
     splat_layers,
 )
@@ -109,9 +112,18 @@ def test_u_indexes_columns_and_v_rows():
 
 
 def test_unit_rgb_is_clamped_before_interpolation():
-    texture = np.array([[[-1.0, 2.0, 0.5, 1.0], [1.0, 0.0, 0.5, 1.0]]])
+    textures = [np.array([[[-1.0, 2.0, 0.5, 1.0], [1.0, 0.0, 0.5, 1.0]]])]
+    scene = hand_scene([[0, 0, 4]], [FACING], [[0, 0]], [0.5], [[1, 1, 1]], textures)
+    texture = shown_texture(scene, 0, Rules(rgb="unit"))
     texel, _, _ = lookup(texture, np.zeros((1, 1)), np.zeros((1, 1)), Rules(rgb="unit"))
     np.testing.assert_allclose(texel[0, 0], [0.5, 0.5, 0.5, 1.0])
+
+
+def test_alpha_over_the_largest_of_all():
+    textures = [np.full((1, 1, 4), -1.0), np.full((1, 2, 4), 3.0)]
+    scene = hand_scene([[0, 0, 4]] * 2, [FACING] * 2, [[0, 0]] * 2, [0.5] * 2, [[1, 1, 1]] * 2, textures)
+    shown = [shown_texture(scene, i, Rules(alpha="global-maximum"))[0, 0] for i in range(2)]
+    np.testing.assert_allclose(shown, [[-1, -1, -1, 0], [3, 3, 3, 3 / 3.000001]])
 
 
 def test_spherical_harmonics_are_orthonormal():
@@ -144,6 +156,23 @@ def test_statistic_against_differences():
     expected = [
         [np.sum(abs(objective(i, j, 1e-6) - objective(i, j, -1e-6))) / 2e-6 for j in range(3)] for i in range(20)
     ]
-    statistic = mean_gradient_statistic(scene, cotangent)
+    statistic = gradient_statistic(scene, cotangent)
     assert np.count_nonzero(statistic) > 30
     np.testing.assert_allclose(statistic, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("i", [1, 6, 10])
+def test_gradients_of_rho_against_differences(i):
+    """ε = 1e-6: M[0, 2] and M[1, 2], which by M[2, 2] are the projected mean; low-pass filter and hit apart."""
+    scene = draw_scene(3, num=20, width=9, height=7)
+    M, jacobian = homography(scene, i)
+    hits = intersect(M, jacobian, 9, 7, 0.2)
+    for axis in range(2):
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = M.copy()
+            moved[axis, 2] += step * M[2, 2]
+            ends.append(intersect(moved, jacobian, 9, 7, 0.2).rho)
+        found = hits.rho_gradients["screen"][..., axis] + hits.rho_gradients["center"][..., axis]
+        expected = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * abs(expected).max())

@@ -6,18 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from oracle import DEFAULT_RULES, Rules, Scene
+from oracle import DEFAULT_RULES, OFFICIAL, Rules, Scene
 from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, render_scene
 
 from a2tg_jax import RenderOutput, RenderSettings, render_image
 
 COMPOSITORS = ("native", "xla")
 FIELDS = ("color", "alpha", "depth", "normal")
-OFFICIAL = Rules(uv="align-corners", outside="identity", rgb="unit")
 OPTIONS = {
     "align-corners": Rules(uv="align-corners", sh_degree=2),
     "identity": Rules(outside="identity", near=1.0),
     "unit": Rules(rgb="unit", sh_degree=0),
+    "global-maximum": Rules(alpha="global-maximum", max_alpha=0.9),
     "all": OFFICIAL._replace(sh_degree=1),
 }
 """Each texture option alone, then all; the degree and the near plane change along, to compile less often."""
@@ -74,7 +74,7 @@ def test_float64_options(option, compositor):
 
 
 @pytest.mark.usefixtures("x64")
-def test_official_preset_is_all_three_options():
+def test_official_preset_is_all_the_options():
     assert_equal_in_float64(draw_scene(5), OFFICIAL, RenderSettings.official())
 
 

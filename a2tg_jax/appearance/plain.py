@@ -14,4 +14,4 @@ class Plain(Appearance):
     """Alpha never exceeds it."""
 
     def rule(self, params: tuple, layout: tuple) -> PlainRule:
-        return PlainRule(self.max_alpha)
+        return PlainRule(max_alpha=self.max_alpha)

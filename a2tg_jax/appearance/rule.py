@@ -7,11 +7,13 @@ make visible (`shade`):
     residual, factor = rule.shade(numbers, interpolated image at rule.texel(image, u, v), u, v)
     α = min(max_alpha, opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
 
-`texel`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They may use nothing of the
-rule but its static fields: whatever is differentiated, or differs between splats, is in the table or in the numbers.
+`texel`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They see the rule without its
+arrays (`StaticRule`): whatever is differentiated, or differs between splats, is in the table or in the numbers. All
+else is computed by XLA for the N splats at once, and may use any field.
 """
 
 import dataclasses
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +35,8 @@ class AppearanceRule:
     max_alpha: float = 0.99
     """Static. Alpha never exceeds it; less than 1."""
     has_low_pass: bool = True
-    """Static. The low-pass filter of 2DGS shows splats that are smaller than a pixel, or seen edge-on."""
+    """Static. The low-pass filter of 2DGS shows splats that are smaller than a pixel, or seen edge-on. Without it, ρ is
+    u² + v² where the pixel's ray meets the splat, and nothing shows where it does not."""
 
     table: Array
     """[T, C] the entries of all images, differentiable; T >= 1, and C >= 1 where there are images."""
@@ -41,7 +44,10 @@ class AppearanceRule:
     """[N] each: the splats' images in the table. None where nothing of it is read."""
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
-        """[N, K] what else `shade` and `falloff` know of each splat, differentiable; it may depend on the view."""
+        """[N, K] what else `shade` and `falloff` know of each splat, differentiable; it may depend on the view.
+
+        It is called once per view and differentiated by JAX, gradients of rows that do not show being zero.
+        """
         return jnp.zeros((gaussians.num, 0), gaussians.means.dtype)
 
     def opacities(self, gaussians: Gaussians) -> Array:
@@ -63,7 +69,10 @@ class AppearanceRule:
         return jnp.exp(-0.5 * rho)
 
     def cutoff(self, opacities: Array) -> Array:
-        """[N] squared distance rho beyond which the splat shows less than 1/255; not positive where it never does."""
+        """[N] squared distance rho beyond which the splat shows less than 1/255; not positive where it never does.
+
+        Bounds only: no gradient flows. Too large a bound costs time, too small a one cuts the splat off.
+        """
         return gaussian_cutoff(opacities)
 
 
@@ -72,7 +81,7 @@ class AppearanceRule:
 class PlainRule(AppearanceRule):
     """Plain 2DGS; also what a rule without images derives from."""
 
-    max_alpha: float = dataclasses.field(default=0.99, metadata={"static": True})
+    max_alpha: float = dataclasses.field(default=0.99, kw_only=True, metadata={"static": True})
 
     @property
     def table(self) -> Array:  # type: ignore[override]
@@ -81,6 +90,51 @@ class PlainRule(AppearanceRule):
     @property
     def images(self) -> None:  # type: ignore[override]
         return None
+
+
+@dataclasses.dataclass(frozen=True)
+class StaticRule:
+    """A rule without its arrays; hashable, so that code can be compiled for it."""
+
+    structure: Any
+    """Its tree structure, with the static fields."""
+    rule_class: type
+    """Its class, which equality of tree structures disregards."""
+
+    @staticmethod
+    def of(rule: AppearanceRule) -> "StaticRule":
+        return StaticRule(jax.tree.structure(rule), type(rule))
+
+    @property
+    def rule(self) -> Any:
+        """The rule as its element-wise functions see it: an array field refuses to be used."""
+        numbered = jax.tree.unflatten(self.structure, range(self.structure.num_leaves))
+        paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
+        name = self.rule_class.__name__
+        return jax.tree.unflatten(self.structure, [_LeftOut(name + jax.tree_util.keystr(path)) for path, _ in paths])
+
+
+class _LeftOut:
+    """Stands where a rule has an array, and says what to do instead where it is used."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def _refuse(self, *_: Any) -> NoReturn:
+        raise ValueError(
+            f"{self._name} is an array, and texel, shade and falloff see the static fields of a rule only: "
+            "return it from numbers(), or put it in the table"
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self._refuse()
+
+    __jax_array__ = __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
+    __add__ = __sub__ = __mul__ = __truediv__ = __pow__ = __neg__ = __abs__ = __matmul__ = _refuse
+    __radd__ = __rsub__ = __rmul__ = __rtruediv__ = __rpow__ = __rmatmul__ = _refuse
+    __lt__ = __le__ = __gt__ = __ge__ = _refuse
 
 
 def gaussian_cutoff(peak: Array) -> Array:

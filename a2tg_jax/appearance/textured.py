@@ -42,13 +42,16 @@ class TextureOptions:
     """Whether the lookup position carries gradients into the geometry."""
     initial_rgb: float = 0.0
     """RGB of new textures."""
+    alpha: Literal["projected", "global-maximum"] = "projected"
+    """Alpha factors as they are, kept in [0, 1] after each update; or any numbers, divided by the largest of all
+    textures and clipped to [0, 1]."""
     max_alpha: float = 0.99
-    """Alpha never exceeds it."""
+    """Alpha of a splat never exceeds it."""
 
     @staticmethod
     def official() -> "TextureOptions":
         """The conventions of the authors' own program."""
-        return TextureOptions("align-corners", "identity", "unit", uv_gradient=False, initial_rgb=0.1)
+        return TextureOptions("align-corners", "identity", "unit", False, 0.1, "global-maximum", max_alpha=0.999)
 
 
 @jax.tree_util.register_dataclass
@@ -63,6 +66,10 @@ class TexturedRule(AppearanceRule):
     peaks: Array
     """[N] the largest alpha factor of each splat; bounds only, without gradient."""
     options: TextureOptions = dataclasses.field(metadata={"static": True})
+
+    @property
+    def max_alpha(self) -> float:  # type: ignore[override]
+        return self.options.max_alpha
 
     def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
         if not self.options.uv_gradient:
@@ -84,6 +91,7 @@ class TexturedRule(AppearanceRule):
 
 def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedRule:
     """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels."""
+    textures = shown_textures(textures, layout, options)
     areas = [height * width for height, width in layout.resolutions]
     capacities = [bucket.shape[0] for bucket in textures.buckets]
     starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
@@ -93,14 +101,37 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
     peaks = jax.lax.stop_gradient(peaks[layout.bucket, layout.row])
     offsets = bucket_starts[layout.bucket] + layout.row * bucket_areas[layout.bucket]
     texels = jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets])
-    if options.rgb == "unit":
-        texels = jnp.concatenate([jnp.clip(texels[:, :3], 0.0, 1.0), texels[:, 3:]], axis=1)
     return TexturedRule(
         table=texels,
         images=Image(offsets, sizes[:, 0], sizes[:, 1]),
         peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
         options=options,
     )
+
+
+def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> Textures:
+    """RGB residuals and alpha factors as they are seen, from the texels that are trained."""
+    if options.rgb == "signed" and options.alpha == "projected":
+        return textures
+    divisor = _largest_alpha(textures, layout) + 1e-6 if options.alpha == "global-maximum" else None
+
+    def shown(texels: Array) -> Array:
+        rgb, alpha = texels[..., :3], texels[..., 3:]
+        rgb = jnp.clip(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
+        alpha = alpha if divisor is None else jnp.clip(alpha / divisor, 0.0, 1.0)
+        return jnp.concatenate([rgb, alpha], axis=-1)
+
+    return jax.tree.map(shown, textures)
+
+
+def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
+    """The largest alpha of all texels, buckets' padding left out; where several are, they share its gradient."""
+    alphas = []
+    for index, bucket in enumerate(textures.buckets):
+        num_used = jnp.sum(layout.bucket == index, dtype=jnp.int32)
+        is_used = jnp.arange(bucket.shape[0], dtype=jnp.int32) < num_used
+        alphas.append(jnp.where(is_used[:, None, None], bucket[..., 3], -jnp.inf).reshape(-1))
+    return jnp.max(jnp.concatenate(alphas))
 
 
 def _padded_peaks(bucket: Array, length: int) -> Array:
@@ -175,6 +206,9 @@ class Textured(Appearance):
 
 
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:
-    """Alpha factors clamped to [0, 1]; RGB too where it is unsigned."""
+    """Alpha factors clamped to [0, 1]; RGB too where it is unsigned. Where alpha is divided by its maximum, nothing is
+    moved: what is shown is clipped instead."""
+    if options.alpha == "global-maximum":
+        return textures
     is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
     return jax.tree.map(lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures)

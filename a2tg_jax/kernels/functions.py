@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import pixel
+from a2tg_jax.appearance import StaticRule
 from a2tg_jax.bilinear import Image, Sample
 from a2tg_jax.kernels import library
 from a2tg_jax.kernels.lanes import trace
@@ -18,17 +19,17 @@ from a2tg_jax.kernels.packing import num_numbers
 class Kind:
     """What a pair of loops is made for; hashable."""
 
-    rule: Any
-    """The tree structure of an appearance rule, with its static fields."""
-    rule_class: type
-    """Its class, which equality of tree structures disregards."""
+    rule: StaticRule
+    """What the splats show."""
+    num_rule_numbers: int
+    """K, what else the rule knows of a splat."""
     num_columns: int
     """C, numbers in an entry of its table; 0 where it has no images."""
     dtype: str
     tile_size: int
     near_plane: float
     has_geometry: bool
-    has_statistic: bool
+    statistic: pixel.Statistic | None
 
     @property
     def num_channels(self) -> int:
@@ -37,7 +38,7 @@ class Kind:
     @property
     def num_floats(self) -> int:
         """S: the splat's own numbers, and the squared distance beyond which it does not show."""
-        return num_numbers(self.has_geometry) + 1
+        return num_numbers(self.has_geometry) + self.num_rule_numbers + 1
 
     @property
     def lanes(self) -> int:
@@ -54,12 +55,13 @@ class Functions:
     """The jaxprs of one kind, all of scalars."""
 
     def __init__(self, kind: Kind):
-        rule = jax.tree.unflatten(kind.rule, [None] * kind.rule.num_leaves)
+        rule = kind.rule.rule
         number: Any = jax.ShapeDtypeStruct((), kind.dtype)
         integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
         flag = jax.ShapeDtypeStruct((), jnp.bool_)
         triple, near_plane = (number,) * 3, kind.near_plane
-        splat = pixel.Splat((triple,) * 3, number, triple, triple if kind.has_geometry else None)
+        normal, numbers = triple if kind.has_geometry else None, (number,) * kind.num_rule_numbers
+        splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
         values = (number,) * kind.num_columns
         image = Image(integer, integer, integer) if values else None
         sample = Sample(values, values, values) if values else None
@@ -74,7 +76,7 @@ class Functions:
         self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
 
         def reach(planes, image, x, y):
-            hit = pixel.intersect(planes, x, y, near_plane)
+            hit = pixel.intersect(planes, x, y, near_plane, rule.has_low_pass)
             return hit.rho, () if image is None else rule.texel(image, hit.u, hit.v)
 
         self.reach, _ = trace(reach, planes, image, number, number)
@@ -86,11 +88,12 @@ class Functions:
 
         def backward(planes, splat, image, sample, x, y, light, is_live, behind, g, center, jacobian):
             at_pixel = planes, splat, image, sample, x, y, light, is_live, behind, g
-            state, weight, d = pixel.composite_vjp(rule, near_plane, *at_pixel, kind.has_statistic)
+            state, weight, d = pixel.composite_vjp(rule, near_plane, *at_pixel, kind.statistic is not None)
             tap = ()
-            if kind.has_statistic:
-                tap = pixel.absolute_gradient(splat.M, x, y, *center, d.log_falloff, jacobian, near_plane)
-            return state, weight > 0, d.values, (d.planes, d.opacity, d.color, d.normal, tap)
+            if kind.statistic:
+                moved = splat.M, x, y, *center, d.log_falloff, jacobian
+                tap = pixel.positional_gradient(kind.statistic, *moved, near_plane, rule.has_low_pass)
+            return state, weight > 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, tap)
 
         at_pixel = number, number, number, flag
         channels = (number,) * kind.num_channels

@@ -212,7 +212,7 @@ class _Forward(_Compositing):
 
 
 class _Backward(_Compositing):
-    """Cotangents of the splats, of the table, and the absolute gradient."""
+    """Cotangents of the splats, of the table, and the statistic."""
 
     def write(self) -> None:
         behind, *g = (self.variable(self.reals, self.kind.num_vectors) for _ in range(1 + self.kind.num_channels))
@@ -245,7 +245,7 @@ class _Backward(_Compositing):
         jacobian = self.spread([self.load(self.arguments["jacobian"], k, self.real) for k in range(9)])
         any_contributes = self.variable(BOOL)
         b.store(BOOL(0), any_contributes)
-        num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.has_statistic else 0)
+        num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.statistic else 0)
         totals = self.zeros(num_sums)
 
         def composite(k, x, y, place, is_live):
@@ -259,7 +259,7 @@ class _Backward(_Compositing):
             self.store(b.zext(still_live, self.integers), self.live, k)
             self.store(left, behind, k)
             d_values, sums = rest[: self.num_columns], rest[self.num_columns :]
-            if kind.has_statistic:
+            if kind.statistic:
                 sums.append(lanes.constant(1.0, self.real))
             # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
             chosen = functools.partial(b.select, contributes, rhs=zero)
@@ -285,7 +285,7 @@ class _Backward(_Compositing):
         d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], tile_x, tile_y, *d_planes])
         num_others = len(numbers) - 9
         self.add("d_splats", self.times(id_, kind.num_floats), [*d_M, *others[:num_others]])
-        if kind.has_statistic:
+        if kind.statistic:
             self.add("d_tap", self.times(id_, 4), others[num_others:])
 
     def add(self, name: str, start: ir.Value, values: Sequence[ir.Value]) -> None:

@@ -23,47 +23,49 @@ PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
 """Fewer than these are not worth another thread."""
 
 
-def _kind(how, splats, rule):
+def _kind(how, rule, splats, table: Array, images):
     from a2tg_jax.kernels.functions import Kind
 
     return Kind(
-        rule=jax.tree.structure(rule),
-        rule_class=type(rule),
-        num_columns=0 if rule.images is None else rule.table.shape[1],
+        rule=rule,
+        num_rule_numbers=splats.numbers.shape[1],
+        num_columns=0 if images is None else table.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
         tile_size=how.grid.tile_size,
         near_plane=how.near_plane,
         has_geometry=how.has_geometry,
-        has_statistic=how.has_statistic,
+        statistic=how.statistic,
     )
 
 
-def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
+def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:
     """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    kind = _kind(how, splats, rule)
+    kind = _kind(how, rule, splats, table, images)
     name = _registered(kind, "forward", _forward_handler)
     shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.tile_size**2), splats.M.dtype)
     call = jax.ffi.ffi_call(name, shape, vmap_method="sequential")
-    image = call(*_inputs(kind, how, splats, params, rule, lists))[:, None]
+    image = call(*_inputs(kind, how, splats, table, images, cutoff, lists))[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
-def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: Array, behind: Array):
+def backward(
+    how, rule, splats, table: Array, images, cutoff: Array, lists, jacobian, tap: Array, g: Array, behind: Array
+):
     """As `compositor._backward`."""
-    kind = _kind(how, splats, rule)
+    kind = _kind(how, rule, splats, table, images)
     name = _registered(kind, "backward", _backward_handler)
     dtype, num = splats.M.dtype, splats.M.shape[0]
     shapes = (
         jax.ShapeDtypeStruct((num, kind.num_floats), dtype),
-        jax.ShapeDtypeStruct(params.shape, dtype),
-        jax.ShapeDtypeStruct(tap.shape if kind.has_statistic else (1, 4), dtype),
+        jax.ShapeDtypeStruct(table.shape, dtype),
+        jax.ShapeDtypeStruct(tap.shape if kind.statistic else (1, 4), dtype),
     )
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
     cotangents = (array.astype(dtype) for array in (g, behind, jacobian))
-    packed, d_params, d_tap = call(*_inputs(kind, how, splats, params, rule, lists), *cotangents)
+    packed, d_table, d_tap = call(*_inputs(kind, how, splats, table, images, cutoff, lists), *cotangents)
     d_splats = unpack_splats(packed, splats, kind.has_geometry)
-    d_tap = d_tap.astype(tap.dtype) if kind.has_statistic else jnp.zeros_like(tap)
-    return d_splats, d_params.astype(params.dtype), d_tap
+    d_tap = d_tap.astype(tap.dtype) if kind.statistic else jnp.zeros_like(tap)
+    return d_splats, d_table.astype(table.dtype), d_tap
 
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
@@ -136,11 +138,11 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
     return visible[order].astype(np.int32)
 
 
-def _inputs(kind, how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
+def _inputs(kind, how, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, ...]:
     """ids, starts, splats, images, table, and (columns, width, height)."""
-    packed = pack_splats(splats, kind.has_geometry, rule.cutoff(splats.opacities)).astype(kind.dtype)
+    packed = pack_splats(splats, kind.has_geometry, cutoff).astype(kind.dtype)
     size = jnp.asarray([how.grid.columns, how.grid.width, how.grid.height], jnp.int32)
-    return lists.ids, lists.starts, packed, pack_images(rule), params.astype(kind.dtype), size
+    return lists.ids, lists.starts, packed, pack_images(images), table.astype(kind.dtype), size
 
 
 def _registered(kind, which: str, make_handler: Callable[[Any], foreign.Handler]) -> str:

@@ -5,29 +5,31 @@ from jax import Array
 
 
 def num_numbers(has_geometry: bool) -> int:
-    """Numbers of a splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
+    """Numbers of every splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
     return 16 if has_geometry else 13
 
 
 def pack_splats(splats, has_geometry: bool, *more: Array) -> Array:
-    """[N, S] with one splat a row, and further columns [N] after it."""
+    """[N, S] with one splat a row, in the order of `pixel.Splat`, and further columns [N] after it."""
     columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
     columns += [splats.normals] if has_geometry else []
-    return jnp.concatenate([*columns, *(column[:, None] for column in more)], axis=1)
+    return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
 
 
 def unpack_splats(packed: Array, like, has_geometry: bool):
     """Cotangents [N, S] as those of splats."""
+    first = num_numbers(has_geometry)
     return type(like)(
         M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
         opacities=packed[:, 9].astype(like.opacities.dtype),
         colors=packed[:, 10:13].astype(like.colors.dtype),
         normals=packed[:, 13:16].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
+        numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
     )
 
 
-def pack_images(rule, least_columns: int = 0) -> Array:
-    """[N, 3] int32 `bilinear.Image` of every splat; a rule without images gives one row of `least_columns`."""
-    if rule.images is None:
+def pack_images(images, least_columns: int = 0) -> Array:
+    """[N, 3] int32 `bilinear.Image` of every splat; without images there is one row of `least_columns`."""
+    if images is None:
         return jnp.zeros((1, least_columns), jnp.int32)
-    return jnp.stack(rule.images, axis=1).astype(jnp.int32)
+    return jnp.stack(images, axis=1).astype(jnp.int32)

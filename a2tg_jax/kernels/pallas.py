@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.experimental import pallas as pl
 
@@ -52,10 +51,12 @@ def _tile(grid: TileGrid, starts, dtype) -> _Tile:
 
 
 def _splat(splats, id_, has_geometry: bool) -> pixel.Splat:
-    numbers = [splats[id_, k] for k in range(num_numbers(has_geometry))]
+    first_of_rule = num_numbers(has_geometry)
+    numbers = [splats[id_, k] for k in range(splats.shape[1])]
     M = tuple(tuple(numbers[3 * i : 3 * i + 3]) for i in range(3))
     normal = tuple(numbers[13:16]) if has_geometry else None
-    return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal)  # type: ignore[arg-type]
+    of_rule = tuple(numbers[first_of_rule:])
+    return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal, of_rule)  # type: ignore[arg-type]
 
 
 class _Read(NamedTuple):
@@ -71,7 +72,7 @@ def _read(how, rule, images, table, id_, planes, tile: _Tile) -> _Read | None:
     """None where the rule has no images: there is then but one column, of nothing."""
     if images.shape[1] < len(Image._fields):
         return None
-    hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane)
+    hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane, rule.has_low_pass)
     image = Image(*(images[id_, k] for k in range(len(Image._fields))))
     taps = bilinear.taps(image, *rule.texel(image, hit.u, hit.v))
     texels = tuple(tuple(table[tap.entry, column] for column in range(table.shape[1])) for tap in taps)
@@ -125,20 +126,20 @@ def _backward_kernel(
         spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
         at_pixel = spread(planes), spread(splat), image, sample, tile.x, tile.y, light, live > 0
         (light, is_live, behind), weight, d = pixel.composite_vjp(
-            rule, how.near_plane, *at_pixel, behind, cotangents, how.has_statistic
+            rule, how.near_plane, *at_pixel, behind, cotangents, how.statistic is not None
         )
         contributes = weight > 0
         # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
         total = lambda x: jnp.sum(jnp.where(contributes, x, jnp.zeros_like(x)))  # noqa: E731
-        d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal))
+        d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal, d.numbers))
         for k, number in enumerate(jax.tree.leaves((to_M(d_planes), *others))):
             _add(d_splats, (id_, k), number)
         if read is not None:
             _add_texels(d_table, read, [jnp.where(contributes, value, jnp.zeros_like(value)) for value in d.values])
-        if how.has_statistic:
-            center = tile.center_x, tile.center_y
-            absolute = pixel.absolute_gradient(splat.M, tile.x, tile.y, *center, d.log_falloff, axes, how.near_plane)
-            for k, number in enumerate((*map(total, absolute), jnp.sum(contributes.astype(weight.dtype)))):
+        if how.statistic:
+            moved = splat.M, tile.x, tile.y, tile.center_x, tile.center_y, d.log_falloff, axes
+            added = pixel.positional_gradient(how.statistic, *moved, how.near_plane, rule.has_low_pass)
+            for k, number in enumerate((*map(total, added), jnp.sum(contributes.astype(weight.dtype)))):
                 _add(d_tap, (id_, k), number)
         return at + 1, light, is_live.astype(jnp.int32), behind
 
@@ -210,36 +211,32 @@ def _call(grid: TileGrid, kernel, shapes, num_inputs: int, aliases: dict[int, in
     )
 
 
-def _inputs(how, splats, params: Array, rule, lists) -> tuple[Array, ...]:
+def _inputs(how, splats, table: Array, images, lists) -> tuple[Array, ...]:
     """ids, starts, splats, images and table; without images or columns there is one that is not read."""
     packed = pack_splats(splats, how.has_geometry)
-    table = params if params.shape[1] else jnp.zeros((1, 1), packed.dtype)
-    return lists.ids, lists.starts, packed, pack_images(rule, least_columns=1), table
+    table = table if table.shape[1] else jnp.zeros((1, 1), packed.dtype)
+    return lists.ids, lists.starts, packed, pack_images(images, least_columns=1), table
 
 
-def forward(how, splats, params: Array, rule, lists) -> tuple[Array, Array]:
+def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:
     """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    kernel = functools.partial(_forward_kernel, how, _without_arrays(rule))
+    kernel = functools.partial(_forward_kernel, how, rule.rule)
     shape = jax.ShapeDtypeStruct((how.grid.num, how.num_channels + 1, how.grid.tile_size**2), splats.M.dtype)
-    inputs = _inputs(how, splats, params, rule, lists)
+    inputs = _inputs(how, splats, table, images, lists)
     image = _call(how.grid, kernel, shape, len(inputs), {})(*inputs)[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
-def backward(how, splats, params: Array, rule, lists, jacobian, tap: Array, g: Array, behind: Array):
+def backward(
+    how, rule, splats, table: Array, images, cutoff: Array, lists, jacobian, tap: Array, g: Array, behind: Array
+):
     """As `compositor._backward`."""
-    kernel = functools.partial(_backward_kernel, how, _without_arrays(rule))
-    inputs = (*_inputs(how, splats, params, rule, lists), g[:, 0], behind[:, 0], jacobian.astype(splats.M.dtype))
-    packed, table = inputs[2], inputs[4]
-    zeros = (jnp.zeros_like(packed), jnp.zeros_like(table), jnp.zeros_like(tap))
+    kernel = functools.partial(_backward_kernel, how, rule.rule)
+    inputs = (*_inputs(how, splats, table, images, lists), g[:, 0], behind[:, 0], jacobian.astype(splats.M.dtype))
+    zeros = (jnp.zeros_like(inputs[2]), jnp.zeros_like(inputs[4]), jnp.zeros_like(tap))
     shapes = tuple(jax.ShapeDtypeStruct(zero.shape, zero.dtype) for zero in zeros)
     aliases = {len(inputs) + k: k for k in range(3)}
     call = _call(how.grid, kernel, shapes, len(inputs) + 3, aliases)
-    packed, table, d_tap = call(*inputs, *zeros)
+    packed, d_table, d_tap = call(*inputs, *zeros)
     d_splats = unpack_splats(packed, splats, how.has_geometry)
-    return d_splats, table if params.shape[1] else jnp.zeros_like(params), d_tap
-
-
-def _without_arrays(rule):
-    """The rule as its element-wise functions see it: static fields only."""
-    return jax.tree.unflatten(jax.tree.structure(rule), [np.nan] * len(jax.tree.leaves(rule)))
+    return d_splats, d_table if table.shape[1] else jnp.zeros_like(table), d_tap

@@ -42,7 +42,7 @@ class DensityConfig:
     least_opacity: float = 0.05
     """Fainter Gaussians are pruned."""
     reset_opacity: float = 0.01
-    """No Gaussian stays more opaque, ten times a stage until half of it is over."""
+    """No Gaussian stays more opaque, every max(500, n/10) of n iterations until n/2."""
 
     def events(self) -> tuple[Event, ...]:
         """Clone, split and prune; reset opacities."""

@@ -159,7 +159,8 @@ class StageRun:
         self.state = dataclasses.replace(self.state, status=jnp.zeros((), jnp.int32))
         if info.status == OVERFLOW:
             self.num_regrown += 1
-            self.capacities[self._size(iteration)] = capacity_for(int(float(info.num_pairs) * GROWTH_ROOM))
+            size = self._size(iteration)
+            self.capacities[size] = _shared_capacity(size, capacity_for(int(float(info.num_pairs) * GROWTH_ROOM)))
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status == NOT_FINITE:
@@ -169,8 +170,8 @@ class StageRun:
                 "damaged camera or image; the state before it is unharmed"
             )
         assert info.status == IMPOSSIBLE
-        reasons = [event.impossible for event in self.stage.events if isinstance(event, StepEvent)]
-        raise ValueError(f"{where}: {'; or '.join(dict.fromkeys(reasons))}")
+        reasons = [event.impossible for event in self.stage.events if isinstance(event, StepEvent) and event.impossible]
+        raise ValueError(f"training cannot go on {where}: {'; or '.join(reasons)}")
 
     def _log(self, iteration: int, info: StepInfo) -> None:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
@@ -209,8 +210,20 @@ class StageRun:
             sample = views[:: -(-len(views) // PLANNED_VIEWS)]
             pairs = max(pairs_of_view(live.gaussians, view.camera, live.rule, settings) for view in sample)
             growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
-            self.capacities[size] = capacity_for(int(pairs * GROWTH_ROOM * growth))
+            self.capacities[size] = _shared_capacity(size, capacity_for(int(pairs * GROWTH_ROOM * growth)))
         return dataclasses.replace(settings, capacity=self.capacities[size])
+
+
+_compiled_capacities: dict[tuple[int, int], set[int]] = {}
+"""Capacities that steps of this process have been compiled for, by image size; no result depends on them."""
+
+
+def _shared_capacity(size: tuple[int, int], needed: int) -> int:
+    """The least capacity that suffices and is compiled already, where it is not twice as large; else a new one."""
+    known = _compiled_capacities.setdefault(size, set())
+    capacity = min((room for room in known if needed <= room <= 2 * needed), default=needed)
+    known.add(capacity)
+    return capacity
 
 
 def _check_resume(resume: Checkpoint, system: System, index: int) -> None:

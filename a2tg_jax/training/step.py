@@ -155,6 +155,7 @@ def _gradients(how: StepSettings, stage: Stage, clock: Clock, state: TrainState,
             output, num_pairs = render_traced(
                 gaussians, target.camera, shown.rule, background, how.render,
                 has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, tap=tap,
+                statistic=stage.statistic,
             )  # fmt: skip
             value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
             error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)

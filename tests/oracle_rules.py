@@ -1,0 +1,59 @@
+"""What splats show by rules other than textures, for the oracle: float64 numpy, no code shared with the package.
+
+Each rule is a function of (scene, parameters, index) that gives the `Hits` and the `Shown` of one splat.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from oracle import (
+    DEFAULT_RULES,
+    MIN_ALPHA,
+    Float,
+    Hits,
+    Image,
+    Layer,
+    Rules,
+    Scene,
+    Shown,
+    composite,
+    homography,
+    intersect,
+    shown_layer,
+    view_direction,
+)
+
+Show = Callable[[Scene, Any, int], tuple[Hits, Shown]]
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-np.asarray(x)))
+
+
+def hits_of(scene: Scene, i: int, has_low_pass: bool = True) -> Hits:
+    """Where the rays meet splat `i`."""
+    return intersect(*homography(scene, i), scene.width, scene.height, DEFAULT_RULES.near, has_low_pass)
+
+
+def layers_of(scene: Scene, params: Any, show: Show, rules: Rules = DEFAULT_RULES) -> list[Layer]:
+    """The layers of all splats."""
+    return [shown_layer(scene, i, rules, *show(scene, params, i)) for i in range(len(scene.means))]
+
+
+def render_rule(scene: Scene, params: Any, show: Show, rules: Rules = DEFAULT_RULES) -> Image:
+    """The image of splats that show what a rule says."""
+    return composite(layers_of(scene, params, show, rules), scene.background)
+
+
+def glossy(scene: Scene, params: dict[str, Float], i: int, has_low_pass: bool = True) -> tuple[Hits, Shown]:
+    """A highlight about an axis, and the falloff (1 + ρ/2k)^(−k)."""
+    hits = hits_of(scene, i, has_low_pass)
+    axis = params["axes"][i] / np.linalg.norm(params["axes"][i])
+    highlight = params["colors"][i] * np.exp(3 * (view_direction(scene, i) @ axis - 1))
+    exponent, opacity = np.exp(params["log_exponents"][i]), sigmoid(scene.logit_opacities[i])
+    falloff = lambda rho: (1 + rho / (2 * exponent)) ** -exponent  # noqa: E731
+    ones = np.ones_like(hits.u)
+    residual = np.stack([highlight[0] * ones, highlight[1] * hits.u, highlight[2] * hits.v * hits.v], axis=-1)
+    is_relevant = opacity * falloff(hits.closest_rho) >= 0.99 * MIN_ALPHA
+    return hits, Shown(opacity * falloff(hits.rho), residual, np.inf, np.inf, is_relevant)
