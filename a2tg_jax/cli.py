@@ -148,7 +148,8 @@ class Train:
         changed = changed_numbers(asked, kept)
         if changed:
             flags = ", ".join("--" + name.replace("_", "-") for name in changed)
-            raise ValueError(f"--resume takes every number from {run.record}, which says otherwise; leave out {flags}")
+            advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
+            raise ValueError(f"--resume takes every number from {run.record}; {advice}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         if compare != kept.compare:
             more = dataclasses.replace(kept, compare=compare)
