@@ -345,6 +345,7 @@ def test_render(tiny_run, tmp_path, monkeypatch, capsys):
     assert np.asarray(Image.open(frames[0])).std() > 1
     assert cli.main(["render", str(run.path), "--path", "test", "--out", str(tmp_path / "test")]) == 0
     assert len(list((tmp_path / "test").glob("*.png"))) == len(list(run.test.glob("*.png")))
+    capsys.readouterr()
     assert "the run has the models a2tg-gaussians, " in fails(capsys, "render", run.path, "--model", "stage2")
 
 
