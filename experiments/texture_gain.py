@@ -1,7 +1,8 @@
 """What textures bring at equal Gaussians and equal training: a second stage with textures against one without.
 
-Trains the first stage once per scene, number of Gaussians and seed, then both second stages from its result, and appends one JSON
-line a run to the output: PSNR, SSIM and LPIPS on test and train views after each stage, seconds and memory.
+Trains the first stage once per scene, number of Gaussians and seed, then both second stages from its result, and
+appends one JSON line a run to the output: PSNR, SSIM and LPIPS on test and train views after each stage, seconds and
+memory.
 
     python experiments/texture_gain.py SCENES/fox SCENES/snowmiku --gaussians 3000 7000 --seeds 0 1 --out gain.jsonl
 """

@@ -65,7 +65,7 @@ def evaluate_run(
     _write_curves(run, plan, list(models))
     if isinstance(main.appearance, Textured):
         _write_texture_figures(run, main, plan[result.main].system, scene)
-    save_ply(run.own(run.point_cloud), main.gaussians, transform=scene.transform)
+    save_ply(run.own(run.point_cloud), main)
     _write_pictures(run, result, scene.test or scene.train, main.background)
     return result
 
