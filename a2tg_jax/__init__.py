@@ -15,6 +15,7 @@ from a2tg_jax.appearance import TexturedRule as TexturedRule
 from a2tg_jax.appearance import TextureOptions as TextureOptions
 from a2tg_jax.cameras import Camera as Camera
 from a2tg_jax.cameras import resize_camera as resize_camera
+from a2tg_jax.cores import set_num_threads as set_num_threads
 from a2tg_jax.data import Scene as Scene
 from a2tg_jax.data import View as View
 from a2tg_jax.data import load_scene as load_scene

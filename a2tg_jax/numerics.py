@@ -19,7 +19,7 @@ def safe_divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> 
 
 def safe_sqrt(x: Array) -> Array:
     """sqrt(max(x, 0)), with zero gradient where x <= 0."""
-    is_positive = x > 0
+    is_positive = ~(x <= 0)  # NaN stays NaN
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 

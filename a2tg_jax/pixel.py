@@ -150,8 +150,9 @@ def show(
     rho = rho if rho_tap is None else rho + rho_tap
     a = splat.opacity * rule.falloff(splat.numbers, rho)
     a = a if factor is None else a * factor
-    is_shown = a >= MIN_ALPHA if rule.has_low_pass else (a >= MIN_ALPHA) & hit.is_ray
-    alpha = jnp.where(is_shown, jnp.where(a < rule.max_alpha, a, rule.max_alpha), 0.0)
+    # What is not a number stays so, here and in `absorb`: it must not vanish.
+    is_hidden = a < MIN_ALPHA if rule.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
+    alpha = jnp.where(is_hidden, 0.0, jnp.where(a >= rule.max_alpha, rule.max_alpha, a))
     channels: tuple[Array, ...] = splat.color
     if residual is not None:
         channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
@@ -163,7 +164,7 @@ def show(
 def absorb(alpha: Array, light: Array, is_live: Array) -> Triple:
     """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
     leave less than 10⁻⁴."""
-    is_live = is_live & (light * (1 - alpha) >= MIN_TRANSMITTANCE)
+    is_live = is_live & ~(light * (1 - alpha) < MIN_TRANSMITTANCE)
     weight = jnp.where(is_live, alpha * light, 0.0)
     return weight, light - weight, is_live
 

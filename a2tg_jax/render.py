@@ -21,7 +21,7 @@ from a2tg_jax.compositor import Compositing, Splats, composite
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
-from a2tg_jax.kernels.choice import choose
+from a2tg_jax.kernels.choice import choose, instead_of_native
 from a2tg_jax.pixel import Statistic
 from a2tg_jax.sh import sh_colors
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
@@ -46,7 +46,8 @@ class RenderSettings:
     capacity: int | None = None
     """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
     compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
-    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had."""
+    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had, and
+    XLA, with a warning, where an appearance rule uses what native loops cannot do."""
     tile_batch: int | None = None
     """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
 
@@ -94,6 +95,10 @@ def render_image(
       textures, layout: their textures; neither, and the splats are plain 2DGS.
       background: [3] colour behind everything.
       settings: static choices. An eager call, also under `jax.grad`, needs no capacity and never overflows.
+
+    Returns:
+      What the view shows. Where a splat would show, but a number of it is not finite (mean, rotation, scales, opacity
+      or colour), all of the picture is NaN, and so are the gradients; a texel that is NaN is seen where it shows.
 
     Raises:
       ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, or if the layout
@@ -179,12 +184,20 @@ def render_traced(
         return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings, degree, num_live)
+    if compositor == "native" and (reason := native.refusal(how, rule, splats)):
+        settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
+        return render_traced(
+            gaussians, camera, rule, background, settings,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, tap=tap, statistic=statistic,
+        )  # fmt: skip
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
     M = jax.lax.stop_gradient(splats.M)
     lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
     channels, transmittance = composite(how, splats, rule, cutoff, lists, jacobian, tap)
+    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
+    channels, transmittance = channels + taint, transmittance + taint
     return _output(how, channels, transmittance, background, lists.overflow), lists.num_pairs
 
 
@@ -312,7 +325,8 @@ def _tile_batch(settings: RenderSettings) -> int:
 
 
 def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
-    """The N splats, and [N] the squared distance within which each shows; not positive where it shows nowhere."""
+    """The N splats, and [N] the squared distance within which each shows: not positive where it shows nowhere, NaN
+    where it would show, but a number of it is not finite."""
     M, normals = homographies(gaussians, camera)
     opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
     if opacities.shape != (gaussians.num,) or numbers.shape[:-1] != (gaussians.num,):
@@ -322,11 +336,22 @@ def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) ->
         )
     if not 0 < rule.max_alpha < 1:
         raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
-    is_drawn = jax.lax.stop_gradient(M[:, 2, 2] >= settings.near_plane)
+    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
+    # Not >=: a depth that is no number is not behind the camera.
+    is_drawn = ~(M[:, 2, 2] < settings.near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num) < num_live
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
-    # Rows that are drawn nowhere may hold anything; a finite stand-in keeps 0 · inf out of the gradients.
-    M = jnp.where(is_drawn[:, None, None], M, jnp.eye(3, dtype=M.dtype)[None])
-    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
+    is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
+    cutoff = jnp.where(is_broken, jnp.nan, cutoff)
+    is_shown = (cutoff > 0)[:, None]
+    # Rows that show nowhere may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
+    M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
+    colors, normals, numbers = (jnp.where(is_shown, x, 0.0) for x in (colors, normals, numbers))
     return Splats(M, colors, opacities, normals, numbers), cutoff
+
+
+def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:
+    """[N] whether all numbers of a splat are."""
+    columns = [*(M[:, i, k] for i in range(3) for k in range(3)), *colors.T, *numbers.T]
+    return functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))

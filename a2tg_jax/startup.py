@@ -7,13 +7,17 @@ from pathlib import Path
 
 import jax
 
-CHECKED_JAX_VERSIONS = ((0, 10), (0, 11))
+from a2tg_jax import cores
+
+CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
 """Versions known to have the flags below; an unknown flag would end the process."""
+QUIET_CACHE_VERSION = (0, 12)
+"""The first version that reads programs from a cache without alarming lines."""
 WHOLE_LOOPS_FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 
 
-def configure_cpu(*, use_cache: bool = True) -> None:
+def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> None:
     """Makes JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
     Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS, of which the user's own settings have
@@ -23,13 +27,23 @@ def configure_cpu(*, use_cache: bool = True) -> None:
 
     Args:
       use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
-        unless JAX has a cache already or reading one would be too noisy (`is_cache_quiet`).
+        unless JAX has a cache already. Where XLA would print pages for every program it reads, its log is reduced to
+        fatal errors (`silence_xla`).
+      num_threads: of native loops (`set_num_threads`); None leaves what is set.
+
+    Raises:
+      ValueError: if the number of threads, here or in the environment, is not a positive integer.
     """
+    if num_threads is not None:
+        cores.set_num_threads(num_threads)
+    cores.num_threads()
     features = _processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
-    if use_cache and is_cache_quiet(features) and jax.config.values["jax_compilation_cache_dir"] is None:
+    if use_cache and jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(compilation_cache_folder()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        if "avx512f" in features and jax.__version_info__ < QUIET_CACHE_VERSION:
+            silence_xla()
 
 
 def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[str, ...]:
@@ -39,13 +53,18 @@ def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[s
     return (WHOLE_LOOPS_FLAG, WIDE_VECTORS_FLAG) if "avx512f" in features else (WHOLE_LOOPS_FLAG,)
 
 
-def is_cache_quiet(features: frozenset[str]) -> bool:
-    """Whether programs are read from a cache without a page of alarming lines for each.
+def silence_xla() -> None:
+    """Lets XLA's C++ code log fatal errors only; what it raises is not affected, nor what JAX itself logs.
 
-    With AVX-512, XLA finds two tuning hints of its own missing from the processor's features and says at length that it
-    may crash; it does not (openxla/xla#44565). Only TF_CPP_MIN_LOG_LEVEL=3, set before JAX is imported, silences that.
+    With AVX-512, XLA finds two tuning hints of its own missing from the processor's features whenever it reads a
+    program from a cache, and says at length that it may crash; it does not (openxla/xla#44565). A user who has asked
+    for XLA's log, by jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, gets it all.
     """
-    return "avx512f" not in features or os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "3"
+    asked = jax.config.values["jax_logging_level"]
+    if asked in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "0":
+        # The first sets the level of XLA and of JAX, the second takes back only that of JAX.
+        jax.config.update("jax_logging_level", "CRITICAL")
+        jax.config.update("jax_logging_level", asked)
 
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:

@@ -32,7 +32,7 @@ def measure_limit(case: dict) -> dict:
     writer.b.store(at.constant(0.0, writer.real), total)
     x, y = (writer.load(writer.arguments["data"], k, reals) for k in range(2))
     with writer.loop(LONG(0), writer.long(writer.arguments["num"])) as (k, _):
-        moved = writer.b.fadd(x, at.splat(writer.b.sitofp(k, writer.real)))
+        moved = writer.b.fadd(x, at.broadcast(writer.b.sitofp(k, writer.real)))
         (result,) = at.emit(traced, [moved, y])
         writer.b.store(writer.b.fadd(result, writer.b.load(total, typ=reals)), total)
     writer.store(writer.b.load(total, typ=reals), writer.arguments["data"], 0)

@@ -93,8 +93,7 @@ def training_section(args: argparse.Namespace) -> list[dict]:
     for downscale, num in ((4, 10_000), (2, 10_000), (2, 19_179), (1, 19_179)):
         case = {"case": "training", "scene": str(args.scene.resolve()), "downscale": downscale, "num": num}
         with tempfile.TemporaryDirectory() as folder:
-            # The second one is for processors with AVX-512, where the cache would be too noisy to be used otherwise.
-            environment = {"XDG_CACHE_HOME": folder, "TF_CPP_MIN_LOG_LEVEL": "3"}
+            environment = {"XDG_CACHE_HOME": folder}
             for cache in ("cold", "warm"):
                 one = {**case, "iterations": [200, 200], "cache": cache}
                 found.append(measure(one, environment=environment))

@@ -152,6 +152,7 @@ def test_flags_fit_the_processor_and_the_version():
     avx512 = frozenset({"avx512f"})
     assert startup.cpu_flags(avx512, (0, 10)) == (startup.WHOLE_LOOPS_FLAG, startup.WIDE_VECTORS_FLAG)
     assert startup.cpu_flags(frozenset(), (0, 10)) == (startup.WHOLE_LOOPS_FLAG,)
+    assert startup.cpu_flags(avx512, (0, 12)) == startup.cpu_flags(avx512, (0, 10))
     assert startup.cpu_flags(avx512, (9, 9)) == ()
 
 
@@ -160,6 +161,42 @@ def test_xla_accepts_the_flags():
     script = "from a2tg_jax.startup import configure_cpu; configure_cpu(); import jax; jax.numpy.ones(3).sum()"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+CACHED = """
+import logging, jax
+from a2tg_jax import startup
+before = jax.config.values["jax_logging_level"], logging.getLogger("jax").level
+startup.configure_cpu()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.jit(lambda x: jax.numpy.sort(x) @ x)(jax.numpy.ones((9, 9))).block_until_ready()
+assert (jax.config.values["jax_logging_level"], logging.getLogger("jax").level) == before
+print("kept" if jax.config.values["jax_compilation_cache_dir"] else "no cache")
+"""
+
+
+def test_programs_are_kept_and_read_again_in_silence(tmp_path):
+    """In a program that has imported JAX already, on any processor."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "XLA_FLAGS": ""}
+    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)
+    counts = []
+    for _ in range(2):
+        command = [sys.executable, "-c", CACHED]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        assert (done.stdout, done.stderr) == ("kept\n", "")
+        counts.append(len([path for path in tmp_path.rglob("*") if path.name.endswith("-cache")]))
+    assert counts[0] == counts[1] > 0
+
+
+def test_a_user_who_asks_for_the_log_gets_it(monkeypatch):
+    asked = []
+    monkeypatch.setattr(startup.jax.config, "update", lambda *given: asked.append(given))
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+    startup.silence_xla()
+    assert not asked
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
+    startup.silence_xla()
+    assert asked == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
 
 
 # A whole run

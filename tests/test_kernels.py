@@ -1,4 +1,4 @@
-"""The native loops apart from the images they make: translation, threads, lists, errors, other rules and fallback."""
+"""The native loops apart from the images they make: threads, lists, errors, other rules and fallback."""
 
 import dataclasses
 import itertools
@@ -9,78 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from llvmlite import ir
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import AppearanceRule, PlainRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.geometry import homographies
-from a2tg_jax.kernels import foreign, lanes, library, native, threads
-from a2tg_jax.kernels.writer import LONG, Writer
+from a2tg_jax.kernels import native, threads
 from a2tg_jax.render import appearance_of, render_traced
 from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
-
-FUNCTIONS = {
-    "arithmetic": lambda x, y: (x + y) * (x - y) / (2 + y * y),
-    "exp": lambda x, y: jnp.exp(x * 10) + jnp.exp(-y),
-    "log and sqrt": lambda x, y: jnp.log(1 + x * x) + jnp.sqrt(y * y),
-    "powers": lambda x, y: x**3 + jnp.square(y) + (2 + x) ** -2,
-    "floor": lambda x, y: jnp.floor(3 * x) + jnp.floor(y).astype(jnp.int32).astype(y.dtype),
-    "choices": lambda x, y: jnp.where((x < y) & ~(x < 0), x, -y) + jnp.where((x != y) | (y > 0), 1.0, 2.0),
-    "limits": lambda x, y: jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y) + jnp.minimum(x, 0.2) + abs(y) + jnp.sign(x),
-    "integers": lambda x, y: (jnp.maximum((x * 9).astype(jnp.int32) * 3 - 1, -2)).astype(x.dtype) + y,
-    "gradient": lambda x, y: jax.grad(lambda x: jnp.clip(x, -0.5, 0.5) * jnp.exp(x) / (1.5 + y))(x),
-}
-
-
-class Elementwise(Writer):
-    """A loop that applies a function of two numbers to arrays."""
-
-    def __init__(self, function, dtype: str, width: int, name: str):
-        self.module = ir.Module(name)
-        super().__init__(self.module, name, ("x", "y", "out"), ("num",), dtype)
-        number = jax.ShapeDtypeStruct((), dtype)
-        traced, _ = lanes.trace(function, number, number)
-        at = lanes.Lanes(self.b, width)
-        with self.loop(LONG(0), self.long(self.arguments["num"])) as (k, _):
-            inputs = [self.load(self.arguments[name], k, at.vector(self.real)) for name in "xy"]
-            self.store(at.emit(traced, inputs)[0], self.arguments["out"], k)
-        self.b.ret_void()
-
-
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("width", [1, 4, 8])
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("float64", 1e-13)])
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_translated_functions_are_those_of_jax(name, dtype, tolerance, width):
-    x, y = np.random.default_rng(0).normal(size=(2, 64)).astype(dtype)
-    x[:4], y[:4] = [0, 0.5, -0.5, 0.25], [0, 0.5, 1, 0.25]
-    tag = f"{name}_{dtype}_{width}".replace(" ", "_")
-    addresses = library.compile_module(Elementwise(FUNCTIONS[name], dtype, width, tag).module)
-    out = np.empty_like(x)
-    run = library.as_function(addresses[tag], 3, 1)
-    run(*(array.ctypes.data for array in (x, y, out)), len(x) // width)
-    expected = jax.vmap(FUNCTIONS[name])(jnp.asarray(x), jnp.asarray(y))
-    np.testing.assert_allclose(out, expected, rtol=tolerance, atol=tolerance)
-
-
-def test_what_cannot_be_translated_is_named():
-    builder = Elementwise(lambda x, y: x, "float32", 1, "refused")
-    traced, _ = lanes.trace(jnp.tan, jax.ShapeDtypeStruct((), jnp.float32))
-    with pytest.raises(NotImplementedError, match="'tan'"):
-        lanes.Lanes(builder.b, 1).emit(traced, [lanes.Lanes(builder.b, 1).constant(1.0, builder.real)])
-
-
-def test_an_error_in_a_handler_reaches_the_caller(capsys):
-    def handler(arguments, results):
-        raise ValueError(f"refused {arguments[0].tolist()}")
-
-    name = foreign.registered("test error", None, lambda: handler)
-    x = jnp.arange(3, dtype=jnp.float32)
-    with pytest.raises(Exception, match=r"refused \[0\.0, 1\.0, 2\.0\]"):
-        jax.block_until_ready(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))(x))
-    assert "ValueError: refused" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("x64")
@@ -181,6 +118,26 @@ def test_any_appearance_rule_is_compiled():
     np.testing.assert_allclose(image, expected, atol=1e-10)
     for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class UntranslatableRule(PlainRule):
+    def falloff(self, numbers, rho):
+        return jnp.exp(-0.5 * rho) + 0 * jax.lax.digamma(1 + rho)
+
+
+def test_a_rule_without_translation_is_left_to_xla():
+    """With "auto", with one warning that names the primitive; with "native" it is an error."""
+    scene = draw_scene(9, num=8, width=16, height=16)
+    gaussians, camera, rule = as_gaussians(scene, "float32"), as_camera(scene, "float32"), UntranslatableRule()
+    show = lambda **settings: render_appearance(gaussians, camera, rule, settings=RenderSettings(**settings)).color  # noqa: E731
+    with pytest.warns(UserWarning, match=r"UntranslatableRule is composited by XLA.*'digamma'"):
+        found = show()
+    show(near_plane=0.3)
+    np.testing.assert_array_equal(found, show(compositor="xla"))
+    with pytest.raises(ValueError, match=r"compositor='native' cannot run UntranslatableRule.*'digamma'"):
+        show(compositor="native")
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,23 @@ def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -
     return "pallas" if is_power_of_two and has_pallas() else "xla"
 
 
+def instead_of_native(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
+    """The compositor for a rule that native loops cannot run: XLA, with one warning per rule.
+
+    Raises:
+      ValueError: if native loops were asked for.
+    """
+    if wanted != "auto":
+        raise ValueError(f"compositor='native' cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
+    _warn_of_fallback(rule, reason)
+    return "xla"
+
+
+@functools.cache
+def _warn_of_fallback(rule: type, reason: str) -> None:
+    warnings.warn(f"{rule.__name__} is composited by XLA, which is slower: {reason}", stacklevel=2)
+
+
 @functools.cache
 def has_native() -> bool:
     """Whether native loops can be made here: XLA runs on the CPU, and llvmlite is installed."""

@@ -1,10 +1,12 @@
 """Functions on numpy arrays that XLA calls on the CPU, through its foreign function interface (xla/ffi/api/c_api.h)."""
 
+import contextlib
 import ctypes
 import hashlib
-import sys
+import signal
 import threading
-from collections.abc import Callable, Hashable
+import traceback
+from collections.abc import Callable, Hashable, Iterator
 
 import jax
 import numpy as np
@@ -95,37 +97,81 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
         while name in _entries and _entries[name][0] != key:
             name += "_"
         if name not in _entries:
-            handler = make_handler()
-            entry = _Entry(lambda frame: _enter(frame.contents, handler))
+            entry = _Entry(_entry(make_handler()))
             _entries[name] = key, entry
             address = ctypes.cast(entry, ctypes.c_void_p).value
             jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
     return name
 
 
-def _capsule(address: int | None):
+def _capsule(address: int | None, destructor: int | None = None):
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (_pointer, ctypes.c_char_p, _pointer)
-    return new(address, None, None)
+    return new(address, None, destructor)
 
 
-def _enter(frame: _CallFrame, handler: Handler) -> int | None:
-    """One call by XLA: None where it went well, else the address of an error."""
+def _entry(handler: Handler) -> Callable[..., int | None]:
+    """What XLA calls: it returns None where all went well, else the address of an error.
+
+    Nothing may be raised through C: it would be lost, and what the results happened to hold would count as computed.
+    """
+
+    def enter(frame) -> int | None:
+        interrupts: list[int] = []
+        dropped_last = []
+        try:
+            with _interrupts_noted(interrupts):
+                _call(frame.contents, handler)
+            if interrupts:
+                dropped_last.append(_interrupt_once_dropped())
+        except BaseException as error:
+            if interrupts or isinstance(error, KeyboardInterrupt):
+                dropped_last.append(_interrupt_once_dropped())
+            failure = _failure(frame.contents, error)
+            error.with_traceback(None)  # it would keep the variables of this function
+            return failure
+        return None
+
+    return enter
+
+
+@contextlib.contextmanager
+def _interrupts_noted(interrupts: list[int]) -> Iterator[None]:
+    """Ctrl-C does not stop what runs here on the main thread, the only one that signals reach; it is appended."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.get_ident() != threading.main_thread().ident or not callable(before):
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupt_once_dropped():
+    """An object whose end is a Ctrl-C, which the main thread meets in Python's next step: with the last reference in
+    the variables of a function that XLA calls, only when that has returned."""
+    interrupt = ctypes.cast(ctypes.pythonapi.PyErr_SetInterrupt, _pointer).value
+    return _capsule(interrupt, interrupt)
+
+
+def _call(frame: _CallFrame, handler: Handler) -> None:
     extension = frame.extension
     if extension and extension.contents.kind == METADATA_EXTENSION:
         version, own = extension.contents.metadata.contents.version, frame.api.contents.version
         version.major, version.minor = own.major, own.minor
-        return None
-    if frame.stage != EXECUTE_STAGE:
-        return None
-    try:
+    elif frame.stage == EXECUTE_STAGE:
         handler(_arrays(frame.arguments), _arrays(frame.results))
-    except BaseException as error:  # nothing may pass through C: XLA is told instead
-        sys.excepthook(type(error), error, error.__traceback__)
-        message = f"{type(error).__name__}: {error}".encode()
-        arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
-        return frame.api.contents.create_error(ctypes.byref(arguments))
-    return None
+
+
+def _failure(frame: _CallFrame, error: BaseException) -> int:
+    """XLA's error that says what was raised, and where."""
+    what = "".join(traceback.format_exception_only(error))
+    where = "".join(traceback.format_tb(error.__traceback__)[2:])
+    message = f"{what}raised, most recent call last, at\n{where}".encode(errors="replace")
+    arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
+    return frame.api.contents.create_error(ctypes.byref(arguments))
 
 
 def _arrays(buffers: _Buffers) -> list[np.ndarray]:

@@ -93,7 +93,7 @@ class Functions:
             if kind.statistic:
                 moved = splat.M, x, y, *center, d.rho, jacobian
                 tap = pixel.positional_gradient(kind.statistic, *moved, near_plane, rule.has_low_pass)
-            return state, weight > 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, tap)
+            return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, tap)
 
         at_pixel = number, number, number, flag
         channels = (number,) * kind.num_channels

@@ -8,6 +8,8 @@ import threading
 import llvmlite.binding as llvm
 from llvmlite import ir
 
+from a2tg_jax.kernels import dump
+
 _LOCK = threading.Lock()
 
 
@@ -47,16 +49,24 @@ def compile_module(module: ir.Module) -> dict[str, int]:
     with _LOCK:
         module.triple = llvm.get_default_triple()
         module.data_layout = str(_machine().target_data)
+        names = [function.name for function in module.functions if _is_exported(function)]
         parsed = llvm.parse_assembly(str(module))
         parsed.verify()
+        dump.write(names[0], "ll", str(parsed))
         options = llvm.create_pipeline_tuning_options(speed_level=3)
         options.slp_vectorization = False
         builder = llvm.create_pass_builder(_machine(), options)
         builder.getModulePassManager().run(parsed, builder)
+        if dump.is_wanted():
+            dump.write(names[0], "optimised.ll", str(parsed))
+            dump.write(names[0], "s", _machine().emit_assembly(parsed))
         _engine().add_module(parsed)
         _engine().finalize_object()
-        names = [function.name for function in module.functions if not function.is_declaration]
         return {name: _engine().get_function_address(name) for name in names}
+
+
+def _is_exported(function: ir.Function) -> bool:
+    return not function.is_declaration and function.linkage != "internal"
 
 
 def as_function(address: int, num_pointers: int, num_integers: int):

@@ -5,11 +5,14 @@ then applied to the tile's pixels, L at a time (vector code). Where no pixel of 
 over.
 
     forward(ids, starts, splats, images, table, result; first, last, columns, width, height)
-    backward(ids, starts, splats, images, table, g, behind, jacobian, d_splats, d_table, d_tap; the same)
+    backward(ids, starts, splats, images, table, g, behind, jacobian, d_splats, d_table, d_tap,
+             places, more_splats, more_table, more_tap, more_first; the same)
 
 Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), images [N, 3], table [entries, C],
 result [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], behind [tiles, P], jacobian [3, 3];
-d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to.
+d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to. A pair whose number in `places` [pairs] is k, not
+−1, adds to row k of more_splats, more_tap and, from entry more_first[k], of more_table instead: its splat's own rows
+are another thread's.
 """
 
 import dataclasses
@@ -28,7 +31,10 @@ from a2tg_jax.kernels.writer import LONG
 
 INTEGERS = ("first", "last", "columns", "width", "height")
 FORWARD = ("ids", "starts", "splats", "images", "table", "result")
-BACKWARD = ("ids", "starts", "splats", "images", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap")
+BACKWARD = (
+    *("ids", "starts", "splats", "images", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap"),
+    *("places", "more_splats", "more_table", "more_tap", "more_first"),
+)
 CUTOFF_SLACK = 1e-3
 """Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
 
@@ -58,6 +64,14 @@ class _LoadedSplat(NamedTuple):
     spread_image: list[ir.Value]
     limit: ir.Value
     """Squared distance within which a pixel is looked at."""
+
+
+class _Rows(NamedTuple):
+    """The addresses to which the cotangents of a splat are added."""
+
+    splat: ir.Value
+    tap: ir.Value
+    image: NativeImage | None
 
 
 class _Compositing(TexelWriter):
@@ -100,11 +114,11 @@ class _Compositing(TexelWriter):
         b.ret_void()
 
     def all_splats(self, tile: ir.Value, each_splat) -> None:
-        """Calls each_splat(id) for the tile's list, front to back, until it returns that no pixel is live."""
+        """Calls each_splat(id, position) for a tile's list, front to back, until it returns that no pixel is live."""
         starts, b = self.arguments["starts"], self.b
         first, last = (self.long(self.load(starts, b.add(tile, LONG(k)), INT)) for k in (0, 1))
         with self.loop(first, last) as (position, done):
-            is_live = each_splat(self.long(self.load(self.arguments["ids"], position, INT)))
+            is_live = each_splat(self.long(self.load(self.arguments["ids"], position, INT)), position)
             going_on = b.append_basic_block("on")
             b.cbranch(is_live, going_on, done)
             b.position_at_end(going_on)
@@ -116,8 +130,8 @@ class _Compositing(TexelWriter):
         """Which pixels of a vector lie inside the image, as 0 and 1."""
         b, inside = self.b, []
         for table, center, size in ((self.pixel_x, tile_x, "width"), (self.pixel_y, tile_y, "height")):
-            at = b.fadd(self.load(table, index, self.reals), self.lanes.splat(center))
-            limit = self.lanes.splat(b.sitofp(self.arguments[size], self.real))
+            at = b.fadd(self.load(table, index, self.reals), self.lanes.broadcast(center))
+            limit = self.lanes.broadcast(b.sitofp(self.arguments[size], self.real))
             inside.append(b.fcmp_ordered("<", at, limit))
         return b.zext(b.and_(*inside), self.integers)
 
@@ -138,8 +152,8 @@ class _Compositing(TexelWriter):
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
         image = self.image_numbers(id_)
         spread = self.spread(planes), self.spread(numbers)
-        as_longs = NativeImage(*map(self.long, image)) if image else None
-        return _LoadedSplat(numbers, *spread, as_longs, self.spread(image), self.lanes.splat(limit))
+        texels = self.image(self.arguments["table"], *map(self.long, image)) if image else None
+        return _LoadedSplat(numbers, *spread, texels, self.spread(image), self.lanes.broadcast(limit))
 
     def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
         """Calls composite(k, x, y, place, is_live) for every vector k of the tile's pixels that the splat may reach,
@@ -168,7 +182,7 @@ class _Compositing(TexelWriter):
         return [self.load(base, k, INT) for k in range(3)] if self.num_columns else []
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
-        return [self.lanes.splat(number) for number in numbers]
+        return [self.lanes.broadcast(number) for number in numbers]
 
 
 class _Forward(_Compositing):
@@ -187,7 +201,7 @@ class _Forward(_Compositing):
 
         self.all_tiles(tile)
 
-    def splat(self, tile_x, tile_y, channels, id_) -> ir.Value:
+    def splat(self, tile_x, tile_y, channels, id_, _) -> ir.Value:
         """Adds one splat to a tile; returns whether a pixel is still live."""
         splat = self.load_splat(id_, tile_x, tile_y)
 
@@ -237,12 +251,13 @@ class _Backward(_Compositing):
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
                 self.store(self.load(base, self.pixel(k, index), self.real), array, k)
 
-    def splat(self, tile_x, tile_y, behind, g, id_) -> ir.Value:
+    def splat(self, tile_x, tile_y, behind, g, id_, position) -> ir.Value:
         """Adds the cotangents of one splat in a tile; returns whether a pixel is still live."""
         b, lanes, kind = self.b, self.lanes, self.kind
         splat, zero = self.load_splat(id_, tile_x, tile_y), self.lanes.constant(0.0, self.real)
         tile_center = self.spread([tile_x, tile_y])
         jacobian = self.spread([self.load(self.arguments["jacobian"], k, self.real) for k in range(9)])
+        rows = self.rows_of(id_, position, splat.image)
         any_contributes = self.variable(BOOL)
         b.store(BOOL(0), any_contributes)
         num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.statistic else 0)
@@ -267,29 +282,44 @@ class _Backward(_Compositing):
                 b.store(BOOL(1), any_contributes)
                 for total, value in zip(totals, sums, strict=True):
                     b.store(b.fadd(b.load(total, typ=self.reals), chosen(value)), total)
-                if splat.image:
-                    self.add_to_texels(splat.image, place, [chosen(value) for value in d_values])
+                if rows.image:
+                    self.add_to_texels(rows.image, place, [chosen(value) for value in d_values])
 
         is_live = self.reached_vectors(splat, composite)
         with b.if_then(b.load(any_contributes, typ=BOOL)):
-            self.add_totals(id_, splat.numbers, tile_x, tile_y, totals)
-            if splat.image:
-                self.finish_texels(splat.image)
+            self.add_totals(rows, splat.numbers, tile_x, tile_y, totals)
+            if rows.image:
+                self.finish_texels(rows.image)
         return is_live
 
-    def add_totals(self, id_, numbers, tile_x, tile_y, totals) -> None:
+    def rows_of(self, id_: ir.Value, position: ir.Value, image: NativeImage | None) -> _Rows:
+        """Where the cotangents of one pair are added."""
+        b, arguments = self.b, self.arguments
+        place = self.long(self.load(arguments["places"], position, INT))
+        is_own = b.icmp_signed("<", place, LONG(0))
+        row = b.select(is_own, id_, place)
+        splats, table, tap = (
+            b.select(is_own, arguments[f"d_{name}"], arguments[f"more_{name}"]) for name in ("splats", "table", "tap")
+        )
+        if image:
+            own_first = self.long(self.load(arguments["images"], self.times(id_, 3), INT))
+            more_first = self.long(self.load(arguments["more_first"], b.select(is_own, LONG(0), place), INT))
+            image = self.image(table, b.select(is_own, own_first, more_first), image.height, image.width)
+        at_row = functools.partial(self.at, type_=self.real)
+        return _Rows(at_row(splats, self.times(row, self.kind.num_floats)), at_row(tap, self.times(row, 4)), image)
+
+    def add_totals(self, rows, numbers, tile_x, tile_y, totals) -> None:
         """Sums over lanes, carried from the planes to the homography, added to the splat's rows of the results."""
         kind, functions = self.kind, self.functions
         sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
         d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
         d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], tile_x, tile_y, *d_planes])
         num_others = len(numbers) - 9
-        self.add("d_splats", self.times(id_, kind.num_floats), [*d_M, *others[:num_others]])
+        self.add(rows.splat, [*d_M, *others[:num_others]])
         if kind.statistic:
-            self.add("d_tap", self.times(id_, 4), others[num_others:])
+            self.add(rows.tap, others[num_others:])
 
-    def add(self, name: str, start: ir.Value, values: Sequence[ir.Value]) -> None:
-        base = self.at(self.arguments[name], start, self.real)
+    def add(self, base: ir.Value, values: Sequence[ir.Value]) -> None:
         for k, value in enumerate(values):
             self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
 

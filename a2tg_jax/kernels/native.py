@@ -1,7 +1,7 @@
 """Tile lists and compositing by native loops on CPUs: what `tiles` and `compositor` do with XLA, faster, on all cores.
 
-Tiles are dealt to threads in contiguous parts of about as many pairs each. Every thread adds to cotangents of its own,
-which are summed in order: results do not depend on timing, only, in the last bits, on the number of threads.
+Tiles are dealt to threads in contiguous parts of about as many pairs each. Results do not depend on timing, only, in
+the last bits, on the number of threads (`sums`).
 """
 
 import functools
@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance import StaticRule
 from a2tg_jax.geometry import Outline
-from a2tg_jax.kernels import foreign, threads
+from a2tg_jax.kernels import foreign, sums, threads
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists
 
@@ -36,6 +37,23 @@ def _kind(how, rule, splats, table: Array, images):
         has_geometry=how.has_geometry,
         statistic=how.statistic,
     )
+
+
+def refusal(how, rule, splats) -> str | None:
+    """Why there can be no native loops for a rule; None where there are, which are then compiled."""
+    return _refusal(_kind(how, StaticRule.of(rule), splats, rule.table, rule.images))
+
+
+@functools.cache
+def _refusal(kind) -> str | None:
+    from a2tg_jax.kernels.lanes import Untranslatable
+    from a2tg_jax.kernels.loops import loops
+
+    try:
+        loops(kind)
+    except Untranslatable as error:
+        return str(error)
+    return None
 
 
 def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:
@@ -171,19 +189,15 @@ def _backward_handler(run: Callable) -> foreign.Handler:
         *inputs, size, g, behind, jacobian = arguments
         starts = inputs[1]
         parts = _parts(starts)
-        totals = [results, *([np.zeros_like(result) for result in results] for _ in parts[1:])]
-        for result in results:
-            result[...] = 0
+        room = sums.SumsOfParts(inputs[0], starts, inputs[3], results, parts)
         given = [array.ctypes.data for array in (*inputs, g, behind, jacobian)]
 
         def part(first: int, last: int, index: int) -> None:
-            outputs = [total.ctypes.data for total in totals[index]]
+            outputs = [array.ctypes.data for array in room.outputs(index)]
             run(*given, *outputs, first, last, *map(int, size))
 
         threads.run_spans(part, parts)
-        for more in totals[1:]:
-            for result, addend in zip(results, more, strict=True):
-                result += addend
+        room.add_up()
 
     return handler
 

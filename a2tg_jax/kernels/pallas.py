@@ -128,7 +128,7 @@ def _backward_kernel(
         (light, is_live, behind), weight, d = pixel.composite_vjp(
             rule, how.near_plane, *at_pixel, behind, cotangents, how.statistic is not None
         )
-        contributes = weight > 0
+        contributes = weight != 0
         # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
         total = lambda x: jnp.sum(jnp.where(contributes, x, jnp.zeros_like(x)))  # noqa: E731
         d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal, d.numbers))

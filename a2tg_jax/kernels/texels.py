@@ -21,10 +21,12 @@ SMALL_HEIGHT = max(SMALL_WIDTHS)
 
 
 class NativeImage(NamedTuple):
-    """`bilinear.Image` as 64-bit scalars."""
+    """An image in the table, or its cotangents in theirs."""
 
     first: ir.Value
+    """The address of its first texel."""
     height: ir.Value
+    """64 bits, as the width."""
     width: ir.Value
 
 
@@ -49,7 +51,7 @@ class Line(NamedTuple):
 
 
 class TexelWriter(Writer):
-    """A function whose buffers "table" and "d_table" are [entries, C]."""
+    """A function that reads images in a table [entries, C], or adds to their cotangents."""
 
     lanes: Lanes
     reals: ir.Type
@@ -62,6 +64,10 @@ class TexelWriter(Writer):
         """C for every texel of the largest small image."""
         return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
 
+    def image(self, table: ir.Value, first: ir.Value, height: ir.Value, width: ir.Value) -> NativeImage:
+        """The image that begins with an entry of a table."""
+        return NativeImage(self.at(table, self.times(first, self.num_columns), self.real), height, width)
+
     def sample(self, image: NativeImage, place: Place, has_slopes: bool) -> list[ir.Value]:
         """C values; and C slopes along x and C along y, where asked for."""
         count = self.num_columns
@@ -72,8 +78,8 @@ class TexelWriter(Writer):
                 in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
 
                 def add_texel(column: Line, row=row, in_row=in_row, in_row_along_x=in_row_along_x) -> None:
-                    texel = self.texel("table", image, column, row)
-                    numbers = [self.lanes.splat(self.load(texel, k, self.real)) for k in range(count)]
+                    texel = self.texel(image, column, row)
+                    numbers = [self.lanes.broadcast(self.load(texel, k, self.real)) for k in range(count)]
                     self.accumulate(in_row, column.weight, numbers)
                     self.accumulate(in_row_along_x, column.slope, numbers)
 
@@ -93,7 +99,7 @@ class TexelWriter(Writer):
                 def add_texel(column: Line, width=width, row=row, in_row=in_row) -> None:
                     addends = [self.product(column.weight, d_value) for d_value in in_row]
                     if width is None:
-                        self.add_sums(self.texel("d_table", image, column, row), addends)
+                        self.add_sums(self.texel(image, column, row), addends)
                         return
                     texel = self.b.add(self.times(row.index, width), column.index)
                     for k, addend in enumerate(addends):
@@ -111,7 +117,7 @@ class TexelWriter(Writer):
             addends = [self.load(base, k, self.reals) for k in range(self.num_columns)]
             for k in range(self.num_columns):
                 self.store(zero, base, k)
-            self.add_sums(self.entry("d_table", b.add(image.first, place)), addends)
+            self.add_sums(self.entry(image, place), addends)
 
     def small_width(self, image: NativeImage) -> ir.Value:
         """The width of a small image; 0 for a large one."""
@@ -164,7 +170,7 @@ class TexelWriter(Writer):
         """The first texel along an axis that a reached lane sees, and the one after the last; and the places, those of
         other lanes moved between the reached ones."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
-        most = self.lanes.splat(b.sitofp(b.sub(size, LONG(1)), self.real))
+        most = self.lanes.broadcast(b.sitofp(b.sub(size, LONG(1)), self.real))
         # Whatever a lane holds, even if it is no number, nothing outside of the image is read.
         places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
         places = b.select(b.fcmp_ordered("<", places, most), places, most)
@@ -172,31 +178,32 @@ class TexelWriter(Writer):
         largest = self.lanes.largest(b.select(is_reached, places, number(0.0)))
         end = b.add(b.fptosi(largest, LONG), LONG(2))
         end = b.select(b.icmp_signed("<", end, size), end, size)
-        moved = self.lanes.smaller(self.lanes.larger(places, self.lanes.splat(least)), self.lanes.splat(largest))
+        moved = self.lanes.smaller(
+            self.lanes.larger(places, self.lanes.broadcast(least)), self.lanes.broadcast(largest)
+        )
         return (b.fptosi(least, LONG), end), moved
 
     def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
         """One of `size` texels along an axis, seen from `places`."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
-        distance = b.fsub(places, self.lanes.splat(b.sitofp(index, self.real)))
+        distance = b.fsub(places, self.lanes.broadcast(b.sitofp(index, self.real)))
         weight = self.lanes.larger(b.fsub(number(1.0), self.lanes.intrinsic("fabs", [distance])), number(0.0))
         if not has_slope:
             return Line(index, weight, None)
         # The last texel goes on: nothing changes beyond it.
         is_last = b.icmp_signed("==", index, b.sub(size, LONG(1)))
-        falling = self.lanes.splat(b.select(is_last, self.real(0.0), self.real(-1.0)))
+        falling = self.lanes.broadcast(b.select(is_last, self.real(0.0), self.real(-1.0)))
         slope = b.select(b.fcmp_ordered("<", distance, number(0.0)), number(1.0), falling)
         is_in_cell = b.fcmp_ordered("<", distance, number(1.0)), b.fcmp_ordered(">=", distance, number(-1.0))
         return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
 
-    def texel(self, name: str, image: NativeImage, column: Line, row: Line) -> ir.Value:
+    def texel(self, image: NativeImage, column: Line, row: Line) -> ir.Value:
         """The address of a texel."""
-        place = self.b.add(self.b.mul(row.index, image.width), column.index)
-        return self.entry(name, self.b.add(image.first, place))
+        return self.entry(image, self.b.add(self.b.mul(row.index, image.width), column.index))
 
-    def entry(self, name: str, index: ir.Value) -> ir.Value:
-        """The address of an entry of the table, or of its cotangents."""
-        return self.at(self.arguments[name], self.times(index, self.num_columns), self.real)
+    def entry(self, image: NativeImage, index: ir.Value) -> ir.Value:
+        """The address of a texel, counted row by row."""
+        return self.at(image.first, self.times(index, self.num_columns), self.real)
 
     def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
         """Adds the sums over lanes of C vectors to an entry."""

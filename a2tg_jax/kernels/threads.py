@@ -1,20 +1,14 @@
-"""The threads that native loops run on: as many as the process has cores, made at the first need."""
+"""The threads that native loops run on, made at the first need."""
 
 import concurrent.futures
 import functools
 import itertools
-import os
 from collections.abc import Callable, Sequence
+
+from a2tg_jax.cores import num_threads
 
 Span = tuple[int, int]
 """First item, and the one after the last."""
-
-
-def num_threads() -> int:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def even_spans(num: int, least_items: int) -> list[Span]:
@@ -28,7 +22,7 @@ def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> N
     others: list[concurrent.futures.Future] = []
     try:
         for index, span in enumerate(spans[1:], start=1):
-            others.append(_pool().submit(work, *span, index))
+            others.append(_pool(num_threads()).submit(work, *span, index))
         work(*spans[0], 0)
     finally:
         # Whatever happens, nobody may write to XLA's buffers once they are given back.
@@ -38,5 +32,5 @@ def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> N
 
 
 @functools.cache
-def _pool() -> concurrent.futures.ThreadPoolExecutor:
-    return concurrent.futures.ThreadPoolExecutor(num_threads(), thread_name_prefix="a2tg")
+def _pool(size: int) -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(size, thread_name_prefix="a2tg")

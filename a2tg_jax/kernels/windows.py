@@ -186,7 +186,7 @@ class _ScoreRows(_Rows):
             with self.vectors(self.across) as (start, num_done):
                 windows = [self.weighed(self.along(mean, start, LONG(1)), self.how.taps) for mean in means]
                 value, *slopes = self.lanes.emit(score, windows)
-                is_new = b.icmp_signed(">=", lane, self.lanes.splat(b.trunc(num_done, INT)))
+                is_new = b.icmp_signed(">=", lane, self.lanes.broadcast(b.trunc(num_done, INT)))
                 b.store(self.sum(b.load(total, typ=self.reals), b.select(is_new, value, zero)), total)
                 for k, slope in enumerate(slopes):
                     row = b.add(
@@ -203,7 +203,8 @@ class _PullBackRows(_Rows):
         length = b.add(self.width, LONG(self.margin))
         rows = [self.row("rows", LONG(k), length) for k in range(3)]
         two, share = (
-            self.lanes.splat(number) for number in (self.real(2.0), self.load(self.arguments["share"], 0, self.real))
+            self.lanes.broadcast(number)
+            for number in (self.real(2.0), self.load(self.arguments["share"], 0, self.real))
         )
         with self.loop_over_rows() as (index, _):
             channel, y = b.sdiv(index, self.height), b.srem(index, self.height)

@@ -1,0 +1,42 @@
+"""Rendering where several devices each render a view, in a process that has rendered nothing before."""
+
+import subprocess
+import sys
+
+SCRIPT = """
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec as P
+from a2tg_jax import Camera, RenderSettings, init_from_points, render_image
+
+gaussians = init_from_points([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]], [[1, 1, 1]] * 3)
+mesh = jax.make_mesh((2,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
+viewmats = jnp.stack([jnp.eye(4), jnp.eye(4).at[0, 3].set(0.1)])
+
+def show(gaussians, viewmat):
+    camera = Camera(viewmat, jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
+    return render_image(gaussians, camera, settings=RenderSettings(capacity=1024, compositor="native")).color
+
+def shown(gaussians, viewmats, check_vma):
+    one = lambda gaussians, viewmats: show(gaussians, viewmats[0])[None]
+    specs = dict(mesh=mesh, in_specs=(P(), P("views")), out_specs=P("views"), check_vma=check_vma)
+    return jax.shard_map(one, **specs)(gaussians, viewmats)
+
+def loss(gaussians, viewmats):
+    return jnp.sum(shown(gaussians, viewmats, False) ** 2)
+
+found = jax.jit(shown, static_argnums=2)(gaussians, viewmats, True)
+gradient = jax.jit(jax.grad(loss))(gaussians, viewmats)
+expected = jnp.stack([show(gaussians, viewmat) for viewmat in viewmats])
+np.testing.assert_allclose(found, expected, atol=1e-6)
+assert expected.max() > 0.05 and jnp.abs(found[0] - found[1]).max() > 0.01
+wanted = jax.grad(lambda g: sum(jnp.sum(show(g, viewmat) ** 2) for viewmat in viewmats))(gaussians)
+np.testing.assert_allclose(gradient.means, wanted.means, rtol=1e-3, atol=1e-4)
+"""
+
+
+def test_the_first_rendering_may_be_inside_a_shard_map(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
