@@ -21,6 +21,7 @@ from a2tg_jax import bilinear, pixel
 from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.bilinear import Image
 from a2tg_jax.kernels.choice import Compositor
+from a2tg_jax.kernels.manual_axes import cotangent_of
 from a2tg_jax.numerics import pixel_sum, spread
 from a2tg_jax.tiles import TileGrid, TileLists
 
@@ -118,7 +119,8 @@ def _composite_tiles_bwd(how, rule, residuals, cotangents):
     g, g_transmittance = cotangents
     behind = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
     backward = _backward if how.compositor == "xla" else _accelerated(how).backward
-    d_splats, d_table, d_tap = backward(how, rule, *arrays, g, behind)
+    cotangents = backward(how, rule, *arrays, g, behind)
+    d_splats, d_table, d_tap = cotangent_of((arrays[0], arrays[1], arrays[-1]), cotangents)
     return d_splats, d_table, None, None, None, None, d_tap
 
 

@@ -22,7 +22,7 @@ LAYERS = (
     {"compositor", "losses"},
     {"render", "optim", "metrics"},
     {"model"},
-    {"io", "renderer"},
+    {"io", "renderer", "gradients"},
     {"events"},
     {"adapt", "mcmc"},
     {"densify"},

@@ -23,16 +23,37 @@ def shown(gaussians, viewmats, check_vma):
     specs = dict(mesh=mesh, in_specs=(P(), P("views")), out_specs=P("views"), check_vma=check_vma)
     return jax.shard_map(one, **specs)(gaussians, viewmats)
 
-def loss(gaussians, viewmats):
-    return jnp.sum(shown(gaussians, viewmats, False) ** 2)
+def loss(gaussians, viewmats, check_vma):
+    return jnp.sum(shown(gaussians, viewmats, check_vma) ** 2)
 
 found = jax.jit(shown, static_argnums=2)(gaussians, viewmats, True)
-gradient = jax.jit(jax.grad(loss))(gaussians, viewmats)
 expected = jnp.stack([show(gaussians, viewmat) for viewmat in viewmats])
 np.testing.assert_allclose(found, expected, atol=1e-6)
 assert expected.max() > 0.05 and jnp.abs(found[0] - found[1]).max() > 0.01
 wanted = jax.grad(lambda g: sum(jnp.sum(show(g, viewmat) ** 2) for viewmat in viewmats))(gaussians)
-np.testing.assert_allclose(gradient.means, wanted.means, rtol=1e-3, atol=1e-4)
+for check_vma in (True, False):
+    gradient = jax.jit(jax.grad(loss), static_argnums=2)(gaussians, viewmats, check_vma)
+    np.testing.assert_allclose(gradient.means, wanted.means, rtol=1e-3, atol=1e-4)
+
+from a2tg_jax.losses import ssim
+
+photo = jnp.linspace(0, 1, 32 * 32 * 3).reshape(32, 32, 3)
+photos = jnp.stack([photo**2, photo**3])
+means = lambda photo, photos: jax.vmap(ssim, in_axes=(None, 0))(photo, photos)
+both = jax.shard_map(means, mesh=mesh, in_specs=(P(), P("views")), out_specs=P("views"))
+wanted, found = (jax.grad(lambda x, f=f: jnp.sum(f(x, photos)))(photo) for f in (means, both))
+np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
+
+def as_if_equal(gaussians, viewmats):
+    one = lambda gaussians, viewmats: show(gaussians, viewmats[0])
+    return jax.shard_map(one, mesh=mesh, in_specs=(P(), P("views")), out_specs=P())(gaussians, viewmats)
+
+try:
+    as_if_equal(gaussians, viewmats)
+except ValueError as error:
+    assert "out_specs" in str(error)
+else:
+    raise AssertionError("pictures that differ between devices passed for one")
 """
 
 

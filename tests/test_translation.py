@@ -140,6 +140,7 @@ CONTROL = [
     Op("array", lambda x, y: jnp.sum(jnp.flip(jnp.stack([x, y])) * jnp.asarray([1, -2], x.dtype)), "ff", "f"),
     Op("grid", lambda x, y: jnp.sum((jnp.stack([x, y])[:, None] * jnp.asarray([[1, 2]], x.dtype)).T[1]), "ff", "f"),
     Op("all", lambda p, q: jnp.all(jnp.stack([p, q])) | jnp.any(jnp.stack([q, p])[:1]), "bb", "b"),
+    Op("joined", lambda x, y: jnp.concatenate([jnp.stack([x, y]), x.reshape(1)]).reshape(3, 1)[2, 0], "ff", "f"),
     Op("product", lambda x: tame(jnp.prod(jnp.broadcast_to(x, (3,)))), "f", "f"),
 ]
 OPS = FLOATS + INTEGERS + ELEMENTARY + CONTROL

@@ -38,6 +38,10 @@ class Appearance:
         """The parameters moved to where they are allowed, after an update; traceable."""
         return params
 
+    def rates(self, rate: Any) -> Any:
+        """Adam's learning rates, a prefix of the parameters' tree, given what a stage says of them; traceable."""
+        return rate
+
     def num_floats(self, layout: Any, num: int) -> int:
         """Trained floats of `num` live Gaussians with all that they show, padding left out (host)."""
         per_row = sum(np.prod(leaf.shape[1:], dtype=int) for leaf in jax.tree.leaves(self._shapes(1)[0]))

@@ -5,7 +5,7 @@ vectors of L lanes, or on plain scalars. What is computed, and its derivative, i
 primitives are in `primitives` and `structure`; docs/compiler.md tells more.
 """
 
-import threading
+import concurrent.futures
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,24 +36,15 @@ def trace(function: Callable, *examples) -> tuple[core.ClosedJaxpr, Any]:
 
 def _in_clean_context(work: Callable[[], Any]) -> Any:
     """work(), on a thread of its own: JAX keeps what it is tracing by thread. Its rules for dtypes are the caller's."""
-    outcome: list[tuple[Any, BaseException | None]] = []
     config: Any = jax.config
     is_x64, promotion = config.jax_enable_x64, config.jax_numpy_dtype_promotion
 
-    def run() -> None:
-        try:
-            with jax.enable_x64(is_x64), jax.numpy_dtype_promotion(promotion):
-                outcome.append((work(), None))
-        except BaseException as error:
-            outcome.append((None, error))
+    def with_rules() -> Any:
+        with jax.enable_x64(is_x64), jax.numpy_dtype_promotion(promotion):
+            return work()
 
-    thread = threading.Thread(target=run, name="a2tg-trace")
-    thread.start()
-    thread.join()
-    ((result, error),) = outcome
-    if error is not None:
-        raise error
-    return result
+    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="a2tg-trace") as pool:
+        return pool.submit(with_rules).result()
 
 
 class Lanes(Vectors):

@@ -17,6 +17,7 @@ from jax import Array
 from a2tg_jax.appearance import StaticRule
 from a2tg_jax.geometry import Outline
 from a2tg_jax.kernels import foreign, sums, threads
+from a2tg_jax.kernels.manual_axes import vary_with
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists
 
@@ -62,7 +63,8 @@ def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tu
     name = _registered(kind, "forward", _forward_handler)
     shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.tile_size**2), splats.M.dtype)
     call = jax.ffi.ffi_call(name, shape, vmap_method="sequential")
-    image = call(*_inputs(kind, how, splats, table, images, cutoff, lists))[:, None]
+    inputs = _inputs(kind, how, splats, table, images, cutoff, lists)
+    image = vary_with(inputs, call(*inputs))[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
@@ -79,8 +81,9 @@ def backward(
         jax.ShapeDtypeStruct(tap.shape if kind.statistic else (1, 4), dtype),
     )
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    cotangents = (array.astype(dtype) for array in (g, behind, jacobian))
-    packed, d_table, d_tap = call(*_inputs(kind, how, splats, table, images, cutoff, lists), *cotangents)
+    cotangents = [array.astype(dtype) for array in (g, behind, jacobian)]
+    inputs = (*_inputs(kind, how, splats, table, images, cutoff, lists), *cotangents)
+    packed, d_table, d_tap = vary_with(inputs, call(*inputs))
     d_splats = unpack_splats(packed, splats, kind.has_geometry)
     d_tap = d_tap.astype(tap.dtype) if kind.statistic else jnp.zeros_like(tap)
     return d_splats, d_table.astype(table.dtype), d_tap
@@ -102,7 +105,8 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     )
     size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    return TileLists(*call(M, cutoff.astype(M.dtype), size))
+    inputs = M, cutoff.astype(M.dtype), size
+    return TileLists(*vary_with(inputs, call(*inputs)))
 
 
 def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:

@@ -25,6 +25,7 @@ from llvmlite import ir
 
 from a2tg_jax.kernels import foreign, library, threads
 from a2tg_jax.kernels.lanes import INT, Lanes, trace
+from a2tg_jax.kernels.manual_axes import cotangent_of, vary_with
 from a2tg_jax.kernels.writer import LONG, Writer
 
 SCORE = ("x", "y", "sums", "d_means", "rows")
@@ -64,7 +65,7 @@ def _score(how: Score, x: Array, y: Array) -> tuple[Array, Array]:
     )
     name = _registered(how, str(x.dtype), "score", _score_handler)
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    sums, d_means = call(x, y)
+    sums, d_means = vary_with((x, y), call(x, y))
     return jnp.sum(sums) / (count * down * across), d_means
 
 
@@ -80,8 +81,9 @@ def _score_backward(how: Score, residuals, cotangent: Array) -> tuple[Array, Arr
     call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype), vmap_method="sequential")
     num_windows = count * (height - len(how.taps) + 1) * d_x_mean.shape[2]
     share = cotangent[None] / num_windows
+    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
     # Where nobody asks for the second, XLA leaves it out.
-    return call(x, y, d_x_mean, *d_products, share), call(y, x, d_y_mean, *d_products, share)
+    return cotangent_of((x, y), tuple(vary_with(given, call(*given)) for given in inputs))
 
 
 mean_score.defvjp(_score_forward, _score_backward)
