@@ -35,6 +35,8 @@ from a2tg_jax.events import event as event
 from a2tg_jax.events import static as static
 from a2tg_jax.gaussians import Gaussians as Gaussians
 from a2tg_jax.gaussians import init_from_points as init_from_points
+from a2tg_jax.gradients import ViewGradients as ViewGradients
+from a2tg_jax.gradients import view_gradients as view_gradients
 from a2tg_jax.io.model import load_model as load_model
 from a2tg_jax.io.model import save_model as save_model
 from a2tg_jax.io.ply import load_ply as load_ply
@@ -69,7 +71,6 @@ from a2tg_jax.systems.gaussians_2d import Gaussians2d as Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc as Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import DensityConfig as DensityConfig
 from a2tg_jax.systems.stage1 import McmcConfig as McmcConfig
-from a2tg_jax.systems.stage1 import rates_of as rates_of
 from a2tg_jax.systems.textured_gaussians import TexturedGaussians as TexturedGaussians
 from a2tg_jax.texture import AtlasLayout as AtlasLayout
 from a2tg_jax.texture import Textures as Textures
@@ -81,7 +82,6 @@ from a2tg_jax.training import FitResult as FitResult
 from a2tg_jax.training import History as History
 from a2tg_jax.training import LearningRates as LearningRates
 from a2tg_jax.training import LossConfig as LossConfig
-from a2tg_jax.training import Rates as Rates
 from a2tg_jax.training import Stage as Stage
 from a2tg_jax.training import StageResult as StageResult
 from a2tg_jax.training import System as System

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.checks import check_floats, check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import safe_divide, safe_norm
 from a2tg_jax.optim import AdamState
-from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, plan_layout
+from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
 
 BYTES_PER_TEXEL = 16
 PAPER_ITERATIONS = 30_000
@@ -43,6 +44,8 @@ class GradientStatistics:
 
     def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
         """Adds one view: `norms` [N] counts where `is_visible` [N]."""
+        check_floats("norms", norms, self.total.shape)
+        check_shape("is_visible", is_visible, self.total.shape)
         total = self.total + jnp.where(is_visible, norms, 0.0)
         return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
 
@@ -211,11 +214,9 @@ def select(
       ValueError: unless exactly one rule is given, in its range, and the shapes agree.
     """
     statistic, sizes, proposed = np.asarray(statistic), np.asarray(sizes), np.asarray(proposed)
-    if sizes.shape != (len(statistic), 2) or proposed.shape != sizes.shape:
-        raise ValueError(
-            f"statistic [N], sizes [N, 2] and proposed [N, 2] must agree; got {statistic.shape}, {sizes.shape}, "
-            f"{proposed.shape}"
-        )
+    check_shape("statistic", statistic, ("N",))
+    check_shape("sizes", sizes, (len(statistic), 2))
+    check_shape("proposed", proposed, (len(statistic), 2))
     if sum(rule is not None for rule in (threshold, fraction, budget_bytes)) != 1:
         raise ValueError("select needs exactly one of threshold, fraction and budget_bytes")
     added_bytes = BYTES_PER_TEXEL * (np.prod(proposed, axis=1) - np.prod(sizes, axis=1))
@@ -268,8 +269,8 @@ def reallocate(
       ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
     """
     new_sizes = np.asarray(new_sizes)
-    if new_sizes.shape != (layout.num, 2):
-        raise ValueError(f"new_sizes must be [{layout.num}, 2]; got {new_sizes.shape}")
+    check_textures(textures, layout, layout.num)
+    check_shape("new_sizes", new_sizes, (layout.num, 2))
     new_layout, capacities = plan_layout(new_sizes, known)
     moves = _plan_moves(layout, new_layout)
 
@@ -278,6 +279,7 @@ def reallocate(
         return _move_texels(old, new_layout.resolutions, capacities, moves, padding)
 
     def rebuild_moments(tree: Textures) -> Textures:
+        check_textures(tree, layout, layout.num, "moments")
         return rebuild(tree, (0.0, 0.0, 0.0, 0.0))
 
     moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))

@@ -9,47 +9,57 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
-from a2tg_jax.config import DensifyConfig, LearningRates, TextureConfig, TrainConfig
 from a2tg_jax.data import Scene, run_sfm
 from a2tg_jax.metrics import load_lpips
 from a2tg_jax.results.evaluate_run import evaluate_run
-from a2tg_jax.results.folder import PHASES, Phase, RunFolder, check_free, create_run, open_run
+from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.record import SYNTHETIC, RunRecord, SceneSource, changed_fields, read_record, write_record
+from a2tg_jax.results.record import (
+    DEFAULT_SYSTEM,
+    SYNTHETIC,
+    RunFile,
+    RunRecord,
+    SceneSource,
+    changed_numbers,
+    read_record,
+    read_run_file,
+    write_record,
+)
 from a2tg_jax.results.summary import summary_text
 from a2tg_jax.results.train_run import train_run
 from a2tg_jax.startup import configure_cpu
-from a2tg_jax.training import check_config
+from a2tg_jax.systems.a2tg import A2tg, TextureConfig
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import SYSTEMS, System
 
-PRESETS = {"paper": TrainConfig.paper, "quick": TrainConfig.quick}
-DEMO_SOURCE = SceneSource(SYNTHETIC)
-DEMO_CONFIG = TrainConfig(
+BASELINE = "gaussians-2d-mcmc"
+DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
     stage2_iterations=250,
-    densify=DensifyConfig(cap=1_500),
-    rates=LearningRates(texels=1e-2),
-    texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2)),
+    densify=McmcConfig(cap=1_500),
+    texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), rate=1e-2),
 )
 """Few iterations, so textures grow early and learn fast."""
 
-OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
+OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
   a2tg demo                            a whole run on a built-in scene, about a minute on two cores
   a2tg sfm photos/ scene/              camera poses for plain photographs, by COLMAP
-  a2tg train scene/ --out runs/scene   train in two stages, evaluate, write a report
+  a2tg train scene/ --out runs/scene   train a scene, evaluate, write a report
   a2tg eval runs/scene                 measure a run again
   a2tg render runs/scene               frames and a video of a flight, or the test views
   a2tg info runs/scene                 what a run folder holds
 
-a2tg COMMAND --help explains a command, a2tg --version tells the version.
+a2tg COMMAND --help explains a command, a2tg train --system NAME --help the options of a system; a2tg --version tells
+the version. The systems: {", ".join(SYSTEMS)}.
 With A2TG_DEBUG=1 in the environment an error shows its traceback."""
 
 
@@ -66,17 +76,20 @@ class Demo:
     """Replace an earlier run in that folder."""
 
     def run(self) -> None:
-        _begin(RunRecord(DEMO_SOURCE, DEMO_CONFIG, baseline=True), self.out, overwrite=self.overwrite)
+        record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
+        _begin(record, self.out, overwrite=self.overwrite)
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a scene in two stages, evaluate it and write a report.
+    """Train a scene with a system, evaluate it and write a report.
 
     Examples:
       a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
       a2tg train scenes/fox --out runs/fox --resume
       a2tg train scenes/fox --out runs/small --texture.select budget --texture.budget-mb 20 --baseline
+      a2tg train synthetic --out runs/two --preset smoke --system bbsplat --compare textured-gaussians
+      a2tg train --config runs/fox/run.toml --out runs/again
 
     A checkpoint is written every tenth of a stage and at least every 500 iterations; the newest two are kept.
     """
@@ -85,26 +98,34 @@ class Train:
     """Scene folder (COLMAP, transforms.json or Blender), or "synthetic" for the built-in scene."""
     out: Path
     """Run folder: models, checkpoints, metrics, pictures and report.html go there."""
-    preset: Literal["paper", "quick"] = "paper"
-    """Where the numbers below start from; quick is useful on two cores in minutes."""
+    config: Path | None = None
+    """A TOML file that says any of this, such as the run.toml of a run; flags have precedence."""
+    system: str = DEFAULT_SYSTEM
+    """gaussians-2d, gaussians-2d-mcmc, textured-gaussians, supergaussians, bbsplat, a2tg; or your own as
+    package.module:NAME. Its options stand below."""
+    preset: str | None = None
+    """Where the numbers below start from: paper, quick (useful on two cores in minutes), smoke (half a minute on the
+    built-in scene), or another that the system has."""
     downscale: int = 1
     """Use the images at 1/k of their size."""
     test_every: int = 8
     """Every k-th image is kept for testing."""
+    compare: UseAppendAction[tuple[str, ...]] = ()
+    """Also train this system, with the same options where it has options of the same name, to compare with."""
     baseline: bool = False
-    """Also train a second stage of the same length without textures, to compare with."""
+    """Short for --compare gaussians-2d-mcmc: the same iterations without textures."""
     resume: bool = False
     """Go on from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder."""
     lpips_weights: Path | None = None
     """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
-    config: Annotated[TrainConfig, arg(name="")] = dataclasses.field(default_factory=TrainConfig.paper)
+    options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
         if self.resume:
             run = self._resumed()
-            _train_and_report(run, read_record(run).source.load(), self.lpips_weights)
+            _train_and_report(run, read_record(run).scene.load(), self.lpips_weights)
         else:
             _begin(self.record, self.out, overwrite=self.overwrite, lpips_weights=self.lpips_weights)
 
@@ -112,24 +133,28 @@ class Train:
     def record(self) -> RunRecord:
         """The run that the flags ask for."""
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
-        return RunRecord(SceneSource(path, self.downscale, self.test_every), self.config, self.baseline)
+        compare = (*self.compare, BASELINE) if self.baseline else self.compare
+        source = SceneSource(path, self.downscale, self.test_every)
+        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)))
 
     def _resumed(self) -> RunFolder:
         """The existing run folder, after a check that no flag contradicts it."""
         if self.overwrite:
             raise ValueError("--resume goes on with a run and --overwrite deletes it: give one of them")
         run = open_run(self.out)
-        kept = read_record(run)
-        if self.record.source.path != kept.source.path:
-            raise ValueError(f"{run.path} was trained on {kept.source.path}, not on {self.record.source.path}")
-        default = SceneSource(kept.source.path)
-        changed = changed_fields(self.record.source, default, kept.source)
-        changed += changed_fields(self.config, PRESETS[self.preset](), kept.config)
+        kept, asked = read_record(run), self.record
+        if asked.scene.path != kept.scene.path:
+            raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
+        changed = changed_numbers(asked, kept)
         if changed:
             flags = ", ".join("--" + name.replace("_", "-") for name in changed)
-            raise ValueError(f"--resume takes every number from {run.config}; leave out {flags}")
-        if self.baseline and not kept.baseline:
-            write_record(run, dataclasses.replace(kept, baseline=True))
+            advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
+            raise ValueError(f"--resume takes every number from {run.record}; {advice}")
+        compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
+        if compare != kept.compare:
+            more = dataclasses.replace(kept, compare=compare)
+            more.check()
+            write_record(run, more)
         return run
 
 
@@ -156,6 +181,8 @@ class Eval:
 class Render:
     """Render frames of a finished run: PNG files and, of a flight and where ffmpeg is installed, a video.
 
+    The photographs are not needed.
+
     Examples:
       a2tg render runs/fox --frames 240
       a2tg render runs/fox --path test --out fox-test
@@ -169,13 +196,13 @@ class Render:
     """Length of the flight in frames, 30 a second."""
     out: Path | None = None
     """Folder for the frames (default: RUN/frames)."""
-    phase: Phase = "stage2"
-    """Whose model is drawn; baseline where the run has one."""
+    model: str | None = None
+    """Which model is drawn, by the name that a2tg info tells (default: the last of the run's main system)."""
 
     def run(self) -> None:
         run = open_run(self.folder)
         out = self.out or run.path / "frames"
-        paths = render_frames(run, out, route=self.path, num_frames=self.frames, phase=self.phase)
+        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model)
         print(f"{len(paths)} frames in {out}")
         if self.path == "smooth":
             video = out / "flight.mp4"
@@ -233,8 +260,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         return _fail(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
     configure_cpu()
-    command = _parse(name, arguments)
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # Where the modules of one's own systems are.
+    command: Command | None = None
     try:
+        command = _parse(name, arguments)
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             command.run()
@@ -255,13 +285,39 @@ def _fail(message: str) -> int:
 
 
 def _parse(name: str, arguments: list[str]) -> Command:
-    """The command that the arguments ask for. A preset is looked at first: it decides the numbers' defaults."""
+    """The command that the arguments ask for. System, preset and file are looked at first: they decide the defaults.
+
+    Raises:
+      ValueError, FileNotFoundError: if there is no such system, preset or file, or the file is wrong.
+    """
     kind = COMMANDS[name]
     options: dict[str, Any] = {"prog": f"a2tg {name}", "description": inspect.getdoc(kind), "args": arguments}
     if kind is Train:
-        config = PRESETS.get(_value_of("--preset", arguments), TrainConfig.paper)()
-        options["default"] = Train(scene=tyro.MISSING, out=tyro.MISSING, config=config)
+        options["default"] = _train_defaults(arguments)
     return tyro.cli(kind, **options)
+
+
+def _train_defaults(arguments: list[str]) -> Train:
+    """What is not said on the command line: from the file; when a run is resumed, from its own."""
+    path = _value_of("--config", arguments)
+    system, preset = _value_of("--system", arguments), _value_of("--preset", arguments)
+    own = RunFolder(Path(_value_of("--out", arguments))).record
+    if not path and "--resume" in arguments and own.is_file() and not preset:
+        path = str(own)
+    file = read_run_file(Path(path)) if path else RunFile()
+    if preset or (system and system != file.system):
+        # The numbers of the file are those of another preset or system.
+        file = dataclasses.replace(file, system=system or file.system, preset=preset or None, options={})
+    return Train(
+        scene=tyro.MISSING if file.scene is None else file.scene,
+        out=tyro.MISSING,
+        system=file.system,
+        preset=file.preset,
+        downscale=file.downscale,
+        test_every=file.test_every,
+        compare=file.compare,
+        options=file.chosen(path),
+    )
 
 
 def _value_of(flag: str, arguments: list[str]) -> str:
@@ -276,11 +332,11 @@ def _value_of(flag: str, arguments: list[str]) -> str:
 
 def _begin(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None = None) -> None:
     """Makes the run folder, once all about the new run has been checked, and trains."""
-    check_config(record.config)
+    record.check()
     if lpips_weights is not None:
         load_lpips(lpips_weights)
     check_free(out, overwrite=overwrite)
-    scene = record.source.load()
+    scene = record.scene.load()
     run = create_run(out, overwrite=overwrite)
     write_record(run, record)
     _train_and_report(run, scene, lpips_weights)
@@ -293,16 +349,15 @@ def _train_and_report(run: RunFolder, scene: Scene, lpips_weights: Path | None) 
     print(f"report: {run.report}")
 
 
-def _how_to_go_on(command: Command) -> str:
+def _how_to_go_on(command: Command | None) -> str:
     """Where the newest checkpoint is and how to resume, if the command was training."""
     if not isinstance(command, Demo | Train):
         return ""
     run = RunFolder(command.out)
-    checkpoints = [path for phase in PHASES for path in run.checkpoints(phase)]
-    if not run.config.is_file():
+    if not run.record.is_file():
         return ""
-    scene = command.scene if isinstance(command, Train) else SYNTHETIC
-    again = shlex.join(["a2tg", "train", scene, "--out", str(command.out), "--resume"])
+    checkpoints = [path for name in read_record(run).plan.names for path in run.checkpoints(name)]
+    again = shlex.join(["a2tg", "train", "--out", str(command.out), "--resume"])
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     return f"; {last}; go on with: {again}"
 

@@ -302,9 +302,9 @@ def _read(rule, table: Array, images: Image | None, hit: pixel.Hit) -> _Read | N
     return _Read(image, taps, sample)
 
 
-def _show(how: Compositing, rule, splats: Splats, hit: pixel.Hit, values, at, tile: _Tile, log_tap=None):
+def _show(how: Compositing, rule, splats: Splats, hit: pixel.Hit, values, at, tile: _Tile, rho_tap=None):
     """`pixel.Shown` of a block at a tile's pixels, each [B, P]; entries past the end of the list show nothing."""
-    shown = pixel.show(rule, _split(splats, how.has_geometry, how.grid.tile_size**2), hit, values, log_tap)
+    shown = pixel.show(rule, _split(splats, how.has_geometry, how.grid.tile_size**2), hit, values, rho_tap)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
@@ -349,12 +349,12 @@ def _block_vjp(how: Compositing, rule, table: Array, jacobian, rows, at, tile, l
     read = _read(rule, table, images, _hits(how, rule, splats, tile))
     image, sample = (None, None) if read is None else (read.image, read.sample)
 
-    def of_floats(splats, values, log_tap):
+    def of_floats(splats, values, rho_tap):
         hit = _hits(how, rule, splats, tile)
-        return _show(how, rule, splats, hit, pixel.values_at(rule, image, sample, hit, values), at, tile, log_tap)
+        return _show(how, rule, splats, hit, pixel.values_at(rule, image, sample, hit, values), at, tile, rho_tap)
 
-    log_tap = jnp.zeros((BLOCK, light.shape[0]), light.dtype) if how.statistic else None
-    shown, pull_back = jax.vjp(of_floats, splats, _values(read), log_tap)
+    rho_tap = jnp.zeros((BLOCK, light.shape[0]), light.dtype) if how.statistic else None
+    shown, pull_back = jax.vjp(of_floats, splats, _values(read), rho_tap)
     g = g[:, None]
     seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 
@@ -364,8 +364,8 @@ def _block_vjp(how: Compositing, rule, table: Array, jacobian, rows, at, tile, l
 
     carry, (weights, d_alpha) = jax.lax.scan(add_splat, (light, is_live, behind), (shown.alpha, seen))
     d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(how.num_channels)))
-    d_splats, d_values, d_log = pull_back(d_shown)
-    d_tap = _statistic(how, rule, jacobian, splats, tile, d_log, weights) if how.statistic else None
+    d_splats, d_values, d_rho = pull_back(d_shown)
+    d_tap = _statistic(how, rule, jacobian, splats, tile, d_rho, weights) if how.statistic else None
     return *carry, (d_splats, d_tap, _d_texels(read, d_values))
 
 
@@ -381,11 +381,11 @@ def _d_texels(read: _Read | None, d_values: tuple[Array, ...]) -> tuple[Array, A
     return jnp.stack([tap.entry for tap in read.taps]), jnp.stack(per_tap)
 
 
-def _statistic(how: Compositing, rule, jacobian, splats: Splats, tile: _Tile, d_log: Array, weights: Array) -> Array:
+def _statistic(how: Compositing, rule, jacobian, splats: Splats, tile: _Tile, d_rho: Array, weights: Array) -> Array:
     """[B, 4]: Σ_pixels of the statistic, and the pixels composited."""
     assert how.statistic is not None
-    x, y = _pixels_of_tile(how.grid.tile_size, d_log.dtype)
+    x, y = _pixels_of_tile(how.grid.tile_size, d_rho.dtype)
     M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
-    at_pixel = M, x, y, tile.x, tile.y, d_log, jacobian
+    at_pixel = M, x, y, tile.x, tile.y, d_rho, jacobian
     components = pixel.positional_gradient(how.statistic, *at_pixel, how.near_plane, rule.has_low_pass)
-    return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_log.dtype))], axis=1)
+    return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_rho.dtype))], axis=1)

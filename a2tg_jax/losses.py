@@ -9,7 +9,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.checks import check_floats, check_shape
+from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.kernels.choice import has_native
 from a2tg_jax.numerics import normalize, safe_divide
 
@@ -97,7 +98,14 @@ def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera
 
     Returns:
       A scalar in [0, 2].
+
+    Raises:
+      ValueError: if an image is not of the camera's size.
     """
+    size = camera.height, camera.width
+    check_floats("normal", normal, (*size, 3))
+    check_floats("depth", depth, size)
+    check_floats("alpha", alpha, size)
     surface, is_defined = depth_normals(safe_divide(depth, alpha), alpha > 0, camera)
     error = alpha[1:-1, 1:-1] - jnp.sum(normal[1:-1, 1:-1] * surface, axis=-1)
     return jnp.sum(jnp.where(is_defined, error, 0.0)) / alpha.size
@@ -114,7 +122,12 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
     Returns:
       [H-2, W-2, 3] unit normals in the world, facing the camera, of all pixels but the border; and [H-2, W-2],
       whether the pixel and the four neighbours it needs are valid.
+
+    Raises:
+      ValueError: if an image is not of the camera's size.
     """
+    check_floats("depth", depth, (camera.height, camera.width))
+    check_shape("is_valid", is_valid, depth.shape)
     points = _back_project(depth, camera)
     along_x = points[1:-1, 2:] - points[1:-1, :-2]
     along_y = points[2:, 1:-1] - points[:-2, 1:-1]
@@ -128,11 +141,13 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
 
 def mean_opacity(gaussians: Gaussians, num_live: Array | int) -> Array:
     """Mean opacity of the first `num_live` rows (the opacity regulariser of 3DGS-MCMC)."""
+    check_gaussians(gaussians)
     return _live_mean(gaussians.opacities, num_live)
 
 
 def mean_scale(gaussians: Gaussians, num_live: Array | int) -> Array:
     """Mean scale, over both axes, of the first `num_live` rows (the scale regulariser of 3DGS-MCMC)."""
+    check_gaussians(gaussians)
     return _live_mean(jnp.mean(gaussians.scales, axis=-1), num_live)
 
 
@@ -145,6 +160,7 @@ def check_same_shape(image: Array, target: Array) -> None:
 
 
 def _live_mean(values: Array, num_live: Array | int) -> Array:
+    check_shape("num_live", num_live, ())
     num_live = jnp.asarray(num_live, jnp.int32)
     is_live = jnp.arange(values.shape[0], dtype=jnp.int32) < num_live
     return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, event, gather_rows, static
-from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
 from a2tg_jax.sharing import DEAD_OPACITY, MAX_SHARES, share
@@ -67,6 +68,7 @@ def relocate(key: Array, gaussians: Gaussians, moments, num_live: Array | int) -
       ValueError: if a leaf of `moments` has another leading axis.
     """
     _check_moments(gaussians, moments)
+    check_shape("num_live", num_live, ())
     num_live = jnp.asarray(num_live, jnp.int32)
     moves = plan_relocation(key, gaussians.opacities, num_live)
     return MoveResult(_copy_hosts(gaussians, moves), _zero_rows(moments, moves.is_reset), num_live, moves.info)
@@ -91,6 +93,8 @@ def grow(key: Array, gaussians: Gaussians, moments, num_live: Array | int, cap: 
       ValueError: if a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
     """
     _check_moments(gaussians, moments)
+    check_shape("num_live", num_live, ())
+    check_shape("cap", cap, ())
     if not isinstance(cap, jax.core.Tracer) and int(cap) > gaussians.num:
         raise ValueError(f"cap must be at most the {gaussians.num} rows that are allocated; got {int(cap)}")
     num_live = jnp.asarray(num_live, jnp.int32)
@@ -145,7 +149,13 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
       gaussians: N rows.
       num_live: rows in use; may be traced.
       lr: the current learning rate of the means, in world units; may be traced.
+
+    Raises:
+      ValueError: if an argument has another shape than it must have.
     """
+    check_gaussians(gaussians)
+    check_shape("num_live", num_live, ())
+    check_shape("lr", lr, ())
     means, dtype = gaussians.means, gaussians.means.dtype
     noise = jax.random.normal(key, means.shape, dtype)
     axes = rotation_matrices(gaussians.quats)[:, :, :2]
@@ -224,7 +234,8 @@ def _zero_rows(tree, is_zeroed: Array):
 
 
 def _check_moments(gaussians: Gaussians, moments) -> None:
-    """Raises ValueError unless every leaf has one row per Gaussian."""
+    """Raises ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
+    check_gaussians(gaussians)
     for leaf in jax.tree.leaves(moments):
         if leaf.ndim == 0 or leaf.shape[0] != gaussians.num:
             raise ValueError(f"every leaf of moments must have {gaussians.num} rows; got shape {leaf.shape}")

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.checks import check_shape
+
 with warnings.catch_warnings():
     # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
     warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
@@ -58,13 +60,20 @@ def adam_update(
 
     Returns:
       jaxopt's `OptStep(params, state)`, the updated parameters and the `AdamState`.
+
+    Raises:
+      ValueError: if gradients, moments or rates do not fit the parameters, naming the leaf.
     """
+    for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
+        _check_like(name, tree, params)
     count = state.count + 1
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
     def step(rate, param, m, v):
         rate = jnp.asarray(rate, param.dtype)
+        if rate.ndim and (rate.ndim != param.ndim or jnp.broadcast_shapes(rate.shape, param.shape) != param.shape):
+            raise ValueError(f"rates must broadcast to {[*param.shape]} at equal rank; got {[*rate.shape]}")
         root = jnp.sqrt(v) / jnp.sqrt(_bias_correction(b2, count, param.dtype))
         return param - rate / _bias_correction(b1, count, param.dtype) * (m / (root + eps))
 
@@ -86,6 +95,16 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     """
     progress = jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) / total, 0.0, 1.0)
     return start * jnp.exp(math.log(final_factor) * progress)
+
+
+def _check_like(name: str, tree, params) -> None:
+    """Raises ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
+    found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
+    if found != wanted:
+        raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    for (path, leaf), param in zip(leaves, jax.tree.leaves(params), strict=True):
+        check_shape(f"{name}{jax.tree_util.keystr(path)}", leaf, jnp.shape(param))
 
 
 def _bias_correction(decay: float, count: Array, dtype) -> Array:

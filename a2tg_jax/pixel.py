@@ -133,7 +133,7 @@ def values_at(rule: AppearanceRule, image: Image | None, sample: Sample | None, 
 
 
 def show(
-    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], log_tap: Array | None = None
+    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_tap: Array | None = None
 ) -> Shown:
     """α = min(rule.max_alpha, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
 
@@ -142,14 +142,14 @@ def show(
       splat: its homography is not read.
       hit: where the ray meets the splat.
       values: what the splat's image shows there.
-      log_tap: zero, added to the exponent of the falloff, to read the gradient there; or None.
+      rho_tap: zero, added to what the falloff is given, to read the gradient there; or None.
     """
     residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
     # No falloff is asked for its slope at infinity, which need not be a number.
     rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
+    rho = rho if rho_tap is None else rho + rho_tap
     a = splat.opacity * rule.falloff(splat.numbers, rho)
     a = a if factor is None else a * factor
-    a = a if log_tap is None else a * jnp.exp(log_tap)
     # What is not a number stays so, here and in `absorb`: it must not vanish.
     is_hidden = a < MIN_ALPHA if rule.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
     alpha = jnp.where(is_hidden, 0.0, jnp.where(a >= rule.max_alpha, rule.max_alpha, a))
@@ -199,8 +199,8 @@ class Cotangents(NamedTuple):
     numbers: tuple[Array, ...]
     values: tuple[Array, ...]
     """Of what the splat's image shows."""
-    log_falloff: Array | None
-    """∂L/∂(log of the falloff), where asked for."""
+    rho: Array | None
+    """∂L/∂ρ through the falloff, where asked for."""
 
 
 def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, light, is_live):
@@ -212,7 +212,7 @@ def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Sp
 
 def composite_vjp(
     rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, image: Image | None, sample: Sample | None,
-    x, y, light, is_live, behind, g, has_log: bool,
+    x, y, light, is_live, behind, g, has_rho: bool,
 ):  # fmt: skip
     """One splat at one pixel of the backward pass; `behind` and `g` as in `absorb_vjp`, g channel by channel.
 
@@ -221,14 +221,14 @@ def composite_vjp(
       weight is positive: elsewhere they may not even be finite.
     """
 
-    def of_floats(planes, opacity, color, normal, numbers, values, log_tap):
+    def of_floats(planes, opacity, color, normal, numbers, values, rho_tap):
         hit = intersect(planes, x, y, near_plane, rule.has_low_pass)
         values = values_at(rule, image, sample, hit, values)
-        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, log_tap)
+        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_tap)
 
-    log_tap = jnp.zeros_like(light) if has_log else None
+    rho_tap = jnp.zeros_like(light) if has_rho else None
     values = () if sample is None else sample.values
-    floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, log_tap
+    floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, rho_tap
     shown, pull_back = jax.vjp(of_floats, *floats)
     seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
     weight, light, is_live, behind, d_alpha = absorb_vjp(shown.alpha, light, is_live, behind, seen)
@@ -237,10 +237,10 @@ def composite_vjp(
 
 
 def positional_gradient(
-    statistic: Statistic, M, x: Array, y: Array, tile_x, tile_y, d_log: Array, jacobian, near_plane: float,
+    statistic: Statistic, M, x: Array, y: Array, tile_x, tile_y, d_rho: Array, jacobian, near_plane: float,
     has_low_pass: bool,
 ) -> Triple:  # fmt: skip
-    """What a pixel adds to a statistic of densification, through the falloff only; zero where `d_log` is.
+    """What a pixel adds to a statistic of densification, through the falloff only; zero where `d_rho` is.
 
     "position": |∂L/∂μ| per world component (A²TG).
     "screen": |∂L/∂c| per pixel axis of the projected mean c, where the low-pass filter decides, and 0 (gsplat's
@@ -251,12 +251,12 @@ def positional_gradient(
       statistic: which.
       M: rows of the homography.
       x, y: the pixel, from the tile's centre (tile_x, tile_y).
-      d_log: ∂L/∂(−ρ/2), the gradient of the logarithm of the falloff.
+      d_rho: ∂L/∂ρ through the falloff.
       jacobian: rows of ∂M[:, 2]/∂μ = K·Rc.
       near_plane, has_low_pass: as for `intersect`.
     """
     axes = tuple((row[0], row[1]) for row in M)
-    mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_log)) for row in M)
+    mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
 
     def rho(mean):
         rows = tuple((*axes[i], mean[i]) for i in range(3))
@@ -264,7 +264,7 @@ def positional_gradient(
         return hit.rho, hit.is_ray
 
     _, pull_back, is_ray = jax.vjp(rho, mean, has_aux=True)
-    (d_mean,) = pull_back(-0.5 * d_log)
+    (d_mean,) = pull_back(d_rho)
     if statistic == "position":
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]

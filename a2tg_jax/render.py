@@ -101,9 +101,10 @@ def render_image(
       or colour), all of the picture is NaN, and so are the gradients; a texel that is NaN is seen where it shows.
 
     Raises:
-      ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, or if the layout
-        is of another number of Gaussians.
+      ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, if the layout
+        is of another number of Gaussians, or if an argument has another shape than it must have.
     """
+    check_gaussians(gaussians)
     rule = appearance_of(gaussians, textures, layout, settings)
     return render_appearance(gaussians, camera, rule, background=background, settings=settings)
 
@@ -121,8 +122,9 @@ def render_appearance(
     check_gaussians(gaussians)
     check_camera(camera)
     check_background(background)
-    if settings.capacity is None:
-        settings = dataclasses.replace(settings, capacity=_capacity_now(gaussians, camera, rule, settings, num_live))
+    if num_live is not None:
+        check_shape("num_live", num_live, ())
+    settings = with_capacity(settings, gaussians, camera, rule, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
     output, _ = _jitted_render()(gaussians, camera, rule, background, settings, num_live=num_live)
     return output
@@ -241,11 +243,11 @@ def plan_render(
         raise ValueError("cameras must be one camera at least; got none")
     if not head_room >= 1:
         raise ValueError(f"head_room must be at least 1; got {head_room}")
+    check_gaussians(gaussians)
     if rule is None:
         rule = appearance_of(gaussians, textures, layout, settings)
     elif textures is not None or layout is not None:
         raise ValueError("rule already says what the splats show: give it, or textures and layout")
-    check_gaussians(gaussians)
     for camera in cameras:
         check_camera(camera)
     most = max(pairs_of_view(gaussians, camera, rule, settings) for camera in cameras)
@@ -295,14 +297,24 @@ def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 
 
-def _capacity_now(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings, num_live=None) -> int:
+def with_capacity(
+    settings: RenderSettings, gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any = None
+) -> RenderSettings:
+    """The settings; where they lack a capacity with one for this view, which an eager call can find.
+
+    Raises:
+      ValueError: under jit or vmap without a capacity.
+    """
+    if settings.capacity is not None:
+        return settings
     gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
         )
-    return capacity_for(pairs_of_view(gaussians, camera, rule, settings, num_live))
+    pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
+    return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
 def _primal_value(x):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from a2tg_jax.appearance import AppearanceRule
-from a2tg_jax.cameras import Camera, check_camera
+from a2tg_jax.cameras import Camera, check_camera, resize_camera
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.render import (
@@ -22,9 +22,11 @@ from a2tg_jax.render import (
 )
 
 FIRST_ROOM = 1.5
-"""Head room over the first view of a size, where no other cameras are known."""
-GROWTH = 2
+"""Head room over the views that room is first made for."""
+GROWTH = 3
 """The least factor by which room grows."""
+PLANNED_CAMERAS = 16
+"""Of a model's own cameras, so many are looked at before room is made."""
 
 Size = tuple[int, int]
 
@@ -32,9 +34,9 @@ Size = tuple[int, int]
 class Renderer:
     """Draws one model from any camera.
 
-    Each image size is compiled for a capacity. A view that needs more is drawn again with at least twice the room, so
-    that a long flight compiles a few times only, and no camera is refused. Models of equal shapes share what is
-    compiled.
+    Each image size is compiled for a capacity, which suffices for the first view and the model's own cameras. A view
+    that needs more is drawn again with at least three times the room, so that a long flight compiles a few times only,
+    and no camera is refused. Models of equal shapes share what is compiled.
 
         renderer = Renderer(model)
         for camera in smooth_path(cameras, 200):
@@ -74,6 +76,8 @@ class Renderer:
         self._rule = model.rule if rule is None else rule
         self._background = jnp.asarray(background, model.gaussians.means.dtype)
         self._settings, self._has_geometry = settings, has_geometry
+        own = [] if model.origin is None else model.origin.cameras
+        self._known = own[:: -(-len(own) // PLANNED_CAMERAS) or 1]
         self.capacities: dict[Size, int] = {}
         """Room for (splat, tile) pairs by image size, (width, height)."""
         self._plan(list(cameras))
@@ -83,7 +87,10 @@ class Renderer:
         check_camera(camera)
         size = camera.width, camera.height
         if size not in self.capacities:
-            self.capacities[size] = capacity_for(self._num_pairs(camera), FIRST_ROOM)
+            cameras = [camera, *(resize_camera(known, *size) for known in self._known)]
+            # A first view may see next to nothing; where all are seen, each Gaussian is in a tile at least.
+            pairs = max(self._gaussians.num, *map(self._num_pairs, cameras))
+            self.capacities[size] = capacity_for(pairs, FIRST_ROOM)
         output, pairs = self._draw(camera)
         while bool(output.overflow):
             self.capacities[size] = max(capacity_for(int(pairs)), GROWTH * self.capacities[size])
@@ -102,13 +109,17 @@ class Renderer:
 
     def _draw(self, camera: Camera):
         settings = dataclasses.replace(self._settings, capacity=self.capacities[camera.width, camera.height])
-        return _jitted_draw()(
-            self._gaussians, camera, self._rule, self._background, settings,
-            has_geometry=self._has_geometry, num_live=self._num_live,
-        )  # fmt: skip
+        draw = _jitted_draw()
+        return draw(self._gaussians, self._num_live, camera, self._rule, self._background, settings, self._has_geometry)
 
 
 @functools.cache
 def _jitted_draw() -> Callable[..., Any]:
-    """`render_traced`, jitted; its cache counts the compilations."""
-    return jax.jit(render_traced, static_argnums=4, static_argnames="has_geometry")
+    """Draws on the device; its cache counts the compilations."""
+
+    def draw(gaussians, num_live, camera, rule, background, settings, has_geometry):
+        return render_traced(
+            gaussians, camera, rule, background, settings, has_geometry=has_geometry, num_live=num_live
+        )
+
+    return jax.jit(draw, static_argnames=("settings", "has_geometry"))

@@ -64,19 +64,19 @@ class AtlasLayout:
         return short_repr(self)
 
 
-def check_textures(textures: Textures, layout: AtlasLayout, num: int) -> None:
+def check_textures(textures: Textures, layout: AtlasLayout, num: int, name: str = "textures") -> None:
     """Raises ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians."""
     if not isinstance(textures, Textures) or not isinstance(layout, AtlasLayout):
         kinds = f"{type(textures).__name__} and {type(layout).__name__}"
-        raise ValueError(f"textures and layout must be Textures and their AtlasLayout; got {kinds}")
+        raise ValueError(f"{name} and layout must be Textures and their AtlasLayout; got {kinds}")
     if layout.num != num:
         raise ValueError(f"layout is of {layout.num} textures, but there are {num} gaussians")
     check_shape("layout.row", layout.row, (num,))
     if len(textures.buckets) != len(layout.resolutions):
         counts = f"{len(textures.buckets)} buckets, and the layout {len(layout.resolutions)} sizes"
-        raise ValueError(f"textures must have one bucket for each size of the layout; they have {counts}")
+        raise ValueError(f"{name} must have one bucket for each size of the layout; they have {counts}")
     for index, (bucket, size) in enumerate(zip(textures.buckets, layout.resolutions, strict=True)):
-        check_floats(f"textures.buckets[{index}]", bucket, ("capacity", *size, 4))
+        check_floats(f"{name}.buckets[{index}]", bucket, ("capacity", *size, 4))
 
 
 def bucket_capacity(count: int) -> int:
@@ -165,12 +165,14 @@ def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
     """Buckets made from N arrays [Tv, Tu, 4] of one float dtype; the inverse of `texture_arrays`.
 
     Raises:
-      ValueError: if an array is not [Tv, Tu, 4] with sides of 1 to 16, naming it.
+      ValueError: if an array is not floats [Tv, Tu, 4] with sides of 1 to 16, naming it.
     """
     arrays = [np.asarray(array) for array in arrays]
     for index, array in enumerate(arrays):
         if array.ndim != 3 or array.shape[2] != 4:
             raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
+        if not jnp.issubdtype(array.dtype, jnp.floating):
+            raise ValueError(f"texture {index} must be floats; got {array.dtype}")
     layout, capacities = plan_layout(np.array([a.shape[:2] for a in arrays], np.int64).reshape(-1, 2))
     dtype = np.result_type(*arrays) if arrays else np.float32
     filled = [
@@ -198,6 +200,7 @@ def first_textures(textures: Textures, layout: AtlasLayout, num: int) -> tuple[T
 
 def texture_arrays(textures: Textures, layout: AtlasLayout) -> list[np.ndarray]:
     """The N textures as numpy arrays [Tv, Tu, 4], in the order of the Gaussians (host)."""
+    check_textures(textures, layout, layout.num)
     buckets = [np.asarray(bucket) for bucket in textures.buckets]
     places = zip(np.asarray(layout.bucket), np.asarray(layout.row), strict=True)
     return [buckets[bucket][row] for bucket, row in places]

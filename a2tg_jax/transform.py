@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.sh import sh_basis
 
 NUM_DIRECTIONS = 64
@@ -29,7 +29,11 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
 
     Returns:
       N Gaussians of the same dtype; the quaternions are unit.
+
+    Raises:
+      ValueError: if a field of the Gaussians has another shape than it must have.
     """
+    check_gaussians(gaussians)
     rotation = np.asarray(similarity.rotation, np.float64)
     means = similarity.apply(np.asarray(gaussians.means, np.float64))
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.asarray(gaussians.quats), scalar_first=True)

@@ -6,53 +6,55 @@ import pathlib
 import numpy as np
 
 import a2tg_jax
+from a2tg_jax import A2tg
 from a2tg_jax.cameras import resize_camera
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import fit_stage, like
 from benchmarks.rendering import measure_view
 
 
 def measure_training(case: dict) -> dict:
     """Warm steps of both stages: median milliseconds of the last ones, compilation apart."""
-    scene, config = load_case(case)
-    plain = dataclasses.replace(config, texture=dataclasses.replace(config.texture, is_enabled=False))
-    first = a2tg_jax.fit_stage1(scene, config, progress=False)
-    untextured = a2tg_jax.fit_stage2(scene, first.gaussians, plain, progress=False)
-    textured = a2tg_jax.fit_stage2(scene, first.gaussians, config, progress=False)
+    scene, textured = load_case(case)
+    plain = like(Gaussians2dMcmc, textured)
+    first = fit_stage(scene, textured, 0, progress=False)
     height, width = scene.train[0].image.shape[:2]
     return {
         "scene": scene.name,
         "image": [width, height],
-        "num_live": first.gaussians.num,
+        "num_live": first.model.num,
         "stage1_ms": late_step_ms(first.history),
-        "untextured_ms": late_step_ms(untextured.history),
-        "textured_ms": late_step_ms(textured.history),
+        "untextured_ms": late_step_ms(fit_stage(scene, plain, 1, first.model, progress=False).history),
+        "textured_ms": late_step_ms(fit_stage(scene, textured, 1, first.model, progress=False).history),
     }
 
 
 def measure_trained(case: dict) -> dict:
     """A test view after short training, at several sizes, without and with the textures."""
-    scene, config = load_case(case)
-    result = a2tg_jax.fit(scene, config, progress=False)
-    camera, settings = scene.test[0].camera, a2tg_jax.render_settings(config)
+    scene, system = load_case(case)
+    model = a2tg_jax.fit(scene, system, progress=False).model
+    camera, settings = scene.test[0].camera, a2tg_jax.RenderSettings(tile_size=system.tile_size)
     renders = []
     for factor in case["factors"]:
         view = resize_camera(camera, factor * camera.width, factor * camera.height)
-        for kind, textures, layout in (("none", None, None), ("trained", result.textures, result.layout)):
-            figures = measure_view(result.gaussians, view, textures, layout, settings)
+        for kind, textures, layout in (("none", None, None), ("trained", model.params, model.layout)):
+            figures = measure_view(model.gaussians, view, textures, layout, settings)
             renders.append({"width": view.width, "height": view.height, "textures": kind, **figures})
-    return {"scene": scene.name, "num": result.gaussians.num, "renders": renders}
+    return {"scene": scene.name, "num": model.num, "renders": renders}
 
 
-def load_case(case: dict) -> tuple[a2tg_jax.Scene, a2tg_jax.TrainConfig]:
+def load_case(case: dict) -> tuple[a2tg_jax.Scene, A2tg]:
     """The scene, and a short training of it."""
     scene = a2tg_jax.load_scene(pathlib.Path(case["scene"]), downscale=case["downscale"])
     stage1, stage2 = case["iterations"]
-    config = dataclasses.replace(
-        a2tg_jax.TrainConfig.quick(),
+    system = dataclasses.replace(
+        A2tg.preset("quick"),
         stage1_iterations=stage1,
         stage2_iterations=stage2,
-        densify=a2tg_jax.DensifyConfig(cap=case["num"]),
+        densify=McmcConfig(cap=case["num"]),
     )
-    return scene, config
+    return scene, system
 
 
 def late_step_ms(history: a2tg_jax.History) -> float:

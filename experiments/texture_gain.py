@@ -1,7 +1,8 @@
-"""What textures bring at equal Gaussians and equal training: stage 2 with textures against stage 2 without.
+"""What textures bring at equal Gaussians and equal training: a second stage with textures against one without.
 
-Trains stage 1 once per scene, number of Gaussians and seed, then stage 2 twice from its result, and appends one JSON
-line a run to the output: PSNR, SSIM and LPIPS on test and train views after each stage, seconds and memory.
+Trains the first stage once per scene, number of Gaussians and seed, then both second stages from its result, and
+appends one JSON line a run to the output: PSNR, SSIM and LPIPS on test and train views after each stage, seconds and
+memory.
 
     python experiments/texture_gain.py SCENES/fox SCENES/snowmiku --gaussians 3000 7000 --seeds 0 1 --out gain.jsonl
 """
@@ -13,7 +14,11 @@ import pathlib
 import resource
 
 import a2tg_jax
+from a2tg_jax import A2tg
 from a2tg_jax.startup import configure_cpu
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import StageResult, fit_stage, like
 
 
 def main() -> None:
@@ -44,19 +49,19 @@ def parse_arguments() -> argparse.Namespace:
 
 def run_one(scene, num: int, seed: int, args: argparse.Namespace) -> dict:
     """Both second stages of one scene, size and seed."""
-    config = dataclasses.replace(
-        a2tg_jax.TrainConfig.quick(),
+    textured = dataclasses.replace(
+        A2tg.preset("quick"),
         stage1_iterations=args.iterations[0],
         stage2_iterations=args.iterations[1],
         seed=seed,
-        densify=a2tg_jax.DensifyConfig(cap=num),
+        densify=McmcConfig(cap=num),
     )
-    plain = dataclasses.replace(config, texture=dataclasses.replace(config.texture, is_enabled=False))
-    first = a2tg_jax.fit_stage1(scene, config, progress=False)
+    plain = like(Gaussians2dMcmc, textured)
+    first = fit_stage(scene, textured, 0, progress=False)
     results = {
         "stage1": first,
-        "untextured": a2tg_jax.fit_stage2(scene, first.gaussians, plain, progress=False),
-        "textured": a2tg_jax.fit_stage2(scene, first.gaussians, config, progress=False),
+        "untextured": fit_stage(scene, plain, 1, first.model, progress=False),
+        "textured": fit_stage(scene, textured, 1, first.model, progress=False),
     }
     name = f"{scene.name}-{num}-{seed}"
     row: dict = {phase: measure(scene, result, f"{name}-{phase}", args) for phase, result in results.items()}
@@ -64,19 +69,17 @@ def run_one(scene, num: int, seed: int, args: argparse.Namespace) -> dict:
     return row
 
 
-def measure(scene, result, name: str, args: argparse.Namespace) -> dict:
+def measure(scene, result: StageResult, name: str, args: argparse.Namespace) -> dict:
     """Figures of one trained model."""
-    model = result.gaussians, result.textures, result.layout
-    settings = a2tg_jax.render_settings(result.config)
     figures: dict = {
-        "num": result.gaussians.num,
-        "megabytes": a2tg_jax.parameter_bytes(result.gaussians, result.layout) / 1e6,
+        "num": result.model.num,
+        "megabytes": result.model.num_bytes / 1e6,
         "seconds": result.seconds,
         "ms_per_step": median_step(result.history) * 1e3,
     }
     for split, views in (("test", scene.test), ("train", scene.train)):
         weights = args.lpips_weights
-        found = a2tg_jax.evaluate(views, *model, settings=settings, lpips_weights=weights, num_renders=len(scene.test))
+        found = a2tg_jax.evaluate(views, result.model, lpips_weights=weights, num_renders=len(scene.test))
         figures[split] = {"psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips}
         if split == "test" and args.renders is not None:
             save_renders(args.renders, name, found.renders)

@@ -57,3 +57,35 @@ def glossy(scene: Scene, params: dict[str, Float], i: int, has_low_pass: bool = 
     residual = np.stack([highlight[0] * ones, highlight[1] * hits.u, highlight[2] * hits.v * hits.v], axis=-1)
     is_relevant = opacity * falloff(hits.closest_rho) >= 0.99 * MIN_ALPHA
     return hits, Shown(opacity * falloff(hits.rho), residual, np.inf, np.inf, is_relevant)
+
+
+def movable(scene: Scene, params: dict[str, Float], i: int) -> tuple[Hits, Shown]:
+    """SuperGaussians: four kernels, each 10⁻⁴ + exp(−k·distance²), of (u, v) at the hit."""
+    hits, opacities = hits_of(scene, i), sigmoid(params["logit_opacities"][i])
+    opacity, residual = np.zeros_like(hits.u), np.zeros((*hits.u.shape, 3))
+    for kernel in range(4):
+        offset = np.stack([hits.u, hits.v], axis=-1) - params["centers"][i, kernel]
+        weight = np.exp(-params["sharpness"][i, kernel] * np.sum(offset**2, axis=-1)) + 1e-4
+        opacity += opacities[kernel] * weight / 4
+        residual += weight[..., None] * params["colors"][i, kernel] / 4
+    is_relevant = np.mean(opacities) * np.exp(-hits.closest_rho / 2) >= 0.98 * MIN_ALPHA
+    return hits, Shown(opacity * np.exp(-hits.rho / 2), residual, np.inf, np.inf, is_relevant)
+
+
+def billboard(scene: Scene, params: dict[str, Float], i: int) -> tuple[Hits, Shown]:
+    """BBSplat: an RGBA picture over u, v in [−1, 1], its outer texels at the ends, bilinear among zeros."""
+    hits, texels = hits_of(scene, i, has_low_pass=False), params["texels"][i]
+    side = len(texels)
+    shown = np.concatenate([sigmoid(texels[..., :3]), texels[..., 3:]], axis=-1)
+    padded = np.pad(shown, ((1, 2), (1, 2), (0, 0)))
+    x, y = (np.clip((w + 1) / 2 * (side - 1), -1, side) for w in (hits.u, hits.v))
+    column, row = np.floor(x).astype(int) + 1, np.floor(y).astype(int) + 1
+    fx, fy = (x - np.floor(x))[..., None], (y - np.floor(y))[..., None]
+    above = (1 - fx) * padded[row, column] + fx * padded[row, column + 1]
+    below = (1 - fx) * padded[row + 1, column] + fx * padded[row + 1, column + 1]
+    texel = (1 - fy) * above + fy * below
+    kink = np.minimum(abs(x - np.round(x)), abs(y - np.round(y)))
+    is_relevant = hits.closest_rho <= 2 * (1 + 2 / (side - 1)) ** 2
+    return hits, Shown(
+        np.where(np.isfinite(hits.rho), texel[..., 3], 0.0), texel[..., :3] - 0.1, np.inf, kink, is_relevant
+    )

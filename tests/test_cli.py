@@ -6,6 +6,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import tomllib
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from a2tg_jax import cli, startup
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.results import train_run as train_run_module
 from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.record import SceneSource, read_record
+from a2tg_jax.training import SYSTEMS
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -31,14 +34,14 @@ def untouched_jax(monkeypatch):
 
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory):
-    """A run interrupted after the first checkpoint of stage 2 and resumed, with both exit codes and messages."""
+    """A run interrupted after the first checkpoint of its textures and resumed, with both exit codes."""
     out = tmp_path_factory.mktemp("cli") / "run"
     arguments = ["train", "synthetic", "--out", str(out)]
     save = train_run_module.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
         save(path, checkpoint)
-        if path.name.startswith("stage2"):
+        if path.name.startswith("a2tg-textures"):
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
@@ -47,7 +50,7 @@ def tiny_run(tmp_path_factory):
         interrupted = cli.main([*arguments, *TINY])
         patch.undo()
         patch.setattr(cli, "configure_cpu", lambda: None)
-        resumed = cli.main([*arguments, "--resume"])
+        resumed = cli.main(["train", "--out", str(out), "--resume"])
     return RunFolder(out), interrupted, resumed
 
 
@@ -136,7 +139,87 @@ def test_preset_decides_the_defaults_of_the_numbers():
     for preset, iterations in (("quick", 2_000), ("paper", 30_000)):
         for flag in (["--preset", preset], [f"--preset={preset}"]):
             command = cli._parse("train", ["scene", "--out", "run", *flag, "--texture.cap", "8"])
-            assert (command.config.stage1_iterations, command.config.texture.cap) == (iterations, 8)
+            assert (command.options.stage1_iterations, command.options.texture.cap) == (iterations, 8)
+
+
+@pytest.mark.parametrize("name", ["gaussians-2d", "gaussians-2d-mcmc", "textured-gaussians", "a2tg"])
+def test_help_tells_the_options_of_a_system(capsys, name):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--system", name, "--help"])
+    text = capsys.readouterr().out
+    assert ("--densify.threshold" in text) == (name == "gaussians-2d")
+    assert ("--texture.side" in text) == (name == "textured-gaussians")
+    assert ("--texture.lookup.uv" in text) == (name in ("textured-gaussians", "a2tg"))
+    assert all(system in text for system in SYSTEMS)
+
+
+# Configuration files
+
+
+FILE = """
+scene = "synthetic"
+downscale = 2
+system = "textured-gaussians"
+preset = "quick"
+compare = ["gaussians-2d-mcmc"]
+[options.texture]
+side = 2
+"""
+
+
+def parsed_with_file(folder, text: str, *flags: str) -> cli.Train:
+    (folder / "mine.toml").write_text(text)
+    return cli._parse("train", ["--config", str(folder / "mine.toml"), "--out", "run", *flags])
+
+
+def test_flags_win_over_the_file(tmp_path):
+    said = parsed_with_file(tmp_path, FILE)
+    assert said.record.scene == SceneSource("synthetic", downscale=2)
+    assert (said.options.texture.side, said.options.stage1_iterations) == (2, 2_000)
+    won = parsed_with_file(tmp_path, FILE, "--texture.side", "3", "--downscale", "1", "--compare", "gaussians-2d")
+    assert (won.options.texture.side, won.options.stage1_iterations, won.downscale) == (3, 2_000, 1)
+    assert won.record.compare == ("gaussians-2d-mcmc", "gaussians-2d")
+    other_preset = parsed_with_file(tmp_path, FILE, "--preset", "paper").options
+    assert (other_preset.texture.side, other_preset.stage1_iterations) == (4, 30_000)
+    other_system = parsed_with_file(tmp_path, FILE, "--system", "gaussians-2d")
+    assert (other_system.record.name, other_system.options.stage1_iterations) == ("gaussians-2d", 30_000)
+
+
+def test_own_systems_are_found_in_the_current_directory(tmp_path, monkeypatch):
+    (tmp_path / "systems_of_mine.py").write_text(
+        "import dataclasses\n"
+        "from a2tg_jax.systems.a2tg import A2tg, TextureConfig\n"
+        "@dataclasses.dataclass(frozen=True, kw_only=True)\n"
+        "class Mine(A2tg):\n"
+        "    strength: float = 2.0\n"
+        "VARIANT = Mine(texture=TextureConfig(cap=8))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert cli.main(["info", "nowhere"]) == 2
+    arguments = ("scene", "--out", "run", "--preset", "quick", "--strength", "3")
+    own = cli._parse("train", [*arguments, "--system", "systems_of_mine:Mine"]).options
+    assert (type(own).__name__, own.strength, own.densify.cap, own.texture.cap) == ("Mine", 3.0, 10_000, 4)
+    variant = cli._parse("train", [*arguments, "--system", "systems_of_mine:VARIANT"]).options
+    assert (variant.strength, variant.densify.cap, variant.texture.cap) == (3.0, 10_000, 8)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--system", "b2tg"), "there is no system 'b2tg'; the systems are a2tg, "),
+        (("--system", "nowhere:B"), "'nowhere:B' cannot be imported: No module named 'nowhere'"),
+        (("--system", "os:sep"), "'os:sep' is no system"),
+        (("--preset", "fast"), "a2tg has the presets paper, official, quick, smoke; got 'fast'"),
+        (("--config", "nowhere.toml"), "nowhere.toml: no such configuration file"),
+        (("--compare", "b2tg"), "there is no system 'b2tg'"),
+        (("--compare", "a2tg"), "two systems of the run would be called 'a2tg'"),
+        (("--compare", "gaussians-2d", "--densify.cap", "1"), "densify.cap must be at least 2"),
+    ],
+)
+def test_wrong_system_is_one_clear_line(capsys, tmp_path, flags, message):
+    assert message in fails(capsys, "train", "synthetic", "--out", tmp_path / "run", *flags)
+    assert not (tmp_path / "run").exists()
 
 
 # Settings of JAX
@@ -205,21 +288,49 @@ def test_a_user_who_asks_for_the_log_gets_it(monkeypatch):
 def test_interrupted_and_resumed(tiny_run):
     run, interrupted, resumed = tiny_run
     assert (interrupted, resumed) == (130, 0)
-    assert len(run.checkpoints("stage2")) == 2
-    assert json.loads(run.config.read_text())["config"]["densify"]["cap"] == 60
+    assert len(run.checkpoints("a2tg-textures")) == 2
+    assert tomllib.loads(run.record.read_text())["options"]["densify"]["cap"] == 60
+
+
+def test_interruption_changes_nothing(tiny_run, tmp_path, capsys):
+    """The run that was interrupted is, bit for bit, the one that was not: run.toml repeats it."""
+    run, *_ = tiny_run
+    again = RunFolder(tmp_path / "again")
+    assert cli.main(["train", "--config", str(run.record), "--out", str(again.path)]) == 0
+    assert read_record(again) == read_record(run)
+    for path in (run.path / "models").iterdir():
+        with np.load(path) as model, np.load(again.model(path.stem)) as other:
+            assert model.files == other.files
+            for name in model.files:
+                np.testing.assert_array_equal(model[name], other[name])
+
+
+def test_interrupted_run_says_how_to_go_on(tiny_run, tmp_path, monkeypatch, capsys):
+    run, *_ = tiny_run
+    copy = RunFolder(shutil.copytree(run.path, tmp_path / "copy"))
+    copy.model("gaussians-2d-mcmc-continued").unlink()
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_run_module, "fit_stage", interrupt)
+    assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 130
+    error = capsys.readouterr().err
+    assert f"continued-000020.npz; go on with: a2tg train --out {copy.path} --resume" in error
 
 
 def test_run_folder_is_complete(tiny_run):
     run, *_ = tiny_run
     metrics = json.loads(run.metrics.read_text())
-    assert list(metrics["phases"]) == ["stage1", "stage2", "baseline"]
-    stage2 = metrics["phases"]["stage2"]
-    assert stage2["num_gaussians"] == 60 and stage2["num_texels"] > 60
-    assert stage2["megabytes"] == pytest.approx((232 * 60 + 16 * stage2["num_texels"]) / 1e6)
-    assert metrics["gain_db"] == pytest.approx(stage2["test"]["psnr"] - metrics["phases"]["baseline"]["test"]["psnr"])
+    assert list(metrics["models"]) == ["a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"]
+    main, other = metrics["models"]["a2tg-textures"], metrics["models"]["gaussians-2d-mcmc-continued"]
+    assert main["num_gaussians"] == 60 and main["num_texels"] > 60
+    assert main["num_bytes"] == 232 * 60 + 16 * main["num_texels"]
+    gain = main["test"]["psnr"] - other["test"]["psnr"]
+    assert metrics["gains_db"] == pytest.approx({"gaussians-2d-mcmc-continued": gain})
     for name in ("curves", "sizes", "resolutions"):
         assert (run.figures / f"{name}.png").is_file()
-    assert len(list(run.test.glob("*.png"))) == stage2["test"]["views"]
+    assert len(list(run.test.glob("*.png"))) == main["test"]["views"]
     assert load_ply(run.point_cloud).num == 60
     assert "http" not in run.report.read_text(encoding="utf-8")
 
@@ -228,34 +339,37 @@ def test_info(tiny_run, capsys):
     run, *_ = tiny_run
     assert cli.main(["info", str(run.path)]) == 0
     text = capsys.readouterr().out
-    assert "a2tg train synthetic --out" in text and "60 Gaussians" in text and "1×1: " in text
+    assert f"a2tg train --config {run.record} --out" in text and "60 Gaussians" in text and "1×1: " in text
 
 
 def test_finished_run_resumes_to_the_same_metrics(tiny_run, capsys):
     run, *_ = tiny_run
-    before = json.loads(run.metrics.read_text())["phases"]["stage2"]["test"]
+    before = json.loads(run.metrics.read_text())["models"]["a2tg-textures"]["test"]
     assert cli.main(["eval", str(run.path)]) == 0
-    assert "stage 2, textured" in capsys.readouterr().out
-    assert json.loads(run.metrics.read_text())["phases"]["stage2"]["test"] == before
+    assert "a2tg-textures" in capsys.readouterr().out
+    assert json.loads(run.metrics.read_text())["models"]["a2tg-textures"]["test"] == before
 
 
 def test_resume_refuses_other_numbers(tiny_run, capsys):
     run, *_ = tiny_run
     again = ("train", "synthetic", "--out", run.path, "--resume")
     assert "leave out --texture.k-a" in fails(capsys, *again, "--texture.k-a", "9")
+    assert "leave out --preset, which differs in --downscale, " in fails(capsys, *again, "--preset", "quick")
+    assert "there is no system" in fails(capsys, *again, "--compare", "b2tg")
     assert "was trained on synthetic" in fails(capsys, "train", run.path, "--out", run.path, "--resume")
 
 
 def test_damaged_model_is_one_clear_line(tiny_run, capsys, tmp_path):
     run, *_ = tiny_run
     copy = RunFolder(shutil.copytree(run.path, tmp_path / "copy"))
-    copy.model("stage2").write_bytes(b"PK")
-    assert "stage2.npz: is not an a2tg-jax model, or is damaged" in fails(capsys, "eval", copy.path)
+    copy.model("a2tg-textures").write_bytes(b"PK")
+    assert "a2tg-textures.npz: is not an a2tg-jax model, or is damaged" in fails(capsys, "eval", copy.path)
 
 
 def test_render(tiny_run, tmp_path, monkeypatch, capsys):
-    """Frames of both kinds; ffmpeg is a stand-in that writes its last argument."""
+    """Frames of both kinds, without the scene; ffmpeg is a stand-in that writes its last argument."""
     run, *_ = tiny_run
+    monkeypatch.delattr(SceneSource, "load")
     program = tmp_path / "bin" / "ffmpeg"
     program.parent.mkdir()
     program.write_text('#!/bin/sh\nfor last; do :; done\necho video > "$last"\n')
@@ -268,6 +382,8 @@ def test_render(tiny_run, tmp_path, monkeypatch, capsys):
     assert np.asarray(Image.open(frames[0])).std() > 1
     assert cli.main(["render", str(run.path), "--path", "test", "--out", str(tmp_path / "test")]) == 0
     assert len(list((tmp_path / "test").glob("*.png"))) == len(list(run.test.glob("*.png")))
+    capsys.readouterr()
+    assert "the run has the models a2tg-gaussians, " in fails(capsys, "render", run.path, "--model", "stage2")
 
 
 def test_render_without_ffmpeg_says_so(tiny_run, tmp_path, monkeypatch, capsys):

@@ -98,3 +98,35 @@ def test_results_are_views_of_the_buffers():
     name = ffi.registered("test double", None, lambda: handler)
     x = jnp.arange(6, dtype=jnp.float32).reshape(2, 3)
     np.testing.assert_array_equal(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((2, 3), jnp.float32))(x), 2 * x)
+
+
+ENDING = """
+import threading, time
+import jax, jax.numpy as jnp
+from a2tg_jax.kernels import foreign
+
+def handler(arguments, results):
+    if arguments[0][0] > 0:
+        begun.set()
+        time.sleep(0.02)
+    results[0][...] = 7
+
+def hundred(x):
+    for _ in range(100):
+        x = call(x)
+    return x
+
+begun, name = threading.Event(), foreign.registered("test", None, lambda: handler)
+call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))
+run = jax.jit(hundred)
+run(jnp.zeros(3)).block_until_ready()
+x = jnp.ones(3) + 0 * (jnp.ones((1500, 1500)) @ jnp.ones((1500, 1500)))[0, :3]
+threading.Thread(target=lambda: run(x).block_until_ready(), daemon=True).start()
+begun.wait()
+raise SystemExit(3)
+"""
+
+
+def test_a_program_ends_well_while_functions_run_and_are_still_to_run():
+    done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 3, done.stderr

@@ -67,7 +67,7 @@ def assert_same_model(found: Model, wanted: Model) -> None:
 
 
 def test_round_trip(tmp_path):
-    save_model(tmp_path / "m.npz", textured_model(), {"note": "kept"})
+    save_model(tmp_path / "m.npz", textured_model(), {"note": "kept", "format": "of the caller"})
     assert_same_model(load_model(tmp_path / "m.npz"), textured_model())
     assert read_archive_header(tmp_path / "m.npz", format=FORMAT)["note"] == "kept"
 

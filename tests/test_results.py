@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shlex
+import tomllib
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,6 @@ import pytest
 
 from a2tg_jax import cli
 from a2tg_jax.cameras import Camera
-from a2tg_jax.checkpoint import History
-from a2tg_jax.config import DensifyConfig, TextureConfig, TrainConfig
 from a2tg_jax.data import View, view_image
 from a2tg_jax.evaluation import Evaluation, ViewMetrics, evaluate
 from a2tg_jax.gaussians import init_from_points
@@ -23,20 +22,37 @@ from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_fig
 from a2tg_jax.results.folder import create_run, open_run
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.pictures import error_picture, largest_gain, resolution_colors, side_by_side, to_uint8
-from a2tg_jax.results.record import RunRecord, SceneSource, changed_fields, read_record, write_record
+from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import (
+    RunRecord,
+    SceneSource,
+    changed_numbers,
+    read_record,
+    repeating_command,
+    write_record,
+)
 from a2tg_jax.results.report import SECTIONS, Comparison, write_report
-from a2tg_jax.results.summary import PhaseResult, RunResult, metrics_json, minutes, per_view_json, summary_text
+from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, minutes, per_view_json, summary_text
+from a2tg_jax.systems.a2tg import A2tg, TextureConfig
+from a2tg_jax.systems.gaussians_2d import Gaussians2d
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.systems.textured_gaussians import TexturedGaussians
+from a2tg_jax.training import History, LearningRates, like
 
-RECORD = RunRecord(SceneSource("scenes/a b", downscale=2), TrainConfig.quick(), baseline=True)
+RECORD = RunRecord(SceneSource("/scenes/a b", downscale=2), "a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc",))
+NAMES = ["a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"]
 
 
 def some_result(record: RunRecord = RECORD) -> RunResult:
-    def phase(psnr: float, texels: int) -> PhaseResult:
+    def measured(psnr: float, texels: int) -> ModelResult:
         views = (ViewMetrics("a<b.png", psnr, 0.5, 0.25), ViewMetrics("c.png", psnr + 2, 0.7, 0.75))
         found = Evaluation(views, "alex", 20.0, ())
-        return PhaseResult(found, found, 100, texels, 0.0232 + 16e-6 * texels, 0.0, 62.0)
+        num_bytes = 23_200 + 16 * texels
+        return ModelResult(found, found, 100, texels, num_bytes, num_bytes, 0, 62.0)
 
-    return RunResult("scene", record, {"stage1": phase(20, 0), "stage2": phase(23, 300), "baseline": phase(22, 0)})
+    models = dict(zip(NAMES, (measured(20, 0), measured(23, 300), measured(22, 0)), strict=True))
+    return RunResult("scene", record, record.plan, models)
 
 
 def some_history(stage: int = 1, num: int = 60) -> History:
@@ -104,7 +120,7 @@ def test_folder_of_a_run_that_never_began_is_free(tmp_path):
 def test_overwrite_deletes_only_what_runs_write(tmp_path):
     run = create_run(tmp_path / "run")
     write_record(run, RECORD)
-    own = [run.model("stage1"), run.history("stage2"), run.checkpoint("stage1", 5), run.report, run.test / "a.png"]
+    own = [run.model(NAMES[0]), run.history(NAMES[1]), run.checkpoint(NAMES[0], 5), run.report, run.test / "a.png"]
     foreign = [
         tmp_path / "outside.txt",
         run.path / "notes.txt",
@@ -124,7 +140,7 @@ def test_overwrite_deletes_only_what_runs_write(tmp_path):
 def test_a_scene_is_never_overwritten(tmp_path):
     """A Blender scene has folders that runs have too."""
     photographs = [tmp_path / split / "r_0.png" for split in ("train", "test", "models", "figures")]
-    for path in [*photographs, tmp_path / "transforms_train.json", tmp_path / "config.json"]:
+    for path in [*photographs, tmp_path / "transforms_train.json", tmp_path / "run.toml"]:
         path.parent.mkdir(exist_ok=True)
         path.touch()
     with pytest.raises(FileExistsError, match="not a run folder"):
@@ -138,12 +154,15 @@ def test_open_run_wants_a_run(tmp_path):
 
 
 def test_newest_checkpoints_are_kept(tmp_path):
+    """Those of a stage whose name begins alike are another's."""
     run = create_run(tmp_path)
-    for iteration in (20, 100, 1000, 3):
-        run.checkpoint("stage1", iteration).parent.mkdir(exist_ok=True)
-        run.checkpoint("stage1", iteration).touch()
-    run.drop_old_checkpoints("stage1")
-    assert run.checkpoints("stage1") == [run.checkpoint("stage1", 100), run.checkpoint("stage1", 1000)]
+    kept = [run.checkpoint("a-b", 7), run.checkpoint("a", 999_999), run.checkpoint("a", 1_000_000)]
+    for path in [*kept, *(run.checkpoint("a", iteration) for iteration in (20, 100, 1000, 3))]:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    run.drop_old_checkpoints("a")
+    assert [*run.checkpoints("a-b"), *run.checkpoints("a")] == kept
+    assert sorted(kept[0].parent.iterdir()) == sorted(kept)
 
 
 # Records
@@ -155,63 +174,162 @@ def test_record_round_trip(tmp_path):
     assert read_record(run) == RECORD
 
 
-def test_damaged_record_is_one_clear_line(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scene = {", r"run\.toml: is not valid TOML"),
+        ('system = "a2tg"', r"run\.toml: scene is missing"),
+        ('scene = "a"\nscenes = "b"', r"run\.toml: scenes is not a field of RunFile; did you mean scene\?"),
+        ("scene = 3", r"run\.toml: scene must be str \| None; got 3"),
+        ('scene = "a"\ncompare = [1]', r"run\.toml: compare must be tuple\[str, \.\.\.\]; got \[1\]"),
+        ('scene = "a"\n[options.texture]\ncaps = 4', r"run\.toml: options\.texture\.caps is not .*did you mean cap\?"),
+        ('scene = "a"\n[options]\nseed = 0.5', r"run\.toml: options\.seed must be int; got 0\.5"),
+        ('scene = "a"\n[options]\ntexture = 1', r"run\.toml: options\.texture must hold the fields of TextureConfig"),
+        ('scene = "a"\n[options.texture]\nupscale_at = ["1"]', r"run\.toml: options\.texture\.upscale_at must be"),
+        (
+            'scene = "a"\n[options.texture]\naxes = "both"',
+            r"options\.texture\.axes must be Literal\['paper', ",
+        ),
+        ('scene = "a"\nsystem = "b2tg"', "there is no system 'b2tg'; the systems are a2tg, "),
+        ('scene = "a"\npreset = "fast"', "a2tg has the presets paper, .*; got 'fast'"),
+    ],
+)
+def test_wrong_record_is_one_clear_line(tmp_path, text, message):
     run = create_run(tmp_path)
-    run.config.write_text("{")
-    with pytest.raises(ValueError, match=r"config\.json: is not valid JSON"):
+    run.record.write_text(text)
+    with pytest.raises(ValueError, match=message):
         read_record(run)
-    run.config.write_text(json.dumps({"source": {}, "config": {}, "baseline": True}))
-    with pytest.raises(ValueError, match=r"config\.json\.source\.path is missing"):
-        read_record(run)
+
+
+def test_configuration_file_says_a_part(tmp_path):
+    run = create_run(tmp_path / "run")
+    run.record.write_text('scene = "../fox"\npreset = "quick"\n[options.texture]\nk_a = 9\nupscale_at = [1, 0.5]\n')
+    record = read_record(run)
+    assert record.scene == SceneSource(str(tmp_path / "fox"))
+    assert (record.system.stage1_iterations, record.system.densify.cap) == (2_000, 10_000)
+    assert (record.system.texture.k_a, record.system.texture.upscale_at) == (9.0, (1.0, 0.5))
+    assert all(isinstance(number, float) for number in (record.system.texture.k_a, *record.system.texture.upscale_at))
 
 
 @pytest.mark.parametrize(
-    "config",
+    ("name", "system", "compare"),
     [
-        TrainConfig.quick(),
-        TrainConfig(
-            texture=TextureConfig(is_enabled=False, upscale_at=(0.1, 0.5), budget_mb=3.5),
-            densify=DensifyConfig(cap=7),
-            initial_gaussians=50,
-            background="white",
+        ("a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc", "textured-gaussians")),
+        (
+            "a2tg",
+            A2tg(
+                texture=TextureConfig(select="budget", upscale_at=(0.1, 0.5), budget_mb=3.5),
+                densify=McmcConfig(cap=7),
+                initial_gaussians=50,
+                background="white",
+                rates=LearningRates(quats=float("inf")),
+            ),
+            (),
         ),
+        ("gaussians-2d", Gaussians2d(seed=5), ("gaussians-2d-mcmc",)),
     ],
 )
-def test_command_repeats_the_run(tmp_path, config):
-    record = RunRecord(SceneSource(str(tmp_path / "a b"), downscale=4), config, baseline=True)
-    a2tg, name, *arguments = shlex.split(record.command(tmp_path / "run"))
-    assert (a2tg, cli._parse(name, arguments).record) == ("a2tg", record)
+def test_command_repeats_the_run(tmp_path, name, system, compare):
+    """run.toml holds every number, so that other defaults, or a preset, change nothing."""
+    record = RunRecord(SceneSource(str(tmp_path / "a b"), downscale=4), name, system, compare)
+    run = create_run(tmp_path / "run c")
+    write_record(run, record)
+    assert tomllib.loads(run.record.read_text())["options"]["stage1_iterations"] == system.stage1_iterations
+    a2tg, command, *arguments = shlex.split(repeating_command(run))
+    again = cli._parse(command, arguments)
+    assert (a2tg, again.record, again.out) == ("a2tg", record, tmp_path / "run c-again")
 
 
-def test_changed_fields_are_those_asked_for_in_vain():
-    kept = TrainConfig.quick()
-    asked = dataclasses.replace(TrainConfig.paper(), seed=3)
-    assert changed_fields(asked, TrainConfig.paper(), kept) == ["seed"]
-    assert changed_fields(TrainConfig.paper(), TrainConfig.paper(), kept) == []
-    assert changed_fields(kept, TrainConfig.paper(), kept) == []
+def test_changed_numbers_are_named():
+    changed = dataclasses.replace(RECORD.system, seed=3, texture=TextureConfig(cap=8))
+    asked = dataclasses.replace(RECORD, scene=SceneSource("/scenes/a b", downscale=4), system=changed)
+    assert changed_numbers(asked, RECORD) == ["downscale", "seed", "texture.cap"]
+    assert changed_numbers(RECORD, RECORD) == []
+    assert "system" in changed_numbers(dataclasses.replace(RECORD, name="gaussians-2d", system=Gaussians2d()), RECORD)
+
+
+# Plans
+
+
+def test_shared_stages_are_trained_once():
+    main = A2tg.preset("quick")
+    kinds = {"baseline": Gaussians2dMcmc, "fixed": TexturedGaussians, "density": Gaussians2d}
+    plan = plan_run({"main": main, **{label: like(kind, main) for label, kind in kinds.items()}})
+    assert plan.names == (
+        "main-gaussians", "main-textures", "baseline-continued", "fixed-textures", "density-gaussians",
+        "density-continued",
+    )  # fmt: skip
+    assert plan.chains["fixed"] == ("main-gaussians", "fixed-textures")
+    assert [planned.start for planned in plan.stages][1:4] == ["main-gaussians"] * 3
+    assert plan.first_iteration("density-continued") == 2_000
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": 1},
+        {"batch_size": 2},
+        {"initial_opacity": 0.2},
+        {"background": "white"},
+        {"stage1_iterations": 7},
+        {"rates": LearningRates(sh_rest=1.0)},
+        {"densify": McmcConfig(cap=9)},
+    ],
+)
+def test_stages_that_differ_are_not_shared(change):
+    main = A2tg()
+    assert len(plan_run({"a": main, "b": main}).stages) == 2
+    assert len(plan_run({"a": main, "b": dataclasses.replace(main, **change)}).stages) == 4
+
+
+def test_compared_systems_take_the_options(tmp_path, monkeypatch):
+    (tmp_path / "variants_of_mine.py").write_text(
+        "from a2tg_jax import A2tg\nfrom a2tg_jax.systems.a2tg import TextureConfig\n"
+        "SQUARE = A2tg(texture=TextureConfig(anisotropic=False))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    record = dataclasses.replace(RECORD, compare=("variants_of_mine:SQUARE", "textured-gaussians"))
+    square, fixed = list(record.systems.values())[1:]
+    assert list(record.systems) == ["a2tg", "SQUARE", "textured-gaussians"]
+    assert square == dataclasses.replace(RECORD.system, texture=TextureConfig(anisotropic=False))
+    assert (fixed.stage1_iterations, fixed.densify.cap) == (2_000, 10_000)
+    with pytest.raises(ValueError, match="would be called 'a2tg'"):
+        dataclasses.replace(RECORD, compare=("a2tg",)).check()
 
 
 # Summaries
 
 
-def test_gain_is_over_the_baseline():
+def test_gains_are_over_the_compared_systems():
     result = some_result()
-    assert result.gain == pytest.approx(1.0)
-    assert dataclasses.replace(result, phases={"stage1": result.phases["stage1"]}).gain is None
+    assert result.main == "a2tg-textures" and result.before == ["a2tg-gaussians"]
+    assert result.gains == pytest.approx({"gaussians-2d-mcmc-continued": 1.0})
+    unfinished = dataclasses.replace(result, models={NAMES[0]: result.models[NAMES[0]]})
+    assert (unfinished.main, unfinished.before, unfinished.gains) == ("a2tg-gaussians", [], {})
 
 
 def test_metrics_hold_means_of_the_views():
     metrics = json.loads(json.dumps(metrics_json(some_result())))
-    assert metrics["phases"]["stage2"]["test"] == {"psnr": 24.0, "ssim": 0.6, "lpips": 0.5, "views": 2}
+    assert metrics["models"]["a2tg-textures"]["test"] == {"psnr": 24.0, "ssim": 0.6, "lpips": 0.5, "views": 2}
     assert metrics["lpips_network"] == "alex"
-    assert per_view_json(some_result())["stage1"]["train"]["c.png"]["psnr"] == 22
+    assert metrics["models"]["a2tg-textures"]["num_bytes"] == 28_000
+    assert metrics["gains_db"] == {"gaussians-2d-mcmc-continued": 1.0}
+    assert per_view_json(some_result())["a2tg-gaussians"]["train"]["c.png"]["psnr"] == 22
 
 
-def test_summary_has_a_column_for_each_phase():
+def test_summary_has_a_column_for_each_model():
     lines = summary_text(some_result()).splitlines()
-    assert re.split(r"\s{2,}", lines[0])[1:] == ["stage 1", "stage 2, textured", "stage 2, untextured"]
+    assert re.split(r"\s{2,}", lines[0])[1:] == NAMES
     assert lines[1].split() == ["test", "PSNR", "(dB)", "21.00", "24.00", "23.00"]
-    assert lines[-1] == "textures bring +1.00 dB over the untextured second stage"
+    assert lines[-1] == "a2tg-textures gains +1.00 dB over gaussians-2d-mcmc-continued"
+
+
+def test_published_bytes_stand_beside_other_counts():
+    result = some_result()
+    assert "published" not in summary_text(result)
+    counted = dataclasses.replace(result.models[NAMES[1]], num_published_bytes=20_000)
+    text = summary_text(dataclasses.replace(result, models={**result.models, NAMES[1]: counted}))
+    assert re.search(r"as published \(MB\) +0\.02\n", text)
 
 
 def test_durations():
@@ -261,9 +379,14 @@ def test_resolution_colors_differ():
 
 
 def test_figures_are_written(tmp_path):
-    histories = {"stage1": some_history(1), "stage2": some_history(2), "baseline": some_history(2)}
+    histories = {NAMES[0]: some_history(1), NAMES[1]: some_history(2), NAMES[2]: some_history(2)}
+    starts = {NAMES[0]: 0, NAMES[1]: 60, NAMES[2]: 60}
     sizes = np.array([(1, 1), (1, 4), (4, 2), (1, 1), (8, 8)])
-    figures = [curves_figure(histories), sizes_figure(sizes), resolutions_figure(np.zeros((30, 40, 3), np.uint8), 7)]
+    figures = [
+        curves_figure(histories, starts),
+        sizes_figure(sizes),
+        resolutions_figure(np.zeros((30, 40, 3), np.uint8), 7),
+    ]
     for index, figure in enumerate(figures):
         save_figure(tmp_path / f"{index}.png", figure)
         assert (tmp_path / f"{index}.png").stat().st_size > 1000
@@ -274,7 +397,7 @@ def test_figures_are_written(tmp_path):
 
 def test_report_is_one_self_contained_page(tmp_path):
     run = create_run(tmp_path)
-    save_figure(run.figures / "curves.png", curves_figure({"stage1": some_history()}))
+    save_figure(run.figures / "curves.png", curves_figure({"a": some_history()}, {"a": 0}))
     image = np.zeros((30, 40, 3), np.uint8)
     crop = largest_gain(image, image, image)
     write_report(run, some_result(), [Comparison("a<b.png", [image] * 3, ["photograph", "before", "after"], crop)])

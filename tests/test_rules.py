@@ -1,11 +1,14 @@
-"""The protocol of appearance rules: numbers of each splat, largest alpha, low-pass filter, what rules may not do."""
+"""Appearance rules other than textures against the oracle: one made up here, movable kernels, and billboards."""
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import oracle_rules
 import pytest
 from oracle import DEFAULT_RULES
@@ -14,9 +17,14 @@ from test_oracle import EDGE_ON, hand_scene
 from test_render import errors
 from test_render_gradients import CLEARANCE, assert_gradients_close, differences, draw_weights
 
-from a2tg_jax import Camera, RenderSettings, render_appearance
-from a2tg_jax.appearance import PlainRule
+from a2tg_jax import Camera, RenderSettings, Textures, render_appearance
+from a2tg_jax.appearance import AppearanceRule, Billboards, MovableKernelParams, MovableKernels, PlainRule
 from a2tg_jax.numerics import normalize
+from a2tg_jax.render import render_traced
+from a2tg_jax.texture import plan_layout
+
+SIDE = 4
+"""Of the billboards."""
 
 
 @jax.tree_util.register_dataclass
@@ -45,6 +53,11 @@ class GlossyRule(PlainRule):
         return 2 * exponents * (jnp.exp(jnp.log(255 * opacities) / exponents) - 1)
 
 
+def rounded(params: dict, dtype: str) -> dict[str, np.ndarray]:
+    """Numbers of float32, so that both precisions start from the same ones."""
+    return {name: np.asarray(value, np.float32).astype(dtype) for name, value in params.items()}
+
+
 def glossy_params(num: int, dtype="float64") -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
     params = {
@@ -52,11 +65,67 @@ def glossy_params(num: int, dtype="float64") -> dict[str, np.ndarray]:
         "axes": rng.normal(size=(num, 3)),
         "log_exponents": rng.uniform(0.5, 2, num),
     }
-    return {name: np.asarray(value, np.float32).astype(dtype) for name, value in params.items()}
+    return rounded(params, dtype)
 
 
 def glossy_rule(params: dict, **static) -> GlossyRule:
     return GlossyRule(**jax.tree.map(jnp.asarray, params), **static)
+
+
+def kernel_params(num: int, dtype="float64") -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    params = {
+        "centers": rng.normal(size=(num, 4, 2)),
+        "sharpness": rng.uniform(0.05, 1, (num, 4)),
+        "logit_opacities": rng.uniform(-1, 2, (num, 4)),
+        "colors": rng.normal(scale=0.4, size=(num, 4, 3)),
+    }
+    return rounded(params, dtype)
+
+
+def kernel_rule(params: dict):
+    return MovableKernels().rule(MovableKernelParams(**jax.tree.map(jnp.asarray, params)), ())
+
+
+def billboard_params(num: int, dtype="float64") -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    alpha = rng.uniform(0.1, 0.9, (num, SIDE, SIDE, 1))
+    return rounded({"texels": np.concatenate([rng.normal(size=(num, SIDE, SIDE, 3)), alpha], axis=-1)}, dtype)
+
+
+def billboard_rule(params: dict):
+    texels = jnp.asarray(params["texels"])
+    layout, (capacity,) = plan_layout(np.full((len(texels), 2), SIDE))
+    padding = jnp.ones((capacity - len(texels), SIDE, SIDE, 4), texels.dtype)
+    return Billboards(side=SIDE).rule(Textures((jnp.concatenate([texels, padding]),)), layout)
+
+
+class Case(NamedTuple):
+    """A rule, and what the oracle says of it."""
+
+    params: Callable[..., dict]
+    rule: Callable[[dict], AppearanceRule]
+    show: oracle_rules.Show
+    is_gaussian_opaque: bool
+    """The Gaussian's own opacity counts."""
+    smooth_seed: int
+    """A scene that keeps clear of thresholds and kinks."""
+    max_alpha: float = 0.99
+
+
+CASES = {
+    "glossy": Case(glossy_params, glossy_rule, oracle_rules.glossy, True, 53),
+    "glossy, no low-pass filter": Case(
+        glossy_params,
+        functools.partial(glossy_rule, has_low_pass=False, max_alpha=0.7),
+        functools.partial(oracle_rules.glossy, has_low_pass=False),
+        True,
+        1,
+        0.7,
+    ),
+    "movable kernels": Case(kernel_params, kernel_rule, oracle_rules.movable, False, 1),
+    "billboards": Case(billboard_params, billboard_rule, oracle_rules.billboard, False, 0),
+}
 
 
 def rendered(scene, rule, compositor="auto", dtype="float64"):
@@ -65,68 +134,110 @@ def rendered(scene, rule, compositor="auto", dtype="float64"):
     return render_appearance(as_gaussians(scene, dtype), camera, rule, background=background, settings=settings)
 
 
+def expected_image(case: Case, scene, params) -> oracle.Image:
+    return oracle_rules.render_rule(scene, params, case.show, DEFAULT_RULES._replace(max_alpha=case.max_alpha))
+
+
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("compositor", ["native", "xla"])
-@pytest.mark.parametrize(("has_low_pass", "max_alpha"), [(True, 0.99), (False, 0.7)])
-def test_numbers_that_depend_on_the_view(compositor, has_low_pass, max_alpha):
-    scene = draw_scene(4)
-    params = glossy_params(len(scene.means))
-    show = functools.partial(oracle_rules.glossy, has_low_pass=has_low_pass)
-    expected = oracle_rules.render_rule(scene, params, show, DEFAULT_RULES._replace(max_alpha=max_alpha))
-    assert expected.margin.min() > 1e-9
-    rule = glossy_rule(params, has_low_pass=has_low_pass, max_alpha=max_alpha)
-    output = rendered(scene, rule, compositor)
+@pytest.mark.parametrize("name", CASES)
+def test_float64(name, compositor):
+    case, scene = CASES[name], draw_scene(4)
+    params = case.params(len(scene.means))
+    expected = expected_image(case, scene, params)
+    assert expected.margin.min() > 1e-9 and expected.alpha.max() > 0.9
+    output = rendered(scene, case.rule(params), compositor)
     for name, error in errors(output, expected, np.full(expected.alpha.shape, True)).items():
         assert error.max() < 1e-9, name
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_float32(name):
+    """As the textures' test of float32."""
+    case, scene = CASES[name], draw_scene(4)
+    expected = expected_image(case, scene, case.params(len(scene.means)))
+    is_compared = expected.margin > 1e-4
+    assert is_compared.mean() > 0.95
+    output = rendered(scene, case.rule(case.params(len(scene.means), "float32")), dtype="float32")
+    for name, error in errors(output, expected, is_compared).items():
+        assert np.mean(error < 1e-5) >= 0.99, name
+        assert np.mean(error < 3e-4) >= 0.999, name
+
+
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("compositor", ["native", "xla"])
-@pytest.mark.parametrize("has_low_pass", [True, False])
-def test_gradients_of_numbers_against_differences(compositor, has_low_pass):
-    scene = draw_smooth_scene(53)
-    params, weights = glossy_params(len(scene.means)), draw_weights(scene)
-    show = functools.partial(oracle_rules.glossy, has_low_pass=has_low_pass)
-    image = oracle_rules.render_rule(scene, params, show)
+@pytest.mark.parametrize("name", CASES)
+def test_every_leaf_against_differences(name, compositor):
+    """Of the rule, of the Gaussians, and of the camera, on which the numbers may depend."""
+    case = CASES[name]
+    scene = draw_smooth_scene(case.smooth_seed)
+    params, weights = case.params(len(scene.means)), draw_weights(scene)
+    image = expected_image(case, scene, params)
     assert min(image.margin.min(), image.kink.min()) > CLEARANCE
+    settings, background = RenderSettings(compositor=compositor), jnp.asarray(scene.background)
 
     def loss(params, gaussians, viewmat):
         camera = Camera(viewmat, jnp.asarray(scene.K), scene.width, scene.height)
-        rule = glossy_rule(params, has_low_pass=has_low_pass)
-        settings = RenderSettings(compositor=compositor)
-        output = render_appearance(gaussians, camera, rule, background=jnp.asarray(scene.background), settings=settings)
+        output = render_appearance(gaussians, camera, case.rule(params), background=background, settings=settings)
         return sum(jnp.sum(getattr(output, name) * jnp.asarray(weight)) for name, weight in weights.items())
 
     def expected_loss(scene, params):
-        image = oracle_rules.render_rule(scene, params, show)
+        image = expected_image(case, scene, params)
         return sum(np.sum(getattr(image, name) * weight) for name, weight in weights.items())
 
     found = jax.grad(loss, argnums=(0, 1, 2))(params, as_gaussians(scene, "float64"), jnp.asarray(scene.viewmat))
-    for name in params:
-        expected = differences(params[name], lambda value, name=name: expected_loss(scene, params | {name: value}))
-        assert_gradients_close(found[0][name], expected, name)
-    leaves = {name: getattr(found[1], name) for name in ("means", "quats", "log_scales", "logit_opacities")}
-    for name, gradient in (leaves | {"viewmat": found[2]}).items():
-        moved = lambda value, name=name: expected_loss(scene._replace(**{name: value}), params)  # noqa: E731
-        assert_gradients_close(gradient, differences(getattr(scene, name), moved), name)
+    for leaf in params:
+        expected = differences(params[leaf], lambda value, leaf=leaf: expected_loss(scene, params | {leaf: value}))
+        assert_gradients_close(found[0][leaf], expected, leaf)
+    leaves = {leaf: getattr(found[1], leaf) for leaf in ("means", "quats", "log_scales")} | {"viewmat": found[2]}
+    if case.is_gaussian_opaque:
+        leaves["logit_opacities"] = found[1].logit_opacities
+    else:
+        np.testing.assert_array_equal(found[1].logit_opacities, 0)
+    for leaf, gradient in leaves.items():
+        moved = lambda value, leaf=leaf: expected_loss(scene._replace(**{leaf: value}), params)  # noqa: E731
+        assert_gradients_close(gradient, differences(getattr(scene, leaf), moved), leaf)
 
 
-@pytest.mark.parametrize("has_low_pass", [True, False])
-def test_pallas_kernels_take_numbers(has_low_pass):
-    scene = draw_scene(4, num=16, width=19, height=13)
+@pytest.mark.parametrize("name", ["glossy", "movable kernels", "billboards"])
+def test_pallas_kernels_are_those_of_xla(name):
+    case, scene = CASES[name], draw_scene(4, num=16, width=19, height=13)
 
     def loss(params, gaussians, compositor):
-        rule = glossy_rule(params, has_low_pass=has_low_pass)
         settings = RenderSettings(compositor=compositor)
-        output = render_appearance(gaussians, as_camera(scene, "float32"), rule, settings=settings)
+        output = render_appearance(gaussians, as_camera(scene, "float32"), case.rule(params), settings=settings)
         return jnp.sum(output.color**2), output.color
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    inputs = glossy_params(16, "float32"), as_gaussians(scene, "float32")
+    inputs = case.params(16, "float32"), as_gaussians(scene, "float32")
     wanted, found = (jax.tree.leaves(differentiate(*inputs, compositor)) for compositor in ("xla", "pallas"))
     for a, b in zip(wanted, found, strict=True):
         assert np.isfinite(a).all()
         np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", ["native", "xla"])
+def test_the_statistic_takes_the_way_of_the_falloff(compositor):
+    """At one pixel, of splats whose mean does nothing else, it is the size of the gradient; none, for billboards."""
+    scene = draw_smooth_scene(53)
+    scene = scene._replace(width=1, height=1, K=scene.K * np.array([[1, 1, 0.06], [1, 1, 0.06], [1, 1, 1]]))
+    params = glossy_params(len(scene.means))
+    params["colors"][:] = 0
+    settings = RenderSettings(compositor=compositor, capacity=1024, sh_degree=0)
+    camera, background = as_camera(scene, "float64"), jnp.zeros(3)
+
+    def loss(gaussians, tap, rule):
+        output, _ = render_traced(gaussians, camera, rule, background, settings, has_geometry=False, tap=tap)
+        return jnp.sum(output.color)
+
+    differentiate = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    gaussians, tap = as_gaussians(scene, "float64"), jnp.zeros((len(scene.means), 4))
+    by_mean, statistic = differentiate(gaussians, tap, glossy_rule(params))
+    assert jnp.max(jnp.abs(by_mean.means)) > 1e-2
+    np.testing.assert_allclose(statistic[:, :3], jnp.abs(by_mean.means), atol=1e-12)
+    _, statistic = differentiate(gaussians, tap, billboard_rule(billboard_params(len(scene.means))))
+    np.testing.assert_array_equal(statistic[:, :3], 0)
 
 
 @jax.tree_util.register_dataclass
@@ -166,7 +277,7 @@ def test_a_largest_alpha_of_one_is_refused():
         rendered(scene, PlainRule(max_alpha=1.0), dtype="float32")
 
 
-@pytest.mark.parametrize("compositor", ["native", "xla", "pallas"])
+@pytest.mark.parametrize("compositor", ["native", "xla"])
 def test_without_a_low_pass_filter_edge_on_splats_show_nothing(compositor):
     scene = hand_scene([[0, 0, 4]], [EDGE_ON], [[0.0, 0.0]], [0.9], [[1, 1, 1]])
     params, settings = glossy_params(1, "float32"), RenderSettings(compositor=compositor)

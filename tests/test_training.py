@@ -6,16 +6,20 @@ import jax
 import numpy as np
 import pytest
 
-from a2tg_jax import TextureConfig, TrainConfig, fit, fit_stage2, load_checkpoint, save_checkpoint, synthetic_scene
-from a2tg_jax.config import DensifyConfig, LearningRates
-from a2tg_jax.step import initial_state, jitted_step
-from a2tg_jax.training import _allocate, _Stage
+from a2tg_jax import A2tg, fit, load_checkpoint, save_checkpoint, synthetic_scene
+from a2tg_jax.systems.a2tg import TextureConfig
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import LearningRates, fit_stage, like
+from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.start import initial_model
+from a2tg_jax.training.step import jitted_step
 
-CONFIG = TrainConfig(
+CONFIG = A2tg(
     stage1_iterations=24,
     stage2_iterations=20,
     initial_gaussians=100,
-    densify=DensifyConfig(cap=110),
+    densify=McmcConfig(cap=110),
     texture=TextureConfig(upscale_at=(0.3, 0.6)),
     seed=3,
 )
@@ -42,7 +46,7 @@ def trained(scene):
 
 
 def assert_same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, (a.gaussians, a.textures), (b.gaussians, b.textures))
+    jax.tree.map(np.testing.assert_array_equal, a.model, b.model)
 
 
 def test_one_trace_per_stage_and_upscaling(trained):
@@ -56,13 +60,13 @@ def test_both_stages_improve_and_grow(trained):
     assert history.stage.tolist() == [1] * 3 + [2] * 2
     assert np.isfinite(history.loss).all()
     assert history.loss[-1] < history.loss[0]
-    assert result.gaussians.num == 110
-    assert result.layout.num_texels > 110
+    assert result.model.num == 110
+    assert result.model.layout.num_texels > 110
 
 
 def test_texels_stay_where_they_belong(trained):
     result, _, _ = trained
-    for bucket in result.textures.buckets:
+    for bucket in result.model.params.buckets:
         alpha = np.asarray(bucket)[..., 3]
         assert alpha.min() >= 0 and alpha.max() <= 1
 
@@ -77,9 +81,11 @@ def test_resumed_run_is_the_same(scene, trained, tmp_path, which):
 
 def test_what_is_passed_in_stays_usable(scene, trained):
     result, checkpoints, _ = trained
-    again = fit_stage2(scene, result.stage1, CONFIG, progress=False)
+    first = result.stages[0].model
+    before = jax.tree.map(np.array, first)
+    again = fit_stage(scene, CONFIG, 1, first, progress=False)
     assert_same(again, result)
-    jax.tree.map(np.testing.assert_array_equal, again.stage1, result.stage1)
+    jax.tree.map(np.testing.assert_array_equal, first, before)
     for _ in range(2):
         assert_same(fit(scene, CONFIG, resume=checkpoints[-2], progress=False), result)
 
@@ -96,41 +102,43 @@ def test_checkpoint_of_another_configuration_is_refused(scene, trained):
 
 def test_overflow_loses_nothing(scene):
     def one_step(capacity):
-        gaussians, num = _allocate(scene, CONFIG)
-        stage = _Stage(scene, CONFIG, 1, initial_state(gaussians, num, None, False), None, None)
+        run = StageRun(scene, CONFIG, 0, initial_model(scene, CONFIG))
         if capacity is not None:
-            stage.capacities[scene.train[0].image.shape[:2]] = capacity
-        stage.step(1)
-        return stage
+            run.capacities[scene.train[0].image.shape[:2]] = capacity
+        taken = run.steps(1, 1)
+        return run, len(taken) or len(run.steps(1, 1))
 
-    small, ample = one_step(64), one_step(None)
+    (small, num_small), (ample, num_ample) = one_step(64), one_step(None)
+    assert (num_small, num_ample) == (1, 1)
     assert (small.num_regrown, ample.num_regrown) == (1, 0)
     jax.tree.map(np.testing.assert_array_equal, small.state, ample.state)
 
 
-def test_infinite_learning_rate_is_said_and_harms_nothing(scene, trained):
+def test_infinite_learning_rate_is_said_and_harms_nothing(scene):
     config = dataclasses.replace(CONFIG, rates=LearningRates(quats=float("inf")))
-    gaussians, num = _allocate(scene, config)
-    stage = _Stage(scene, config, 1, initial_state(gaussians, num, None, False), None, None)
-    kept = jax.tree.map(np.array, stage.state)
-    with pytest.raises(ValueError, match=r"not finite at iteration 1 of stage 1, view \S+"):
-        stage.step(1)
-    jax.tree.map(np.testing.assert_array_equal, stage.state, kept)
+    run = StageRun(scene, config, 0, initial_model(scene, config))
+    kept = jax.tree.map(np.array, run.state)
+    with pytest.raises(ValueError, match=r"not finite at iteration 1 of stage gaussians, view \S+"):
+        run.steps(1, 1)
+    jax.tree.map(np.testing.assert_array_equal, run.state, kept)
 
 
 def test_memory_budget_holds(scene, trained):
-    num = trained[0].stage1.num
-    budget = (248 * num + 16 * 50) / 1e6
+    first = trained[0].stages[0].model
+    budget = (248 * first.num + 16 * 50) / 1e6
     texture = dataclasses.replace(CONFIG.texture, select="budget", budget_mb=budget)
-    result = fit_stage2(scene, trained[0].stage1, dataclasses.replace(CONFIG, texture=texture), progress=False)
+    result = fit_stage(scene, dataclasses.replace(CONFIG, texture=texture), 1, first, progress=False)
     assert result.history.megabytes.max() <= budget
-    assert result.layout.num_texels > num
+    assert result.model.layout.num_texels > first.num
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"texture": TextureConfig(select="budget", budget_mb=0.001)}, "budget_mb is 0.001"),
+        (
+            {"texture": TextureConfig(select="budget", budget_mb=0.001)},
+            "budget of 0.001 MB is below the 0.027 MB",
+        ),
         ({"texture": TextureConfig(select="budget")}, "budget_mb must say"),
         ({"texture": TextureConfig(cap=32)}, "texture.cap"),
         ({"texture": TextureConfig(upscale_at=(0.5, 0.2))}, "upscale_at"),
@@ -140,11 +148,11 @@ def test_memory_budget_holds(scene, trained):
 )
 def test_impossible_configurations_are_refused(scene, trained, change, message):
     with pytest.raises(ValueError, match=message):
-        fit_stage2(scene, trained[0].stage1, dataclasses.replace(CONFIG, **change), progress=False)
+        fit_stage(scene, dataclasses.replace(CONFIG, **change), 1, trained[0].stages[0].model, progress=False)
 
 
 def test_batches_of_several_views(scene, trained):
-    config = dataclasses.replace(CONFIG, batch_size=2, stage2_iterations=3, texture=TextureConfig(is_enabled=False))
-    result = fit_stage2(scene, trained[0].stage1, config, progress=False)
+    config = dataclasses.replace(like(Gaussians2dMcmc, CONFIG), batch_size=2, stage2_iterations=3)
+    result = fit_stage(scene, config, 1, trained[0].stages[0].model, progress=False)
     assert np.isfinite(result.history.loss).all()
-    assert result.textures is None
+    assert result.model.params == ()

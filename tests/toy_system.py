@@ -75,5 +75,5 @@ class Toy(a2tg.System):
 
     def stages(self):
         losses = (*self.loss.terms(), a2tg.Term(ring_contrast, self.contrast_weight))
-        rates = a2tg.rates_of(self, self.rings_rate)
-        return (a2tg.Stage("rings", Rings(self.frequency), (Shrink(self.factor),), losses, rates, self.iterations),)
+        rings, events = Rings(self.frequency), (Shrink(self.factor),)
+        return (a2tg.Stage("rings", rings, events, losses, self.rates, self.iterations, self.rings_rate),)

@@ -1,6 +1,11 @@
 """What a splat shows: `AppearanceRule` is what the renderer is given, `Appearance` the value that makes one."""
 
 from a2tg_jax.appearance.base import Appearance as Appearance
+from a2tg_jax.appearance.billboards import BillboardRule as BillboardRule
+from a2tg_jax.appearance.billboards import Billboards as Billboards
+from a2tg_jax.appearance.movable_kernels import MovableKernelParams as MovableKernelParams
+from a2tg_jax.appearance.movable_kernels import MovableKernels as MovableKernels
+from a2tg_jax.appearance.movable_kernels import MovableKernelsRule as MovableKernelsRule
 from a2tg_jax.appearance.plain import Plain as Plain
 from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
 from a2tg_jax.appearance.rule import PlainRule as PlainRule

@@ -38,6 +38,10 @@ class Appearance:
         """The parameters moved to where they are allowed, after an update; traceable."""
         return params
 
+    def rates(self, rate: Any) -> Any:
+        """Adam's learning rates, a prefix of the parameters' tree, given what a stage says of them; traceable."""
+        return rate
+
     def num_floats(self, layout: Any, num: int) -> int:
         """Trained floats of `num` live Gaussians with all that they show, padding left out (host)."""
         per_row = sum(np.prod(leaf.shape[1:], dtype=int) for leaf in jax.tree.leaves(self._shapes(1)[0]))
@@ -81,7 +85,7 @@ class Appearance:
     def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:
         """Named arrays from which `from_arrays` makes parameters and layout again, without padding (host)."""
         leaves = jax.tree_util.tree_flatten_with_path(params)[0]
-        return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
+        return {_name(path): np.asarray(leaf) for path, leaf in leaves}
 
     def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Any, Any]:
         """What `arrays` was given.
@@ -91,7 +95,7 @@ class Appearance:
         """
         shapes, layout = self._shapes(1)
         leaves, treedef = jax.tree_util.tree_flatten_with_path(shapes)
-        names = [jax.tree_util.keystr(path) for path, _ in leaves]
+        names = [_name(path) for path, _ in leaves]
         missing = [name for name in names if name not in arrays]
         if missing:
             raise ValueError(f"the array {missing[0]} of {type(self).__name__} is missing")
@@ -105,3 +109,8 @@ class Appearance:
         row = lambda *shape: jax.ShapeDtypeStruct((num, *shape), jnp.float32)  # noqa: E731
         gaussians: Any = Gaussians(row(3), row(4), row(2), row(), row(16, 3))  # type: ignore[arg-type]
         return jax.eval_shape(self.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
+
+
+def _name(path: tuple) -> str:
+    """A leaf's name in a file, such as "kernels.centers"."""
+    return jax.tree_util.keystr(path, simple=True, separator=".")

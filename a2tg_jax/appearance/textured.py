@@ -11,18 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
 from a2tg_jax.bilinear import Image
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
-from a2tg_jax.texture import (
-    AtlasLayout,
-    Textures,
-    allocate_textures,
-    first_textures,
-    texture_arrays,
-    textures_from_arrays,
-)
+from a2tg_jax.texture import AtlasLayout, Textures, allocate_textures
 
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
@@ -148,7 +141,7 @@ def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Textured(Appearance):
+class Textured(Bucketed):
     """A texture for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
 
     start: tuple[int, int] = (1, 1)
@@ -169,40 +162,6 @@ class Textured(Appearance):
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
         texels = int(np.prod(layout.sizes[:num], axis=1).sum())
         return FLOATS_PER_GAUSSIAN * num + 4 * texels
-
-    def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
-        (bucket,) = self._only(params)
-        return Textures((bucket.at[: rows.shape[0]].set(bucket[rows]),))
-
-    def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
-        (bucket,) = self._only(params)
-        is_cleared = jnp.pad(is_cleared, (0, bucket.shape[0] - is_cleared.shape[0]))
-        return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
-
-    def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
-        return (params, layout) if num == layout.num else first_textures(params, layout, num)
-
-    def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
-        """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
-        texels = [array.reshape(-1, 4) for array in texture_arrays(params, layout)]
-        return {"sizes": layout.sizes, "texels": np.concatenate(texels) if texels else np.zeros((0, 4), np.float32)}
-
-    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Textures, AtlasLayout]:
-        missing = [name for name in ("sizes", "texels") if name not in arrays]
-        if missing:
-            raise ValueError(f"the array {missing[0]} of textures is missing")
-        sizes, texels = arrays["sizes"], arrays["texels"]
-        if sizes.ndim != 2 or sizes.shape[1] != 2 or texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
-            raise ValueError(f"sizes [N, 2] and texels [M, 4] disagree; got {sizes.shape} and {texels.shape}")
-        pieces = np.split(texels, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
-        return textures_from_arrays([piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)])
-
-    def _only(self, params: Textures) -> tuple[Array]:
-        if len(params.buckets) != 1:
-            raise ValueError(
-                f"textures of {len(params.buckets)} sizes cannot change rows inside a step: densify before they grow"
-            )
-        return params.buckets
 
 
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:

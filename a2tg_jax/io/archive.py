@@ -29,7 +29,7 @@ def write_archive(
       arrays: named arrays of plain dtypes; the name "header" is taken.
       format: what kind of archive this is; `read_archive` wants the same.
     """
-    text = json.dumps({"format": format, "version": VERSION, **header}, allow_nan=False)
+    text = json.dumps({**header, "format": format, "version": VERSION}, allow_nan=False)
     entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **entries)  # type: ignore[arg-type]

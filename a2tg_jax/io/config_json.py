@@ -1,6 +1,7 @@
 """Configuration dataclasses as JSON-able dictionaries, and back."""
 
 import dataclasses
+import difflib
 import types
 import typing
 from collections.abc import Mapping
@@ -31,11 +32,21 @@ def config_from_dict(kind: type[ConfigT], data: Mapping[str, Any], where: str = 
     names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
     for name in data:
         if name not in names:
-            raise ValueError(f"{where}.{name} is not a field of {kind.__name__}; it was written by another version")
+            raise ValueError(f"{_within(where, name)} is not a field of {kind.__name__}; {_instead(name, names)}")
     for name in names:
         if name not in data:
-            raise ValueError(f"{where}.{name} is missing; it was written by another version")
-    return kind(**{name: _from_json(hints[name], data[name], f"{where}.{name}") for name in names})
+            raise ValueError(f"{_within(where, name)} is missing; it was written by another version")
+    return kind(**{name: _from_json(hints[name], data[name], _within(where, name)) for name in names})
+
+
+def _within(where: str, name: str) -> str:
+    """What the errors call a field: where.name, or "FILE: name" where the place is "FILE:"."""
+    return f"{where} {name}" if where.endswith(":") else f"{where}.{name}"
+
+
+def _instead(name: str, names: list[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]}?" if close else f"it has {', '.join(names)}"
 
 
 def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -58,11 +69,16 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
     """`value` as the type that the annotation asks for."""
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
-    alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    for alternative in alternatives:
+    is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+    for alternative in typing.get_args(hint) if is_union else (hint,):
         if _fits(alternative, value):
-            return tuple(value) if isinstance(value, list) else value
-    raise ValueError(f"{where} must be {getattr(hint, '__name__', hint)}; got {value!r}")
+            return _converted(alternative, value)
+    raise ValueError(f"{where} must be {_told(hint)}; got {value!r}")
+
+
+def _told(hint: Any) -> str:
+    """A type as a user reads it."""
+    return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint).replace("typing.", "")
 
 
 def _fits(hint: Any, value: Any) -> bool:
@@ -71,7 +87,22 @@ def _fits(hint: Any, value: Any) -> bool:
     if origin is typing.Literal:
         return value in typing.get_args(hint)
     if origin is tuple:
-        return isinstance(value, list)
+        return isinstance(value, list) and all(map(_fits, _item_hints(hint, value), value))
     if isinstance(value, bool):
         return hint is bool
     return isinstance(value, (int, float) if hint is float else hint)
+
+
+def _converted(hint: Any, value: Any) -> Any:
+    """A value that fits, as the type itself."""
+    if typing.get_origin(hint) is tuple:
+        return tuple(map(_converted, _item_hints(hint, value), value))
+    return float(value) if hint is float else value
+
+
+def _item_hints(hint: Any, value: list) -> tuple:
+    """The types of the items of a tuple; too few or too many match no list of that length."""
+    first, *rest = typing.get_args(hint)
+    if rest == [...]:
+        return (first,) * len(value)
+    return (first, *rest) if len(value) == 1 + len(rest) else (type(None),) * len(value)

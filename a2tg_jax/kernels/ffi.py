@@ -83,6 +83,8 @@ class _CallFrame(ctypes.Structure):
 
 _Entry = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_CallFrame))
 _LOCK = threading.RLock()
+_AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # used as long as the process lives
 _entries: dict[str, tuple[Hashable, object]] = {}
 
 
@@ -99,8 +101,7 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
         if name not in _entries:
             entry = _Entry(_entry(make_handler()))
             _entries[name] = key, entry
-            address = ctypes.cast(entry, ctypes.c_void_p).value
-            jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
+            jax.ffi.register_ffi_target(name, _capsule(_gated(entry)), platform="cpu")
     return name
 
 
@@ -108,6 +109,15 @@ def _capsule(address: int | None, destructor: int | None = None):
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (_pointer, ctypes.c_char_p, _pointer)
     return new(address, None, destructor)
+
+
+def _gated(entry) -> int:
+    """The address of an entry behind the gate that the end of the program closes."""
+    from a2tg_jax.kernels import gate
+
+    address = ctypes.cast(entry, _pointer).value or 0
+    path = _CallFrame.api.offset, _Api.create_error.offset
+    return gate.gated(address, path, ctypes.addressof(_AT_THE_END))
 
 
 def _entry(handler: Handler) -> Callable[..., int | None]:

@@ -137,7 +137,7 @@ def _backward_kernel(
         if read is not None:
             _add_texels(d_table, read, [jnp.where(contributes, value, jnp.zeros_like(value)) for value in d.values])
         if how.statistic:
-            moved = splat.M, tile.x, tile.y, tile.center_x, tile.center_y, d.log_falloff, axes
+            moved = splat.M, tile.x, tile.y, tile.center_x, tile.center_y, d.rho, axes
             added = pixel.positional_gradient(how.statistic, *moved, how.near_plane, rule.has_low_pass)
             for k, number in enumerate((*map(total, added), jnp.sum(contributes.astype(weight.dtype)))):
                 _add(d_tap, (id_, k), number)

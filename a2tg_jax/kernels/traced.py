@@ -91,7 +91,7 @@ class Functions:
             state, weight, d = pixel.composite_vjp(rule, near_plane, *at_pixel, kind.statistic is not None)
             tap = ()
             if kind.statistic:
-                moved = splat.M, x, y, *center, d.log_falloff, jacobian
+                moved = splat.M, x, y, *center, d.rho, jacobian
                 tap = pixel.positional_gradient(kind.statistic, *moved, near_plane, rule.has_low_pass)
             return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, tap)
 

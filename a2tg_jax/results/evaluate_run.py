@@ -2,18 +2,17 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
 
-from a2tg_jax.config import TrainConfig
+from a2tg_jax.appearance import Textured
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.evaluation import evaluate
 from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
-from a2tg_jax.origin import BLACK, Color
+from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
-from a2tg_jax.results.folder import PHASES, Phase, RunFolder, write_json
+from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.pictures import (
     ERROR_GAIN,
@@ -26,108 +25,114 @@ from a2tg_jax.results.pictures import (
     texel_levels,
     to_uint8,
 )
-from a2tg_jax.results.record import RunRecord, read_record
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, write_report
-from a2tg_jax.results.summary import PhaseResult, RunResult, metrics_json, per_view_json
+from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.texture import AtlasLayout
-from a2tg_jax.training import render_settings
+from a2tg_jax.training import System
 
-WHITE: Color = (1.0, 1.0, 1.0)
 REPORTED_VIEWS = 4
 
 
 def evaluate_run(
     run: RunFolder, scene: Scene | None = None, *, lpips_weights: str | os.PathLike | None = None
 ) -> RunResult:
-    """Measures the finished phases of a run and writes what stands in its folder beside models and checkpoints.
+    """Measures the finished models of a run and writes what stands in its folder beside models and checkpoints.
 
     Args:
-      run: an opened run folder with one finished phase at least.
+      run: an opened run folder with one finished stage at least.
       scene: its scene, if it is loaded already.
       lpips_weights: a weights file for LPIPS; None leaves it out.
 
     Raises:
-      FileNotFoundError: if no phase is finished, or the scene or the weights are not where they were.
+      FileNotFoundError: if no stage is finished, or the scene or the weights are not where they were.
     """
     record = read_record(run)
-    models = {phase: load_model(run.model(phase)) for phase in PHASES if run.model(phase).is_file()}
+    plan = record.plan
+    models = {name: load_model(run.model(name)) for name in plan.names if run.model(name).is_file()}
     if not models:
         raise FileNotFoundError(f"{run.path} has no finished stage yet; go on with a2tg train … --resume")
-    scene = scene or record.source.load()
-    phases = {
-        phase: _measure(model, scene, record.phase_config(phase), _seconds(run, phase), lpips_weights)
-        for phase, model in models.items()
+    scene = scene or record.scene.load()
+    measured = {
+        name: _measure(model, scene, plan[name].system, _seconds(run, name), lpips_weights)
+        for name, model in models.items()
     }
-    result = RunResult(scene.name, record, phases)
+    result = RunResult(scene.name, record, plan, measured)
     write_json(run.own(run.metrics), metrics_json(result))
     write_json(run.own(run.per_view), per_view_json(result))
-    _write_figures(run, record, models, scene)
-    last = models.get("stage2") or models["stage1"]
-    save_ply(run.own(run.point_cloud), last.gaussians, transform=scene.transform)
-    views = scene.test or scene.train
-    for index in range(len(views)):
-        _write_sheet(run, _compare(views, index, result))
-    reported = range(0, len(views), -(-len(views) // REPORTED_VIEWS))
-    write_report(run, result, [_compare(views, index, result) for index in reported])
+    main = models[result.main]
+    _write_curves(run, plan, list(models))
+    if isinstance(main.appearance, Textured):
+        _write_texture_figures(run, main, plan[result.main].system, scene)
+    save_ply(run.own(run.point_cloud), main)
+    _write_pictures(run, result, scene.test or scene.train, main.background)
     return result
 
 
-def background_of(config: TrainConfig) -> Color:
-    """The background that test views are rendered on: the training's, or black where that was random."""
-    return WHITE if config.background == "white" else BLACK
+def settings_of(system: System) -> RenderSettings:
+    """How the models of a system are rendered."""
+    return RenderSettings(tile_size=system.tile_size, sh_degree=system.sh_degree)
 
 
-def _seconds(run: RunFolder, phase: Phase) -> float:
-    """Training time of a phase."""
-    return float(read_history(run.history(phase)).seconds[-1])
+def _seconds(run: RunFolder, name: str) -> float:
+    """Training time of a stage."""
+    return read_history(run.history(name)).last_seconds
 
 
-def _measure(model: Model, scene: Scene, config: TrainConfig, seconds: float, lpips_weights) -> PhaseResult:
+def _measure(model: Model, scene: Scene, system: System, seconds: float, lpips_weights) -> ModelResult:
     found = evaluate(
         (*scene.test, *scene.train),
         model,
-        settings=render_settings(config),
-        background=background_of(config),
+        settings=settings_of(system),
         lpips_weights=lpips_weights,
         num_renders=len(scene.test or scene.train),
     )
-    return PhaseResult(
+    return ModelResult(
         train=found[len(scene.test) :],
         test=found[: len(scene.test)] if scene.test else None,
         num_gaussians=model.num,
         num_texels=model.layout.num_texels if isinstance(model.layout, AtlasLayout) else 0,
-        megabytes=model.num_bytes / 1e6,
-        padding_megabytes=model.num_padding_bytes / 1e6,
+        num_bytes=model.num_bytes,
+        num_published_bytes=model.num_published_bytes,
+        num_padding_bytes=model.num_padding_bytes,
         seconds=seconds,
     )
 
 
-def _write_figures(run: RunFolder, record: RunRecord, models: Mapping[Phase, Model], scene: Scene) -> None:
-    histories = {phase: read_history(run.history(phase)) for phase in models}
-    save_figure(run.own(run.figures / "curves.png"), curves_figure(histories))
-    textured = models.get("stage2")
-    if textured is None or not isinstance(textured.layout, AtlasLayout):
-        return
-    save_figure(run.own(run.figures / "sizes.png"), sizes_figure(textured.layout.sizes))
-    cameras = [view.camera for view in (*scene.test, *scene.train)]
-    gaussians, textures, _ = colored_by_resolution(textured.gaussians, textured.params, textured.layout)
-    colored = dataclasses.replace(textured, gaussians=gaussians, params=textures)
-    background = background_of(record.config)
-    renderer = Renderer(colored, settings=render_settings(record.config), background=background, has_geometry=False)
-    picture = to_uint8(renderer(cameras[0]).color)
-    num_levels = int(texel_levels(textured.layout).max()) + 1
+def _write_curves(run: RunFolder, plan: RunPlan, names: list[str]) -> None:
+    """figures/curves.png: each stage after those that it follows."""
+    histories = {name: read_history(run.history(name)) for name in names}
+    starts = {name: plan.first_iteration(name) for name in names}
+    save_figure(run.own(run.figures / "curves.png"), curves_figure(histories, starts))
+
+
+def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
+    """figures/sizes.png and figures/resolutions.png, of the first view."""
+    save_figure(run.own(run.figures / "sizes.png"), sizes_figure(model.layout.sizes))
+    gaussians, textures, _ = colored_by_resolution(model.gaussians, model.params, model.layout)
+    colored = dataclasses.replace(model, gaussians=gaussians, params=textures)
+    camera = (*scene.test, *scene.train)[0].camera
+    picture = to_uint8(Renderer(colored, settings=settings_of(system), has_geometry=False)(camera).color)
+    num_levels = int(texel_levels(model.layout).max()) + 1
     save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels))
 
 
-def _compare(views: tuple[View, ...], index: int, result: RunResult) -> Comparison:
-    """One view: the photograph, what stage 2 is to be compared with, stage 2."""
-    before: Phase = "baseline" if "baseline" in result.phases else "stage1"
-    shown = [phase for phase in (before, "stage2") if phase in result.phases]
-    truth = to_uint8(view_image(views[index], background_of(result.record.config)))
-    renders = [result.phases[phase].shown.renders[index] for phase in shown]
-    captions = ["photograph", *(result.record.label(phase) for phase in shown)]
-    crop = largest_gain(truth, *renders) if len(renders) == 2 else None
-    return Comparison(views[index].name, [truth, *renders], captions, crop)
+def _write_pictures(run: RunFolder, result: RunResult, views: tuple[View, ...], background) -> None:
+    """A sheet of each view, and the report with some of them."""
+    comparisons = [_compare(view, index, result, background) for index, view in enumerate(views)]
+    for comparison in comparisons:
+        _write_sheet(run, comparison)
+    write_report(run, result, comparisons[:: -(-len(views) // REPORTED_VIEWS)])
+
+
+def _compare(view: View, index: int, result: RunResult, background) -> Comparison:
+    """One view: the photograph, what the main model is to be compared with, the main model."""
+    shown = [*(result.compared or result.before), result.main]
+    truth = to_uint8(view_image(view, background))
+    renders = [result.models[name].shown.renders[index] for name in shown]
+    crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
+    return Comparison(view.name, [truth, *renders], ["photograph", *shown], crop)
 
 
 def _write_sheet(run: RunFolder, comparison: Comparison) -> None:

@@ -1,5 +1,6 @@
 """Figures of a run, drawn with matplotlib's object interface (no windows, no global state)."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,15 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from a2tg_jax.checkpoint import History
 from a2tg_jax.io.atomic import replacing
-from a2tg_jax.results.folder import Phase
 from a2tg_jax.results.pictures import resolution_colors
+from a2tg_jax.training import History
 
-COLORS: dict[Phase, str] = {"stage1": "#4477aa", "stage2": "#cc3311", "baseline": "#777777"}
-LABELS: dict[Phase, str] = {"stage1": "stage 1", "stage2": "stage 2", "baseline": "stage 2 without textures"}
+COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66ccee")
+"""Of the stages, in turn."""
 RUNNING_MEANS = 10
-"""A running mean covers this share of a phase: a tenth."""
+"""A running mean covers this share of a stage: a tenth."""
 CURVES = (
     ("loss", "Loss"),
     ("psnr", "Training PSNR (dB)"),
@@ -34,15 +34,21 @@ def save_figure(path: Path, figure: Figure) -> None:
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def curves_figure(histories: Mapping[Phase, History]) -> Figure:
-    """Loss, PSNR, Gaussians and memory over the iterations of both stages; the stages' border is dashed."""
+def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:
+    """Loss, PSNR, Gaussians and memory over the iterations; where a later stage begins, a dashed line.
+
+    Args:
+      histories: of the stages, by name.
+      starts: how many iterations lie before each.
+    """
     figure = Figure(figsize=(10, 6), layout="constrained")
-    border = int(histories["stage1"].iteration[-1]) if "stage1" in histories else 0
-    for axes, (name, title) in zip(figure.subplots(2, 2).flat, CURVES, strict=True):
-        for phase, history in histories.items():
-            start = 0 if phase == "stage1" else border
-            _plot(axes, start + history.iteration, getattr(history, name), phase, is_noisy=name in ("loss", "psnr"))
-        axes.axvline(border, color="black", linestyle="--", linewidth=0.8)
+    colors = dict(zip(histories, itertools.cycle(COLORS), strict=False))
+    for axes, (field, title) in zip(figure.subplots(2, 2).flat, CURVES, strict=True):
+        for name, history in histories.items():
+            x, y = starts[name] + history.iteration, getattr(history, field)
+            _plot(axes, x, y, name, colors[name], is_noisy=field in ("loss", "psnr"))
+        for border in sorted({start for start in starts.values() if start}):
+            axes.axvline(border, color="black", linestyle="--", linewidth=0.8)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("iteration", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -53,15 +59,14 @@ def curves_figure(histories: Mapping[Phase, History]) -> Figure:
     return figure
 
 
-def _plot(axes: Axes, x: np.ndarray, y: np.ndarray, phase: Phase, *, is_noisy: bool) -> None:
+def _plot(axes: Axes, x: np.ndarray, y: np.ndarray, name: str, color: str, *, is_noisy: bool) -> None:
     """One curve; a noisy one pale, with its running mean over it."""
-    color = COLORS[phase]
     if is_noisy and len(y) >= 2 * RUNNING_MEANS:
         axes.plot(x, y, color=color, alpha=0.2, linewidth=0.8)
         window = len(y) // RUNNING_MEANS
         weights = np.full(window, 1 / window)
         x, y = np.convolve(x, weights, mode="valid"), np.convolve(y, weights, mode="valid")
-    axes.plot(x, y, color=color, label=LABELS[phase], linewidth=1.6)
+    axes.plot(x, y, color=color, label=name, linewidth=1.6)
 
 
 def sizes_figure(sizes: np.ndarray) -> Figure:

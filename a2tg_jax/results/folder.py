@@ -2,29 +2,29 @@
 
     RUN/
       .a2tg-run                  the marker: this program made the folder, and what it wrote there
-      config.json                the scene, every number, the versions
-      checkpoints/PHASE-*.npz    the newest two, to resume from
-      models/PHASE.npz           what each finished phase left behind
-      history/PHASE.csv          loss, PSNR, Gaussians, MB over the iterations
+      run.toml                   the scene, the system with every number, the systems compared: repeats the run
+      checkpoints/NAME-*.npz     the newest two of each stage, to resume from
+      models/NAME.npz            what each finished stage left behind, with cameras, world and background
+      history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
       figures/*.png              curves, texture resolutions
       point_cloud.ply            the Gaussians in the original world
       report.html                all of it on one page
 
-The phases are `stage1`, `stage2` and, where asked for, `baseline`: a second stage of the same length without textures.
+NAME is that of a stage, such as `a2tg-gaussians` or `a2tg-textures`: the system's, and the stage's in it (`plan`).
 """
 
 import dataclasses
+import glob
 import json
 import os
+import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from a2tg_jax.io.atomic import replacing
 
-Phase = Literal["stage1", "stage2", "baseline"]
-PHASES: tuple[Phase, ...] = ("stage1", "stage2", "baseline")
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 
@@ -63,8 +63,8 @@ class RunFolder:
         return names
 
     @property
-    def config(self) -> Path:
-        return self.path / "config.json"
+    def record(self) -> Path:
+        return self.path / "run.toml"
 
     @property
     def metrics(self) -> Path:
@@ -90,23 +90,30 @@ class RunFolder:
     def test(self) -> Path:
         return self.path / "test"
 
-    def model(self, phase: Phase) -> Path:
-        return self.path / "models" / f"{phase}.npz"
+    def model(self, name: str) -> Path:
+        return self.path / "models" / f"{name}.npz"
 
-    def history(self, phase: Phase) -> Path:
-        return self.path / "history" / f"{phase}.csv"
+    def history(self, name: str) -> Path:
+        return self.path / "history" / f"{name}.csv"
 
-    def checkpoint(self, phase: Phase, iteration: int) -> Path:
-        return self.path / "checkpoints" / f"{phase}-{iteration:06d}.npz"
+    def checkpoint(self, name: str, iteration: int) -> Path:
+        return self.path / "checkpoints" / f"{name}-{iteration:06d}.npz"
 
-    def checkpoints(self, phase: Phase) -> list[Path]:
-        """The checkpoints of a phase, oldest first."""
-        return sorted((self.path / "checkpoints").glob(f"{phase}-*.npz"))
+    def checkpoints(self, name: str) -> list[Path]:
+        """The checkpoints of a stage, oldest first."""
+        pattern = re.compile(re.escape(name) + r"-\d{6,}\.npz")
+        found = (self.path / "checkpoints").glob(f"{glob.escape(name)}-*.npz")
+        return sorted((path for path in found if pattern.fullmatch(path.name)), key=iteration_of)
 
-    def drop_old_checkpoints(self, phase: Phase, keep: int = KEPT_CHECKPOINTS) -> None:
-        """Deletes all checkpoints of a phase but the newest `keep`."""
-        for path in self.checkpoints(phase)[: -keep or None]:
+    def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
+        """Deletes all checkpoints of a stage but the newest `keep`."""
+        for path in self.checkpoints(name)[: -keep or None]:
             path.unlink()
+
+
+def iteration_of(checkpoint: Path) -> int:
+    """The iteration after which a checkpoint was written."""
+    return int(checkpoint.stem.rpartition("-")[2])
 
 
 def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
@@ -120,7 +127,7 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; choose another folder with --out")
     run = RunFolder(path)
-    unused = {run.marker.name, run.config.name} if run.marker.is_file() else set()
+    unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
     if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):
         return
     if not run.written():
@@ -135,7 +142,7 @@ def create_run(path: str | os.PathLike, *, overwrite: bool = False) -> RunFolder
     """A new run folder, made with its parents.
 
     Args:
-      path: where; an existing folder must be empty, or hold no more than the config.json of a run that never began.
+      path: where; an existing folder must be empty, or hold no more than the run.toml of a run that never began.
       overwrite: delete first what an earlier run wrote there, as its marker lists it, and nothing else. Check all that
         the new run needs before.
 
@@ -158,8 +165,8 @@ def open_run(path: str | os.PathLike) -> RunFolder:
       FileNotFoundError: if there is none at `path`.
     """
     run = RunFolder(Path(path))
-    if not run.config.is_file():
-        raise FileNotFoundError(f"{path} is not a run folder (it has no config.json); a2tg train --out makes one")
+    if not run.record.is_file():
+        raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml); a2tg train --out makes one")
     return run
 
 

@@ -9,49 +9,44 @@ from typing import Literal
 from tqdm import tqdm
 
 from a2tg_jax.cameras import Camera
-from a2tg_jax.data import Scene
 from a2tg_jax.io.model import load_model
+from a2tg_jax.model import Model
 from a2tg_jax.paths import smooth_path
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.evaluate_run import background_of
-from a2tg_jax.results.folder import Phase, RunFolder
+from a2tg_jax.results.evaluate_run import settings_of
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.pictures import picture_name, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
-from a2tg_jax.training import render_settings
 
 Route = Literal["test", "smooth"]
 
 
 def render_frames(
-    run: RunFolder, out: Path, *, route: Route = "smooth", num_frames: int = 120, phase: Phase = "stage2"
+    run: RunFolder, out: Path, *, route: Route = "smooth", num_frames: int = 120, name: str | None = None
 ) -> list[Path]:
-    """Writes one PNG per frame and returns their paths.
+    """Writes one PNG per frame and returns their paths. The photographs are not needed: a model knows its cameras.
 
     Args:
       run: an opened run folder.
       out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views.
       route: the test views, or a smooth path past all cameras.
       num_frames: length of the path.
-      phase: whose model is drawn.
+      name: whose model is drawn; None: the last stage of the run's main system.
 
     Raises:
-      FileNotFoundError: if that phase is not finished, or the scene is not where it was.
-      ValueError: if the scene has no test views and these are wanted.
+      FileNotFoundError: if that stage is not finished.
+      ValueError: if the run has no such stage, or there are no test views and these are wanted.
     """
-    if not run.model(phase).is_file():
-        raise FileNotFoundError(f"{run.path} has no finished {phase}; go on with a2tg train … --resume")
-    record, model = read_record(run), load_model(run.model(phase))
-    cameras = dict(_cameras(record.source.load(), route, num_frames))
-    renderer = Renderer(
-        model,
-        cameras=cameras.values(),
-        settings=render_settings(record.config),
-        background=background_of(record.config),
-        has_geometry=False,
-    )
-    for name, camera in tqdm(cameras.items(), desc="frames", unit="frame"):
-        save_picture(out / name, to_uint8(renderer(camera).color))
-    return [out / name for name in cameras]
+    plan = read_record(run).plan
+    planned = plan[plan.main[-1] if name is None else name]
+    if not run.model(planned.name).is_file():
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+    model = load_model(run.model(planned.name))
+    cameras = dict(_cameras(model, route, num_frames))
+    renderer = Renderer(model, cameras=cameras.values(), settings=settings_of(planned.system), has_geometry=False)
+    for file_name, camera in tqdm(cameras.items(), desc="frames", unit="frame"):
+        save_picture(out / file_name, to_uint8(renderer(camera).color))
+    return [out / file_name for file_name in cameras]
 
 
 def write_video(folder: Path, path: Path, *, frames_per_second: int = 30) -> bool:
@@ -72,13 +67,15 @@ def write_video(folder: Path, path: Path, *, frames_per_second: int = 30) -> boo
     return True
 
 
-def _cameras(scene: Scene, route: Route, num_frames: int) -> Iterator[tuple[str, Camera]]:
+def _cameras(model: Model, route: Route, num_frames: int) -> Iterator[tuple[str, Camera]]:
     """File names and cameras of the frames."""
+    if model.origin is None:
+        raise ValueError("the model does not know where it was trained, so there are no cameras to render")
+    views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
     if route == "smooth":
-        views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
-        path = smooth_path([view.camera for view in views], num_frames)
+        path = smooth_path([camera for _, _, camera in views], num_frames)
         yield from ((f"frame_{index:04d}.png", camera) for index, camera in enumerate(path))
         return
-    if not scene.test:
-        raise ValueError("the scene has no test views; render a path instead with --path smooth")
-    yield from ((picture_name(view.name), view.camera) for view in scene.test)
+    if not model.origin.is_test.any():
+        raise ValueError("the run has no test views; render a path instead with --path smooth")
+    yield from ((picture_name(name), camera) for name, is_test, camera in views if is_test)

@@ -1,4 +1,4 @@
-"""History of a phase as CSV, one line per logged iteration."""
+"""History of a stage as CSV, one line per logged iteration."""
 
 import csv
 import dataclasses
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax.checkpoint import History
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.training import History
 
 NAMES = tuple(field.name for field in dataclasses.fields(History))
 

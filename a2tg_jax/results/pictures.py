@@ -66,13 +66,15 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
-    """One sheet of images in a row, each under its caption."""
+    """One sheet of images in a row, each under its caption, which is cut off where the image ends."""
     height, width = images[0].shape[:2]
     sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
+    font = ImageFont.load_default(size=14)
     for index, (image, caption) in enumerate(zip(images, captions, strict=True)):
         left = index * (width + MARGIN)
-        draw.text((left + 2, 2), caption, fill="black", font=font)
+        strip = Image.new("RGB", (width, CAPTION_HEIGHT), "white")
+        ImageDraw.Draw(strip).text((2, 2), caption, fill="black", font=font)
+        sheet.paste(strip, (left, 0))
         sheet.paste(Image.fromarray(image), (left, CAPTION_HEIGHT))
     return sheet
 

@@ -1,18 +1,37 @@
-"""What a run was asked to do: the scene, every number, the phases. Kept as config.json."""
+"""What a run was asked to do: the scene, a system with all its numbers, systems to compare. Kept as run.toml.
+
+A configuration file says the same or less; what it leaves out has the value that the command line gives it:
+
+    scene = "../scenes/fox"              # seen from the file's folder; or "synthetic"
+    downscale = 2
+    system = "a2tg"                      # or package.module:NAME
+    preset = "quick"
+    compare = ["gaussians-2d-mcmc"]
+
+    [options.texture]                    # options of the system, as nested tables
+    cap = 8
+"""
 
 import dataclasses
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.config import TrainConfig
+import tomli_w
+
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
+from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
-from a2tg_jax.results.folder import Phase, RunFolder, read_json, write_json
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.plan import RunPlan, plan_run
+from a2tg_jax.training import System, find_system, like
+from a2tg_jax.training.registry import differences, with_changes
 
 SYNTHETIC = "synthetic"
 SYNTHETIC_SIZE = (208, 156)
 """Small enough for two cores to train on in minutes."""
+DEFAULT_SYSTEM = "a2tg"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,71 +61,157 @@ class SceneSource:
 class RunRecord:
     """One run's task."""
 
-    source: SceneSource
-    config: TrainConfig
-    baseline: bool = False
-    """Also train a second stage of the same length without textures, to compare with."""
+    scene: SceneSource
+    name: str
+    """Of the system, as `find_system` takes it."""
+    system: System
+    """With every number."""
+    compare: tuple[str, ...] = ()
+    """Names of the systems that are trained beside it, with its options where they have options of these names."""
 
     @property
-    def phases(self) -> tuple[Phase, ...]:
-        """The phases in order."""
-        return ("stage1", "stage2", "baseline") if self.baseline else ("stage1", "stage2")
+    def systems(self) -> dict[str, System]:
+        """The main system and then those compared with it, by label.
 
-    def phase_config(self, phase: Phase) -> TrainConfig:
-        """The numbers of one phase; the baseline's differ in having no textures."""
-        if phase != "baseline":
-            return self.config
-        return dataclasses.replace(self.config, texture=dataclasses.replace(self.config.texture, is_enabled=False))
+        Raises:
+          ValueError: if a system is not found, or two have one label.
+        """
+        found = {label_of(self.name): self.system}
+        for name in self.compare:
+            if label_of(name) in found:
+                raise ValueError(f"compare: two systems of the run would be called {label_of(name)!r}")
+            found[label_of(name)] = compared_system(name, self.system)
+        return found
 
-    def label(self, phase: Phase) -> str:
-        """What tables and captions call a phase."""
-        if phase == "stage1":
-            return "stage 1"
-        is_textured = self.phase_config(phase).texture.is_enabled
-        return "stage 2, textured" if is_textured else "stage 2, untextured"
+    @property
+    def plan(self) -> RunPlan:
+        """What is trained."""
+        return plan_run(self.systems)
 
-    def command(self, out: Path) -> str:
-        """The command line that repeats the run."""
-        words = ["a2tg", "train", self.source.path, "--out", str(out)]
-        words += _flags(self.source, SceneSource(self.source.path))
-        words += ["--baseline"] if self.baseline else []
-        return shlex.join(words + _flags(self.config, TrainConfig.paper()))
+    def check(self) -> None:
+        """Refuses what cannot be trained.
+
+        Raises:
+          ValueError: naming the option, what was wanted and what came.
+        """
+        for label, system in self.systems.items():
+            try:
+                system.check()
+            except ValueError as error:
+                raise error if system is self.system else ValueError(f"compare {label}: {error}") from error
+        plan_run(self.systems)
+
+    def leaves(self) -> dict[str, Any]:
+        """Every number by the name of its flag, without the dashes."""
+        scene = {name: value for name, value in flatten_config(self.scene).items() if name != "path"}
+        return {"system": self.name, **scene, **flatten_config(self.system)}
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFile:
+    """What a configuration file may say."""
+
+    scene: str | None = None
+    downscale: int = 1
+    test_every: int = 8
+    system: str = DEFAULT_SYSTEM
+    preset: str | None = None
+    compare: tuple[str, ...] = ()
+    options: dict = dataclasses.field(default_factory=dict)
+
+    def chosen(self, where: str) -> System:
+        """The system with the file's preset and options.
+
+        Raises:
+          ValueError: if there is no such system or preset, or an option is unknown or of another type.
+        """
+        return with_changes(chosen_system(self.system, self.preset), self.options, f"{where}: options")
+
+
+def label_of(name: str) -> str:
+    """What a run calls a system: its name, or the NAME of package.module:NAME."""
+    return name.rpartition(":")[2].replace(".", "-")
+
+
+def chosen_system(name: str, preset: str | None = None) -> System:
+    """A system by name, with the numbers of a preset; those that an instance sets itself have precedence.
+
+    Raises:
+      ValueError: if there is no such system or preset.
+    """
+    found = find_system(name)
+    return found if preset is None else with_changes(type(found).preset(preset), differences(found), name)
+
+
+def compared_system(name: str, other: System) -> System:
+    """A system by name, with another's options by name; those that an instance sets itself have precedence.
+
+    Raises:
+      ValueError: if there is no such system.
+    """
+    found = find_system(name)
+    return with_changes(like(type(found), other), differences(found), name)
+
+
+def read_run_file(path: Path) -> RunFile:
+    """Reads a configuration file.
+
+    Raises:
+      FileNotFoundError: if there is none.
+      ValueError: if it is no TOML, or a key is unknown or of another type; key and file are named.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such configuration file")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"{path}: is not valid TOML: {error}") from error
+    file = config_from_dict(RunFile, {**config_to_dict(RunFile()), **table}, f"{path}:")
+    if file.scene is None or file.scene == SYNTHETIC:
+        return file
+    return dataclasses.replace(file, scene=str((path.parent / file.scene).resolve()))
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
-    """Writes config.json."""
-    write_json(run.own(run.config), config_to_dict(record))
+    """Writes run.toml: every number, so that it means the same whatever a later version's defaults are."""
+    table = {
+        "scene": record.scene.path,
+        "downscale": record.scene.downscale,
+        "test_every": record.scene.test_every,
+        "system": record.name,
+        "compare": list(record.compare),
+        "options": _without_none(config_to_dict(record.system)),
+    }
+    text = f"# Repeats the run: {repeating_command(run)}\n{tomli_w.dumps(table)}"
+    with replacing(run.own(run.record)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def read_record(run: RunFolder) -> RunRecord:
-    """Reads config.json.
+    """Reads run.toml. The module of a system of one's own is imported.
 
     Raises:
-      ValueError: if it is damaged or of another version; the field is named.
+      ValueError: if it is damaged, its system is not found, or an option is unknown or of another type; it is named.
     """
-    return config_from_dict(RunRecord, read_json(run.config), where=str(run.config))
+    file = read_run_file(run.record)
+    if file.scene is None:
+        raise ValueError(f"{run.record}: scene is missing")
+    source = SceneSource(file.scene, file.downscale, file.test_every)
+    return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare)
 
 
-def changed_fields(asked: Any, default: Any, kept: Any) -> list[str]:
-    """Dotted names of the leaves that were asked for (they differ from `default`) and differ from `kept`."""
-    kept_leaves, default_leaves = flatten_config(kept), flatten_config(default)
-    return [
-        name
-        for name, value in flatten_config(asked).items()
-        if value != default_leaves[name] and value != kept_leaves[name]
-    ]
+def repeating_command(run: RunFolder) -> str:
+    """The command line that repeats a run."""
+    return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", f"{run.path}-again"])
 
 
-def _flags(value: Any, default: Any) -> list[str]:
-    """Command-line flags for the leaves in which a dataclass differs from `default`."""
-    default_leaves, words = flatten_config(default), []
-    for name, leaf in flatten_config(value).items():
-        if leaf == default_leaves[name]:
-            continue
-        if isinstance(leaf, bool):
-            group, _, last = name.replace("_", "-").rpartition(".")
-            words.append("--" + (f"{group}." if group else "") + ("" if leaf else "no-") + last)
-        else:
-            values = leaf if isinstance(leaf, tuple) else (leaf,)
-            words += ["--" + name.replace("_", "-"), *(str(item) for item in values)]
-    return words
+def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
+    """Names of the numbers in which one record differs from another of the same scene."""
+    before = kept.leaves()
+    return [name for name, value in asked.leaves().items() if name not in before or value != before[name]]
+
+
+def _without_none(table: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no None: a key that is left out has its default, which is None for all that can be."""
+    kept = {name: value for name, value in table.items() if value is not None}
+    return {name: _without_none(value) if isinstance(value, dict) else value for name, value in kept.items()}

@@ -1,6 +1,7 @@
 """report.html: one page with everything a run found, images and style inlined, no scripts, no network."""
 
 import dataclasses
+import inspect
 from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
@@ -12,6 +13,7 @@ from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.pictures import Crop, jpeg_uri, png_uri
+from a2tg_jax.results.record import repeating_command
 from a2tg_jax.results.summary import RunResult, minutes, summary_table, versions
 
 SECTIONS = (
@@ -51,46 +53,52 @@ def write_report(run: RunFolder, result: RunResult, comparisons: Sequence[Compar
     }
     sections = "".join(f'<section id="{name}"><h2>{title}</h2>{bodies[name]}</section>\n' for name, title in SECTIONS)
     links = "".join(f'<a href="#{name}">{title}</a>' for name, title in SECTIONS)
+    label = next(iter(result.plan.chains))
     style = files("a2tg_jax.results").joinpath("report.css").read_text(encoding="utf-8")
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>A²TG: {escape(result.scene)}</title>\n<style>\n{style}</style></head>\n<body>\n"
-        f"<h1>A²TG on {escape(result.scene)}</h1>"
-        f'<p class="soft">Adaptive anisotropic textured 2D Gaussian splatting. {_views_told(result)}</p>'
+        f"<title>{escape(label)}: {escape(result.scene)}</title>\n<style>\n{style}</style></head>\n<body>\n"
+        f"<h1>{escape(label)} on {escape(result.scene)}</h1>"
+        f'<p class="soft">{escape(_system_told(result))} {_views_told(result)}</p>'
         f"<nav>{links}</nav>\n{sections}</body></html>\n"
     )
     with replacing(run.own(run.report)) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
+def _system_told(result: RunResult) -> str:
+    """The first line of what the system's author says of it."""
+    return (inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0]
+
+
 def _views_told(result: RunResult) -> str:
-    shown = next(iter(result.phases.values()))
+    shown = next(iter(result.models.values()))
     held_out = f", {len(shown.test.per_view)} held out for testing" if shown.test else ", none held out for testing"
     total = len(shown.train.per_view) + (len(shown.test.per_view) if shown.test else 0)
     return f"{total} views{held_out}."
 
 
 def _summary(result: RunResult) -> str:
-    last = result.phases.get("stage2") or next(iter(result.phases.values()))
+    last = result.models[result.main]
     split = "Test" if last.test else "Training"
     cards = [(f"{split} PSNR", f"{last.shown.psnr:.2f} dB")]
-    if result.gain is not None:
-        cards.append(("Gain by textures", f"{result.gain:+.2f} dB"))
+    cards += [(f"Gain over {name}", f"{gain:+.2f} dB") for name, gain in result.gains.items()]
     cards += [
         ("SSIM", f"{last.shown.ssim:.4f}"),
         ("Gaussians", f"{last.num_gaussians:,}"),
-        ("Memory", f"{last.megabytes:.2f} MB"),
+        ("Memory", f"{last.num_bytes / 1e6:.2f} MB"),
         ("Speed", f"{last.shown.frames_per_second:.1f} fps"),
-        ("Training", minutes(sum(measured.seconds for measured in result.phases.values()))),
+        ("Training", minutes(sum(measured.seconds for measured in result.models.values()))),
     ]
     tiles = "".join(f'<div class="card">{escape(name)}<b>{escape(value)}</b></div>' for name, value in cards)
     titles, rows = summary_table(result)
     network = f" LPIPS with {result.lpips_network}." if result.lpips_network else ""
     note = (
-        "PSNR in dB, means over the views, images clipped to [0, 1]. MB (10⁶ bytes) counts 232 bytes a Gaussian and 16 "
-        "bytes a texel, as the paper does; padding of the texture buffers stands beside it. Training is the time of "
-        f"each phase alone.{network}"
+        "PSNR in dB, means over the views, images clipped to [0, 1]. MB (10⁶ bytes) counts all trained floats: 232 "
+        "bytes a Gaussian and what it shows, such as 16 bytes a texel; what a method's authors count, where that is "
+        "something else, and padding of the buffers stand beside it. Training is the time of each stage "
+        f"alone.{network}"
     )
     return f'<div class="cards">{tiles}</div>{_table(titles, rows)}<p class="soft">{escape(note)}</p>'
 
@@ -118,12 +126,12 @@ def _textures(run: RunFolder) -> str:
 def _views(result: RunResult) -> str:
     html = ""
     for split in ("test", "train"):
-        found = [(phase, getattr(measured, split)) for phase, measured in result.phases.items()]
+        found = [(name, getattr(measured, split)) for name, measured in result.models.items()]
         if any(evaluation is None for _, evaluation in found):
             continue
         titles = ["view"]
-        for phase, _ in found:
-            titles += [f"{result.record.label(phase)}: PSNR", "SSIM"]
+        for name, _ in found:
+            titles += [f"{name}: PSNR", "SSIM"]
         rows = [
             [views[0].name, *(cell for view in views for cell in (f"{view.psnr:.2f}", f"{view.ssim:.4f}"))]
             for views in zip(*(evaluation.per_view for _, evaluation in found), strict=True)
@@ -134,15 +142,17 @@ def _views(result: RunResult) -> str:
 
 
 def _configuration(result: RunResult) -> str:
-    leaves = flatten_config(result.record.source, "scene.") | flatten_config(result.record.config)
+    leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.system)
     rows = [[name, str(value)] for name, value in leaves.items()]
     return f"<details><summary>{len(rows)} numbers</summary>{_table(['field', 'value'], rows)}</details>"
 
 
 def _reproduce(run: RunFolder, result: RunResult) -> str:
     rows = [[name, value] for name, value in versions().items()]
-    command = f"pip install a2tg-jax=={versions()['a2tg-jax']}\n{result.record.command(run.path)}"
-    return f"<pre>{escape(command)}</pre>{_table(['what', 'version'], rows)}"
+    command = f"pip install a2tg-jax=={versions()['a2tg-jax']}\n{repeating_command(run)}"
+    file = run.record.read_text(encoding="utf-8") if run.record.is_file() else ""
+    folded = f"<details><summary>{run.record.name}</summary><pre>{escape(file)}</pre></details>"
+    return f"<pre>{escape(command)}</pre>{folded}{_table(['what', 'version'], rows)}"
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

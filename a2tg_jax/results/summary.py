@@ -10,18 +10,18 @@ from typing import Any
 import jax
 
 from a2tg_jax.evaluation import Evaluation
-from a2tg_jax.results.folder import Phase
+from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import RunRecord
 
 FIGURES = (
     "test PSNR (dB)", "test SSIM", "test LPIPS", "train PSNR (dB)", "train SSIM", "train LPIPS", "Gaussians",
-    "texels a Gaussian", "memory (MB)", "padding (MB)", "frames a second", "training time",
+    "texels a Gaussian", "memory (MB)", "as published (MB)", "padding (MB)", "frames a second", "training time",
 )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
-class PhaseResult:
-    """One phase's model, measured."""
+class ModelResult:
+    """One stage's model, measured."""
 
     train: Evaluation
     test: Evaluation | None
@@ -29,12 +29,14 @@ class PhaseResult:
     num_gaussians: int
     num_texels: int
     """0 without textures."""
-    megabytes: float
-    """Parameters as the paper counts them: 232 bytes a Gaussian and 16 a texel, 10⁶ bytes an MB."""
-    padding_megabytes: float
-    """Bytes that exist in the texture buffers only."""
+    num_bytes: int
+    """Of the trained floats, padding left out: `Model.num_bytes`."""
+    num_published_bytes: int
+    """As the method's authors count them: `Model.num_published_bytes`."""
+    num_padding_bytes: int
+    """That exist in the buffers only."""
     seconds: float
-    """Training time of this phase."""
+    """Training time of this stage."""
 
     @property
     def shown(self) -> Evaluation:
@@ -44,45 +46,64 @@ class PhaseResult:
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
-    """All the phases of a run that are finished."""
+    """All the models of a run that are finished."""
 
     scene: str
     """Name of the scene."""
     record: RunRecord
-    phases: Mapping[Phase, PhaseResult]
+    plan: RunPlan
+    models: Mapping[str, ModelResult]
+    """By the names of their stages."""
 
     @property
-    def gain(self) -> float | None:
-        """What textures bring in dB: stage 2 over the untextured baseline; None without one."""
-        if not {"stage2", "baseline"} <= self.phases.keys():
-            return None
-        return self.phases["stage2"].shown.psnr - self.phases["baseline"].shown.psnr
+    def main(self) -> str:
+        """The last finished model of the main system."""
+        return [name for name in self.plan.main if name in self.models][-1]
+
+    @property
+    def before(self) -> list[str]:
+        """The stage that the main model started from, if it has one."""
+        start = self.plan[self.main].start
+        return [] if start is None else [start]
+
+    @property
+    def compared(self) -> list[str]:
+        """The finished last models of the other systems; none before the main system is finished."""
+        last = [chain[-1] for chain in self.plan.chains.values()]
+        return [name for name in last[1:] if name in self.models and self.main == last[0] != name]
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """PSNR of the main model over that of each model it is compared with, in dB."""
+        psnr = self.models[self.main].shown.psnr
+        return {name: psnr - self.models[name].shown.psnr for name in self.compared}
 
     @property
     def lpips_network(self) -> str | None:
-        return next(iter(self.phases.values())).train.lpips_network
+        return next(iter(self.models.values())).train.lpips_network
 
 
 def metrics_json(result: RunResult) -> dict[str, Any]:
     """The content of metrics.json."""
     return {
         "scene": result.scene,
-        "phases": {phase: _phase_json(measured) for phase, measured in result.phases.items()},
-        "gain_db": result.gain,
+        "main": result.main,
+        "models": {name: _model_json(measured) for name, measured in result.models.items()},
+        "gains_db": result.gains,
         "lpips_network": result.lpips_network,
         "versions": versions(),
     }
 
 
 def per_view_json(result: RunResult) -> dict[str, Any]:
-    """The content of per_view.json: phase → train or test → view → metrics."""
+    """The content of per_view.json: model → train or test → view → metrics."""
     return {
-        phase: {
+        name: {
             split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
             for split, found in (("train", measured.train), ("test", measured.test))
             if found is not None
         }
-        for phase, measured in result.phases.items()
+        for name, measured in result.models.items()
     }
 
 
@@ -100,14 +121,14 @@ def versions() -> dict[str, str]:
 
 
 def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
-    """Titles and rows of the headline table: a column for each phase, a row for each figure that there is."""
-    columns = [_figures(measured) for measured in result.phases.values()]
+    """Titles and rows of the headline table: a column for each model, a row for each figure that there is."""
+    columns = [_figures(measured) for measured in result.models.values()]
     rows = [[name, *cells] for name, *cells in zip(FIGURES, *columns, strict=True) if any(cells)]
-    return ["", *(result.record.label(phase) for phase in result.phases)], rows
+    return ["", *result.models], rows
 
 
 def summary_text(result: RunResult) -> str:
-    """The headline table for a terminal, and the gain."""
+    """The headline table for a terminal, and the gains."""
     titles, rows = summary_table(result)
     name_width, *widths = (max(map(len, column)) for column in zip(titles, *rows, strict=True))
     lines = []
@@ -116,8 +137,7 @@ def summary_text(result: RunResult) -> str:
         lines.append("  ".join([name.ljust(name_width), *aligned]).rstrip())
     if result.lpips_network:
         lines.append(f"LPIPS with {result.lpips_network}")
-    if result.gain is not None:
-        lines.append(f"textures bring {result.gain:+.2f} dB over the untextured second stage")
+    lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
     return "\n".join(lines)
 
 
@@ -129,7 +149,7 @@ def minutes(seconds: float) -> str:
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
 
 
-def _phase_json(measured: PhaseResult) -> dict[str, Any]:
+def _model_json(measured: ModelResult) -> dict[str, Any]:
     quality = {
         split: {"psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "views": len(found.per_view)}
         for split, found in (("train", measured.train), ("test", measured.test))
@@ -137,27 +157,32 @@ def _phase_json(measured: PhaseResult) -> dict[str, Any]:
     }
     counts = {
         name: getattr(measured, name)
-        for name in ("num_gaussians", "num_texels", "megabytes", "padding_megabytes", "seconds")
+        for name in ("num_gaussians", "num_texels", "num_bytes", "num_published_bytes", "num_padding_bytes", "seconds")
     }
     return {**quality, **counts, "frames_per_second": measured.shown.frames_per_second}
 
 
-def _figures(measured: PhaseResult) -> list[str]:
-    """One phase's column of the headline table; empty where there is no figure."""
+def _figures(measured: ModelResult) -> list[str]:
+    """One model's column of the headline table; empty where there is no figure."""
 
     def quality(found: Evaluation | None) -> list[str]:
         if found is None:
             return ["", "", ""]
         return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
 
+    def megabytes(num_bytes: int) -> str:
+        return f"{num_bytes / 1e6:.2f}"
+
     is_textured = measured.num_texels > 0
+    is_counted_otherwise = measured.num_published_bytes != measured.num_bytes
     return [
         *quality(measured.test),
         *quality(measured.train),
         f"{measured.num_gaussians:,}",
         f"{measured.num_texels / measured.num_gaussians:.2f}" if is_textured else "",
-        f"{measured.megabytes:.2f}",
-        f"{measured.padding_megabytes:.2f}" if is_textured else "",
+        megabytes(measured.num_bytes),
+        megabytes(measured.num_published_bytes) if is_counted_otherwise else "",
+        megabytes(measured.num_padding_bytes) if measured.num_padding_bytes else "",
         f"{measured.shown.frames_per_second:.1f}",
         minutes(measured.seconds),
     ]

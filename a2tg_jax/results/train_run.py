@@ -1,28 +1,21 @@
-"""Training in a run folder: phase after phase, with checkpoints, and from where an earlier attempt stopped."""
+"""Training in a run folder: stage after stage, with checkpoints, and from where an earlier attempt stopped."""
 
-import functools
-
-from a2tg_jax.appearance import Textured
-from a2tg_jax.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from a2tg_jax.config import TrainConfig
 from a2tg_jax.data import Scene
 from a2tg_jax.io.model import load_model, save_model
-from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
-from a2tg_jax.results.evaluate_run import background_of
-from a2tg_jax.results.folder import Phase, RunFolder
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.history import write_history
+from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import read_record
-from a2tg_jax.training import FitResult, fit_stage1, fit_stage2, texture_options
+from a2tg_jax.training import Checkpoint, StageResult, fit_stage, load_checkpoint, save_checkpoint
 
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Iterations."""
 
 
 def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
-    """Trains every phase that the run's record asks for and that is not finished yet.
+    """Trains every stage that the run's record asks for and that is not finished yet.
 
-    A phase goes on from its newest checkpoint. When it ends, its model and its history are written.
+    A stage goes on from its newest checkpoint. When it ends, its history and its model are written.
 
     Args:
       run: a run folder with its record.
@@ -32,39 +25,29 @@ def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
     Raises:
       ValueError: as `fit` does, or if a checkpoint is damaged or of another version.
     """
-    record = read_record(run)
-    for phase in record.phases:
-        if not run.model(phase).is_file():
-            result = _train_phase(run, phase, scene, record.phase_config(phase), progress)
-            write_history(run.own(run.history(phase)), result.history)
-            save_model(run.own(run.model(phase)), _model_of(result, scene))
+    for planned in read_record(run).plan.stages:
+        if not run.model(planned.name).is_file():
+            result = _train_stage(run, planned, scene, progress)
+            write_history(run.own(run.history(planned.name)), result.history)
+            save_model(run.own(run.model(planned.name)), result.model)
 
 
-def _model_of(result: FitResult, scene: Scene) -> Model:
-    """What a phase leaves behind."""
-    origin = Origin.of_scene(scene, background_of(result.config))
-    if result.textures is None:
-        return Model(result.gaussians, origin=origin)
-    appearance = Textured(options=texture_options(result.config))
-    return Model(result.gaussians, result.textures, result.layout, appearance=appearance, origin=origin)
-
-
-def _train_phase(run: RunFolder, phase: Phase, scene: Scene, config: TrainConfig, progress: bool) -> FitResult:
-    """One phase from its newest checkpoint, or from its beginning."""
-    newest = run.checkpoints(phase)[-1:]
-    num_iterations = config.stage1_iterations if phase == "stage1" else config.stage2_iterations
+def _train_stage(run: RunFolder, planned: PlannedStage, scene: Scene, progress: bool) -> StageResult:
+    """One stage from its newest checkpoint, or from its beginning."""
+    name, system = planned.name, planned.system
+    newest = run.checkpoints(name)[-1:]
 
     def keep(checkpoint: Checkpoint) -> None:
-        save_checkpoint(run.own(run.checkpoint(phase, checkpoint.iteration)), checkpoint)
-        run.drop_old_checkpoints(phase)
+        save_checkpoint(run.own(run.checkpoint(name, checkpoint.iteration)), checkpoint)
+        run.drop_old_checkpoints(name)
 
-    if phase == "stage1":
-        fit_phase = functools.partial(fit_stage1, scene, config)
-    else:
-        fit_phase = functools.partial(fit_stage2, scene, load_model(run.model("stage1")).gaussians, config)
-    return fit_phase(
-        resume=load_checkpoint(newest[0]) if newest else None,
+    return fit_stage(
+        scene,
+        system,
+        planned.index,
+        None if planned.start is None else load_model(run.model(planned.start)),
+        resume=load_checkpoint(newest[0], system=type(system)) if newest else None,
         on_checkpoint=keep,
-        checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, num_iterations // 10)),
+        checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, planned.stage.iterations // 10)),
         progress=progress,
     )

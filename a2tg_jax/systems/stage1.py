@@ -8,7 +8,7 @@ from a2tg_jax.densify import CloneSplitPrune, OpacityReset
 from a2tg_jax.events import Event
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.training.options import System
-from a2tg_jax.training.stage import Rates, Stage
+from a2tg_jax.training.stage import Stage
 
 QUICK_CAP = 10_000
 SMOKE: dict[str, Any] = {"stage1_iterations": 200, "initial_gaussians": 800}
@@ -52,11 +52,6 @@ class DensityConfig:
         return (density, OpacityReset(self.reset_opacity))
 
 
-def rates_of(system: System, params: Any = 0.0) -> Rates:
-    """The learning rates of a system, with those of what its splats show."""
-    return Rates(system.rates.of_gaussians(), params, system.rates.means_final_factor)
-
-
 def growing_stage(
     system: System,
     iterations: int,
@@ -66,8 +61,9 @@ def growing_stage(
     name: str = "gaussians",
 ) -> Stage:
     """A first stage, in which the degree of spherical harmonics rises."""
-    terms, rates = system.loss.terms(), rates_of(system, params_rate)
-    return Stage(name, appearance, events, terms, rates, iterations, raises_sh_degree=True)
+    return Stage(
+        name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate, raises_sh_degree=True
+    )
 
 
 def later_stage(
@@ -79,4 +75,4 @@ def later_stage(
     params_rate: Any = 0.0,
 ) -> Stage:
     """A second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
-    return Stage(name, appearance, events, system.loss.terms(), rates_of(system, params_rate), iterations)
+    return Stage(name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate)

@@ -8,13 +8,12 @@ from a2tg_jax.training.fit import FitResult as FitResult
 from a2tg_jax.training.fit import StageResult as StageResult
 from a2tg_jax.training.fit import fit as fit
 from a2tg_jax.training.fit import fit_stage as fit_stage
-from a2tg_jax.training.options import LearningRates as LearningRates
 from a2tg_jax.training.options import LossConfig as LossConfig
 from a2tg_jax.training.options import System as System
 from a2tg_jax.training.options import like as like
 from a2tg_jax.training.registry import SYSTEMS as SYSTEMS
 from a2tg_jax.training.registry import find_system as find_system
-from a2tg_jax.training.stage import Rates as Rates
+from a2tg_jax.training.stage import LearningRates as LearningRates
 from a2tg_jax.training.stage import Stage as Stage
 from a2tg_jax.training.terms import Target as Target
 from a2tg_jax.training.terms import Term as Term

@@ -3,8 +3,7 @@
 import dataclasses
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.stage import LearningRates, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
 
@@ -33,29 +32,6 @@ class LossConfig:
         )
         first = Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
         return (first, *(term for term in optional if term.weight))
-
-
-@dataclasses.dataclass(frozen=True)
-class LearningRates:
-    """Adam's learning rate per field."""
-
-    means: float = 1.6e-4
-    """Times scene_scale; decays exponentially over each stage."""
-    means_final_factor: float = 0.01
-    """The means' rate at the end of a stage over that at its start."""
-    log_scales: float = 5e-3
-    quats: float = 1e-3
-    logit_opacities: float = 5e-2
-    sh_degree0: float = 2.5e-3
-    sh_rest: float = 1.25e-4
-
-    def of_gaussians(self) -> Gaussians:
-        """One rate per field of the Gaussians; the means' is that of the first iteration, without scene_scale."""
-        import jax.numpy as jnp
-
-        sh = jnp.full((1, 16, 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
-        fields: Any = (self.means, self.quats, self.log_scales, self.logit_opacities, sh)
-        return Gaussians(*fields)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,7 @@ import math
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
@@ -32,15 +33,24 @@ class LossTerm(Protocol):
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Rates:
-    """Adam's learning rates."""
+class LearningRates:
+    """Adam's learning rate per field."""
 
-    gaussians: Gaussians
-    """One per field, a number or an array that broadcasts; the means' in units of scene_scale."""
-    params: Any = 0.0
-    """Of what the splats show: one for all, or a prefix of the parameters' tree."""
+    means: float = 1.6e-4
+    """Times scene_scale; decays exponentially over each stage."""
     means_final_factor: float = 0.01
-    """The means' rate decays exponentially to this share of it over the stage."""
+    """The means' rate at the end of a stage over that at its start."""
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    logit_opacities: float = 5e-2
+    sh_degree0: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+
+    def of_gaussians(self, means: Any) -> Gaussians:
+        """One rate per field of the Gaussians, given that of the means now."""
+        sh = jnp.full((1, 16, 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
+        fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
+        return Gaussians(*fields)
 
 
 @jax.tree_util.register_dataclass
@@ -56,9 +66,12 @@ class Stage:
     """Densification, noise, textures that grow, in the order in which they happen."""
     losses: tuple[LossTerm, ...]
     """What is minimised: their sum."""
-    rates: Rates
+    rates: LearningRates
+    """Of the Gaussians."""
     iterations: int
     """Views seen, times the batch size."""
+    params_rate: Any = 0.0
+    """Learning rate of what the splats show: a number, or what `Appearance.rates` takes."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
     """Begins with degree 0 and adds one after every thirtieth of the stage."""
 

@@ -109,7 +109,7 @@ def train_step(
 
     progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
     decay = jnp.exp(clock.log_decay * progress)
-    rate = (stage.rates.gaussians.means * decay).astype(scene_scale.dtype) * scene_scale
+    rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
     model, moments = _updated(stage, state, grads, rate)
     now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
     seen = _seen(batch, found)
@@ -195,8 +195,8 @@ def _seen(batch: Photographs, found: _ViewGradients) -> Seen | None:
 def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
     """Model and moments after Adam, with the parameters projected to where they belong."""
     model = state.model
-    rates = dataclasses.replace(stage.rates.gaussians, means=rate_of_means)
-    step = adam_update((model.gaussians, model.params), grads, state.moments, (rates, stage.rates.params))
+    rates = stage.rates.of_gaussians(rate_of_means), stage.appearance.rates(stage.params_rate)
+    step = adam_update((model.gaussians, model.params), grads, state.moments, rates)
     gaussians, params = step.params
     return dataclasses.replace(model, gaussians=gaussians, params=stage.appearance.project(params)), step.state
 

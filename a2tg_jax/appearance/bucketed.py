@@ -1,0 +1,50 @@
+"""What appearances have in common whose parameters are `Textures`: moving rows, and arrays for files."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.texture import AtlasLayout, Textures, first_textures, texture_arrays, textures_from_arrays
+
+
+@dataclasses.dataclass(frozen=True)
+class Bucketed(Appearance):
+    """An image for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
+
+    def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
+        (bucket,) = self.only(params)
+        return Textures((bucket.at[: rows.shape[0]].set(bucket[rows]),))
+
+    def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
+        (bucket,) = self.only(params)
+        is_cleared = jnp.pad(is_cleared, (0, bucket.shape[0] - is_cleared.shape[0]))
+        return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
+
+    def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
+        return (params, layout) if num == layout.num else first_textures(params, layout, num)
+
+    def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
+        """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
+        texels = [array.reshape(-1, 4) for array in texture_arrays(params, layout)]
+        return {"sizes": layout.sizes, "texels": np.concatenate(texels) if texels else np.zeros((0, 4), np.float32)}
+
+    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Textures, AtlasLayout]:
+        missing = [name for name in ("sizes", "texels") if name not in arrays]
+        if missing:
+            raise ValueError(f"the array {missing[0]} of textures is missing")
+        sizes, texels = arrays["sizes"], arrays["texels"]
+        if sizes.ndim != 2 or sizes.shape[1] != 2 or texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
+            raise ValueError(f"sizes [N, 2] and texels [M, 4] disagree; got {sizes.shape} and {texels.shape}")
+        pieces = np.split(texels, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
+        return textures_from_arrays([piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)])
+
+    def only(self, params: Textures) -> tuple[Array]:
+        """The one bucket of images that all have one size."""
+        if len(params.buckets) != 1:
+            raise ValueError(
+                f"textures of {len(params.buckets)} sizes cannot change rows inside a step: densify before they grow"
+            )
+        return params.buckets

@@ -1,0 +1,112 @@
+"""Which stages a run trains: those of its systems, each once where systems share it, under a name of its own."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+
+from a2tg_jax.training import Stage, System
+
+STAGE_OPTIONS = ("loss", "rates")
+"""Options of every system that reach training through its stages alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedStage:
+    """A stage of a system, and perhaps of others that begin as that one does."""
+
+    name: str
+    """Unique in the run: of its files, columns and captions."""
+    system: System
+    """The first system that has it."""
+    index: int
+    """Which of the system's stages, from 0."""
+    start: str | None
+    """Name of the stage whose model it starts from; None for a first stage."""
+
+    @property
+    def stage(self) -> Stage:
+        return self.system.stages()[self.index]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunPlan:
+    """The stages of a run in the order in which they are trained."""
+
+    stages: tuple[PlannedStage, ...]
+    chains: Mapping[str, tuple[str, ...]]
+    """The stages of each system, by its label; the main system's first."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the stages."""
+        return tuple(planned.name for planned in self.stages)
+
+    @property
+    def main(self) -> tuple[str, ...]:
+        """The stages of the main system."""
+        return next(iter(self.chains.values()))
+
+    def __getitem__(self, name: str) -> PlannedStage:
+        """The stage of a name.
+
+        Raises:
+          ValueError: if the run has no such stage.
+        """
+        for planned in self.stages:
+            if planned.name == name:
+                return planned
+        raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
+
+    def first_iteration(self, name: str) -> int:
+        """How many iterations lie before a stage, in the stages that it follows."""
+        start = self[name].start
+        return 0 if start is None else self.first_iteration(start) + self[start].stage.iterations
+
+
+def plan_run(systems: Mapping[str, System]) -> RunPlan:
+    """The stages of some systems. Two systems share the stages up to the first in which they differ.
+
+    Args:
+      systems: by label, the main one first.
+
+    Raises:
+      ValueError: if two stages would have one name.
+    """
+    planned: list[PlannedStage] = []
+    chains: dict[str, tuple[str, ...]] = {}
+    for label, system in systems.items():
+        chain: list[str] = []
+        for index, stage in enumerate(system.stages()):
+            wanted = PlannedStage(f"{label}-{stage.name}", system, index, chain[-1] if chain else None)
+            shared = next((known for known in planned if _is_same(known, wanted)), None)
+            if shared is None:
+                if wanted.name in {known.name for known in planned}:
+                    raise ValueError(f"two stages of the run are called {wanted.name!r}")
+                planned.append(wanted)
+            chain.append((shared or wanted).name)
+        chains[label] = tuple(chain)
+    return RunPlan(tuple(planned), chains)
+
+
+def _is_same(known: PlannedStage, wanted: PlannedStage) -> bool:
+    """Whether training both would give the same model, bit for bit."""
+    return (
+        (known.index, known.start) == (wanted.index, wanted.start)
+        and _common_options(known.system) == _common_options(wanted.system)
+        and _is_equal(known.stage, wanted.stage)
+    )
+
+
+def _common_options(system: System) -> list:
+    """The options that training reads from the system itself."""
+    return [getattr(system, field.name) for field in dataclasses.fields(System) if field.name not in STAGE_OPTIONS]
+
+
+def _is_equal(a: Stage, b: Stage) -> bool:
+    """Whether two stages are equal in everything, arrays included."""
+    (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
+    if structure != other:  # type: ignore[operator]
+        return False
+    return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))

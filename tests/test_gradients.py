@@ -1,0 +1,94 @@
+"""A view's gradients and its statistic in one call, and a training loop written with them by hand."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from oracle import DEFAULT_RULES
+from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene
+
+import a2tg_jax as a2tg
+from a2tg_jax import Model, RenderSettings, Textured, view_gradients
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradients_are_those_of_the_image_and_the_statistic_is_the_oracles():
+    scene = draw_scene(4)
+    cotangent = np.random.default_rng(4).normal(size=(scene.height, scene.width, 3))
+    model = Model(as_gaussians(scene, "float64"), *as_textures(scene, "float64"), appearance=Textured())
+    camera, settings = as_camera(scene, "float64"), RenderSettings(capacity=CAPACITY)
+
+    def loss(model, output):
+        return jnp.sum(output.color * jnp.asarray(cotangent)) + jnp.sum(model.gaussians.opacities)
+
+    def plain(gaussians, textures):
+        shown = dataclasses.replace(model, gaussians=gaussians, params=textures)
+        return loss(shown, shown.render(camera, background=scene.background, settings=settings))
+
+    how = functools.partial(view_gradients, loss, background=scene.background, settings=settings)
+    found = jax.jit(how)(model, camera)
+    value, (gaussians, params) = jax.jit(jax.value_and_grad(plain, argnums=(0, 1)))(model.gaussians, model.params)
+    np.testing.assert_allclose(found.value, value, rtol=1e-12)
+    for ours, wanted in zip(jax.tree.leaves(found[1:3]), jax.tree.leaves((gaussians, params)), strict=True):
+        np.testing.assert_allclose(ours, wanted, rtol=1e-9, atol=1e-12)
+    expected = oracle.gradient_statistic(scene, cotangent, DEFAULT_RULES, "position")
+    np.testing.assert_allclose(found.norms, np.linalg.norm(expected, axis=1), rtol=1e-8, atol=1e-10 * expected.max())
+    is_seen = np.count_nonzero(oracle.render(scene).weights, axis=(1, 2)) > 0
+    np.testing.assert_array_equal(found.is_visible, is_seen)
+    assert 0 < is_seen.sum() < len(is_seen)
+
+
+def test_an_eager_call_finds_its_capacity():
+    scene = draw_scene(3, num=12)
+    found = view_gradients(
+        lambda model, output: jnp.mean(output.color), Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
+    )
+    assert not found.output.overflow and found.num_pairs > 0
+
+
+def test_a_loop_by_hand_learns_and_upscales():
+    """Adam on two views, then the textures of the Gaussians with the largest statistic double, and Adam again."""
+    scene = draw_scene(4)
+    cameras = [as_camera(scene, "float32")] * 2
+    truth = [a2tg.render_image(as_gaussians(scene, "float32"), camera).color for camera in cameras]
+    gaussians = dataclasses.replace(as_gaussians(scene, "float32"), sh=jnp.zeros((50, 16, 3)))
+    textures, layout = a2tg.allocate_textures(np.ones((50, 2), int))
+    model = Model(gaussians, textures, layout, appearance=Textured())
+    settings = a2tg.plan_render(gaussians, cameras, rule=model.rule, head_room=4)
+
+    @jax.jit
+    def step(model, moments, statistics, camera, target):
+        loss = lambda model, output: a2tg.photometric_loss(output.color, target)  # noqa: E731
+        found = view_gradients(loss, model, camera, settings=settings, has_geometry=False)
+        update = a2tg.adam_update((model.gaussians, model.params), (found.gaussians, found.params), moments, 0.005)
+        gaussians, params = update.params
+        params = model.appearance.project(params)
+        model = dataclasses.replace(model, gaussians=gaussians, params=params)
+        return model, update.state, statistics.observe(found.norms, found.is_visible), found.value
+
+    def train(model, moments):
+        statistics, losses = a2tg.GradientStatistics.init(model.num), []
+        for _ in range(15):
+            for camera, target in zip(cameras, truth, strict=True):
+                model, moments, statistics, loss = step(model, moments, statistics, camera, target)
+                losses.append(float(loss))
+        return model, moments, statistics, losses
+
+    model, moments, statistics, before = train(model, a2tg.adam_init((model.gaussians, model.params)))
+    assert before[-1] < 0.8 * before[0]
+
+    proposed = a2tg.next_sizes(model.layout.sizes, model.gaussians.scales, k_a=4.0, k_s=0.01, cap=4)
+    chosen = a2tg.select(statistics.average(), model.layout.sizes, proposed, fraction=0.25)
+    sizes = np.where(chosen[:, None], proposed, model.layout.sizes)
+    grown = a2tg.reallocate(model.params, model.layout, sizes, (moments.mu[1], moments.nu[1]))
+    mu, nu = grown.moments
+    moments = dataclasses.replace(moments, mu=(moments.mu[0], mu), nu=(moments.nu[0], nu))
+    model = dataclasses.replace(model, params=grown.textures, layout=grown.layout)
+    assert model.num_bytes == 232 * 50 + 16 * sizes.prod(axis=1).sum() and chosen.sum() == 13
+
+    model, moments, statistics, after = train(model, moments)
+    assert after[-1] < before[-1]

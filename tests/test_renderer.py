@@ -1,0 +1,104 @@
+"""Cameras that move: few compilations, no camera refused, the image that `render_image` makes."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes_random import as_camera, as_gaussians, draw_scene
+
+from a2tg_jax import Model, Origin, PlainRule, Renderer, Textured, plan_render, render_image, textures_from_arrays
+from a2tg_jax.cameras import Camera, resize_camera
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.renderer import _jitted_draw
+
+
+def cloud(num: int = 300) -> Gaussians:
+    """Small splats in a ball about the origin."""
+    rng = np.random.default_rng(0)
+    draw = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)  # noqa: E731
+    return Gaussians(0.4 * draw(num, 3), draw(num, 4), 0.3 * draw(num, 2) - 2, draw(num), 0.2 * draw(num, 16, 3))
+
+
+def flight(num: int, size: tuple[int, int] = (48, 32)) -> list[Camera]:
+    """Cameras that first look away from the ball, then move back through it, until it is small and far away."""
+    width, height = size
+    K = jnp.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
+    return [Camera(jnp.eye(4).at[2, 3].set(float(z)), K, width, height) for z in np.linspace(-3, 60, num)]
+
+
+def num_compiled() -> int:
+    return _jitted_draw()._cache_size()
+
+
+def test_a_flight_of_200_views_compiles_three_times_at_most():
+    gaussians = cloud(2000)
+    renderer, before = Renderer(gaussians, has_geometry=False), num_compiled()
+    pairs = [plan_render(gaussians, camera).capacity for camera in flight(20)]
+    assert max(pairs) > 4 * pairs[0], "the flight is to need more room on its way"
+    for index, camera in enumerate(flight(200)):
+        output = renderer(camera)
+        assert not output.overflow
+        if index % 40 == 39:
+            np.testing.assert_array_equal(output.color, render_image(gaussians, camera).color)
+    assert 2 <= num_compiled() - before <= 3
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_cameras_that_are_known_compile_once(is_told):
+    """They are given, or the model was trained with them."""
+    gaussians, cameras = cloud(2100 if is_told else 2200), flight(10, (40, 24))
+    model = Model(gaussians) if is_told else Model(gaussians, origin=Origin.of_cameras(flight(10, (20, 12))))
+    renderer = Renderer(model, cameras=cameras if is_told else (), has_geometry=False)
+    before = num_compiled()
+    for camera in cameras:
+        renderer(camera)
+    assert num_compiled() - before == 1
+
+
+def test_several_sizes_and_models_of_one_shape():
+    cameras = [resize_camera(camera, *size) for camera in flight(4)[:3] for size in ((24, 16), (16, 24))]
+    before = num_compiled()
+    for shift in (0.0, 0.1):
+        gaussians = dataclasses.replace(cloud(), means=cloud().means + shift)
+        renderer = Renderer(gaussians, cameras=cameras, has_geometry=False)
+        for camera in cameras:
+            assert renderer(camera).color.shape == (camera.height, camera.width, 3)
+        assert set(renderer.capacities) == {(24, 16), (16, 24)}
+    assert num_compiled() - before == 2
+
+
+def test_a_model_with_all_that_belongs_to_it():
+    scene = draw_scene(4)
+    camera = as_camera(scene, "float32")
+    textures, layout = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
+    background = tuple(scene.background.tolist())
+    gaussians, origin = as_gaussians(scene, "float32"), Origin.of_cameras([camera], background=background)
+    model = Model(gaussians, textures, layout, jnp.asarray(45), appearance=Textured(), origin=origin)
+    found, expected = Renderer(model)(camera), model.live.render(camera)
+    for image, wanted in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(image, wanted)
+    assert expected.depth.max() > 0
+
+
+def test_what_a_renderer_refuses():
+    with pytest.raises(ValueError, match="rule: a model says itself"):
+        Renderer(Model(cloud()), PlainRule())
+    with pytest.raises(ValueError, match=r"background must be \[3\]; got \[4\]"):
+        Renderer(cloud(), background=(0, 0, 0, 1))
+    with pytest.raises(ValueError, match=r"camera\.K must be \[3, 3\]; got \[4, 4\]"):
+        Renderer(cloud())(dataclasses.replace(flight(1)[0], K=jnp.eye(4)))
+
+
+def test_plan_with_a_rule_and_head_room():
+    camera = flight(3)[1]
+    rule = PlainRule()
+    assert plan_render(cloud(), camera, rule=rule) == plan_render(cloud(), camera)
+    roomy = plan_render(cloud(3000), camera, rule=rule, head_room=10)
+    assert roomy.capacity > 4 * plan_render(cloud(3000), camera, rule=rule).capacity
+    with pytest.raises(ValueError, match="head_room must be at least 1"):
+        plan_render(cloud(), camera, head_room=0.5)
+    with pytest.raises(ValueError, match="cameras must be one camera at least"):
+        plan_render(cloud(), [])
+    with pytest.raises(ValueError, match="give it, or textures and layout"):
+        plan_render(cloud(), camera, *textures_from_arrays(np.ones((300, 1, 1, 4))), rule=rule)

@@ -1,0 +1,237 @@
+"""Systems as values: those of the library and a toy of one file, trained; what a sweep compiles, what the loop waits for."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_system import Toy
+
+import a2tg_jax as a2tg
+from a2tg_jax.training import loop
+from a2tg_jax.training.batches import PhotoStore
+from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict, with_changes
+from a2tg_jax.training.step import jitted_step
+
+TINY = {"stage1_iterations": 24, "initial_gaussians": 60, "densify": {"cap": 80}}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return a2tg.synthetic_scene(num_views=8, width=40, height=30, num_points=150)
+
+
+def tiny(name: str, **changes):
+    """A built-in system that trains in no time."""
+    system = a2tg.find_system(name)
+    if hasattr(system, "stage2_iterations"):
+        changes = {"stage2_iterations": 12, **changes}
+    return with_changes(system, {**TINY, **changes}, "test")
+
+
+def assert_same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, (a.gaussians, a.params), (b.gaussians, b.params))
+
+
+def interrupted_and_resumed(scene, system, path, every: int = 8):
+    """The model of a run that was killed after its second checkpoint and went on from the file."""
+
+    class Killed(Exception):
+        pass
+
+    count = 0
+
+    def keep(checkpoint):
+        nonlocal count
+        a2tg.save_checkpoint(path, checkpoint)
+        count += 1
+        if count == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        a2tg.fit(scene, system, on_checkpoint=keep, checkpoint_every=every, progress=False)
+    resume = a2tg.load_checkpoint(path)
+    assert resume.iteration == 2 * every
+    return a2tg.fit(scene, system, resume=resume, progress=False).model
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_trains_resumes_saves_and_renders(scene, tmp_path, name):
+    system = tiny(name)
+    result = a2tg.fit(scene, system, progress=False)
+    history = result.history
+    assert np.isfinite(history.loss).all() and history.loss[-1] < history.loss[0]
+    assert [stage.name for stage in result.stages] == [stage.name for stage in system.stages()]
+    assert_same(interrupted_and_resumed(scene, system, tmp_path / "checkpoint.npz"), result.model)
+    a2tg.save_model(tmp_path / "model.npz", result.model)
+    loaded = a2tg.load_model(tmp_path / "model.npz")
+    view = scene.test[0]
+    np.testing.assert_array_equal(loaded.render(view.camera).color, result.model.render(view.camera).color)
+    assert result.history.megabytes[-1] == pytest.approx(result.model.num_bytes / 1e6)
+
+
+def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
+    system = Toy()
+    result = a2tg.fit(scene, system, progress=False)
+    rings = np.asarray(result.model.params)
+    assert np.abs(rings[:, :3]).max() > 1e-3, "the rule's numbers are trained"
+    start = a2tg.fit(scene, dataclasses.replace(system, factor=1.0), progress=False).model.gaussians
+    assert result.model.gaussians.log_scales.mean() < start.log_scales.mean() - 0.05, "the event shrinks"
+    heavy = a2tg.fit(scene, dataclasses.replace(system, contrast_weight=100.0), progress=False).model
+    assert np.square(heavy.params[:, :3]).mean() < 0.2 * np.square(rings[:, :3]).mean(), "the term weighs"
+
+    assert_same(interrupted_and_resumed(scene, system, tmp_path / "checkpoint.npz", every=5), result.model)
+    a2tg.save_model(tmp_path / "model.npz", result.model)
+    loaded = a2tg.load_model(tmp_path / "model.npz")
+    assert_same(loaded, result.model)
+    assert loaded.num_bytes == 4 * (58 + 4) * loaded.num
+    found = a2tg.evaluate(scene.test, loaded)
+    assert found.psnr == pytest.approx(a2tg.evaluate(scene.test, result.model).psnr, abs=1e-6)
+
+
+def test_textured_gaussians_are_a2tg_with_one_size_and_no_events(scene):
+    fixed = tiny("textured-gaussians", texture={"side": 2})
+    other = tiny("a2tg")
+    first, second = other.stages()
+    textured = dataclasses.replace(second, appearance=dataclasses.replace(second.appearance, start=(2, 2)), events=())
+    as_system = dataclasses.make_dataclass("Fixed", [], bases=(type(other),), frozen=True)
+    as_system.stages = lambda self: (first, textured)
+    composed = as_system(**{field.name: getattr(other, field.name) for field in dataclasses.fields(other)})
+    assert_same(a2tg.fit(scene, fixed, progress=False).model, a2tg.fit(scene, composed, progress=False).model)
+
+
+def test_without_upscaling_textures_stay_at_one_texel(scene):
+    result = a2tg.fit(scene, tiny("a2tg", texture={"cap": 1}), progress=False)
+    assert result.model.layout.resolutions == ((1, 1),)
+
+
+def test_official_is_a_preset_of_all_options():
+    texture = a2tg.A2tg.preset("official").texture
+    assert (texture.select, texture.threshold, texture.axes, texture.gradient) == (
+        "threshold",
+        2e-5,
+        "authors",
+        "screen",
+    )
+    lookup = dataclasses.asdict(texture.lookup)
+    defaults = dataclasses.asdict(a2tg.TextureOptions())
+    assert all(lookup[name] != defaults[name] for name in defaults), "each choice differs from the paper's"
+    official = a2tg.A2tg.preset("official")
+    assert official.noise_in_stage2 and official.stages()[0].appearance.max_alpha == 0.999
+
+
+SWEEPS = {
+    "seeds": [{"seed": seed} for seed in range(4)],
+    "rates": [{"rates": {"means": rate, "sh_rest": rate}} for rate in (1e-4, 2e-4, 5e-4)],
+    "loss weights": [{"loss": {"ssim_weight": weight, "scale_weight": weight}} for weight in (0.1, 0.2, 0.3)],
+    "schedule ends": [{"stage1_iterations": n, "stage2_iterations": n} for n in (20, 24, 31)],
+}
+
+
+@pytest.mark.parametrize("name, thresholds", [("gaussians-2d", "densify"), ("a2tg", "texture")])
+@pytest.mark.parametrize("sweep", [*SWEEPS, "thresholds"])
+def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds):
+    if sweep == "thresholds":
+        numbers = (2e-4, 3e-4, 4e-4) if thresholds == "densify" else (1e-6, 2e-6, 4e-6)
+        select = {"select": "threshold"} if thresholds == "texture" else {}
+        variants = [{thresholds: {"threshold": number, **select}} for number in numbers]
+    else:
+        variants = SWEEPS[sweep]
+    counts = []
+    for changes in variants:
+        before = jitted_step()._cache_size()
+        merged = {**changes, "densify": {"cap": 80, **changes.get("densify", {})}}
+        if name == "a2tg":
+            merged["texture"] = {"upscale_at": [0.5], **changes.get("texture", {})}
+        a2tg.fit(scene, tiny(name, **merged), progress=False)
+        counts.append(jitted_step()._cache_size() - before)
+    assert counts[1:] == [0] * len(counts[1:]), f"traces per run: {counts}"
+
+
+def test_the_host_waits_once_for_many_steps(scene, monkeypatch):
+    waits = []
+    monkeypatch.setattr(loop, "read", lambda infos: waits.append(len(infos)) or jax.device_get(infos))
+    a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=45, densify=a2tg.McmcConfig(cap=60)), progress=False)
+    assert waits == [10, 10, 10, 10, 5]
+
+
+def test_photographs_stay_on_the_device_while_they_fit(scene):
+    everything, nothing = PhotoStore(scene.train), PhotoStore(scene.train, room=0)
+    assert everything.is_resident and not nothing.is_resident
+    for indices in ((0,), (3, 1)):
+        images = [
+            photographs.images[places] for photographs, places in map(lambda s: s.batch(indices), (everything, nothing))
+        ]
+        np.testing.assert_array_equal(*images)
+    assert everything.batch((0,))[0] is everything.batch((2,))[0]
+
+
+def test_results_do_not_depend_on_where_photographs_are(scene, monkeypatch):
+    system = tiny("gaussians-2d-mcmc")
+    resident = a2tg.fit(scene, system, progress=False).model
+    monkeypatch.setattr(loop, "PhotoStore", lambda views: PhotoStore(views, room=0))
+    assert_same(a2tg.fit(scene, system, progress=False).model, resident)
+
+
+def test_gaussians_that_find_no_room_are_counted_and_said(scene):
+    system = tiny("gaussians-2d", densify={"cap": 61, "threshold": 1e-9})
+    with pytest.warns(UserWarning, match=r"no room for a Gaussian .* raise densify.cap"):
+        a2tg.fit(scene, system, progress=False)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_options_as_values_of_files_and_back(name):
+    system = type(a2tg.find_system(name)).preset("smoke")
+    assert system_from_dict(system_to_dict(system), "file") == system
+    assert with_changes(a2tg.find_system(name), differences(system), "file") == system
+
+
+def test_a_file_imports_nothing():
+    with pytest.raises(ValueError, match="import its module first"):
+        system_from_dict({"name": "antigravity:Fly", "options": {}}, "file")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"texture": {"select": "threshold"}}, "texture.threshold must say"),
+        ({"texture": {"select": "budget"}}, "budget_mb must say"),
+        ({"texture": {"cap": 32}}, "texture.cap"),
+        ({"texture": {"upscale_at": [0.5, 0.2]}}, "upscale_at"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"sh_degree": 4}, "sh_degree"),
+        ({"densify": {"cap": 1}}, "densify.cap"),
+        ({"initial_opacity": 1.0}, "initial_opacity"),
+        ({"stage1_iterations": 0}, "at least 1 iteration"),
+    ],
+)
+def test_impossible_options_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        tiny("a2tg", **changes).check()
+
+
+def test_unknown_systems_are_named():
+    with pytest.raises(ValueError, match="there is no system 'nerf'; the systems are a2tg"):
+        a2tg.find_system("nerf")
+    with pytest.raises(ValueError, match="cannot be imported"):
+        a2tg.find_system("no_such_module:X")
+    with pytest.raises(ValueError, match="is no system"):
+        a2tg.find_system("toy_system:Rings")
+    assert a2tg.find_system("toy_system:Toy") == Toy()
+
+
+def test_like_takes_options_of_the_same_name():
+    main = tiny("a2tg", seed=7, rates={"means": 1e-3})
+    other = a2tg.like(a2tg.Gaussians2dMcmc, main)
+    assert (other.seed, other.rates, other.densify, other.stage2_iterations) == (7, main.rates, main.densify, 12)
+    assert other.stages()[0] == main.stages()[0]
+
+
+def test_gradients_of_a_sweep_are_those_of_its_numbers(scene):
+    """A traced weight is the weight: twice the opacity term fades Gaussians more."""
+    means = []
+    for weight in (0.0, 0.5, 2.0):
+        system = tiny("gaussians-2d-mcmc", loss={"opacity_weight": weight}, densify={"cap": 60, "is_enabled": False})
+        means.append(float(jnp.mean(a2tg.fit(scene, system, progress=False).model.gaussians.opacities)))
+    assert means[0] > means[1] > means[2]
