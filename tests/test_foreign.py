@@ -103,7 +103,7 @@ def test_results_are_views_of_the_buffers():
 ENDING = """
 import threading, time
 import jax, jax.numpy as jnp
-from a2tg_jax.kernels import foreign
+from a2tg_jax.kernels import ffi
 
 def handler(arguments, results):
     if arguments[0][0] > 0:
@@ -116,7 +116,7 @@ def hundred(x):
         x = call(x)
     return x
 
-begun, name = threading.Event(), foreign.registered("test", None, lambda: handler)
+begun, name = threading.Event(), ffi.registered("test", None, lambda: handler)
 call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))
 run = jax.jit(hundred)
 run(jnp.zeros(3)).block_until_ready()
