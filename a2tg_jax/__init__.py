@@ -67,10 +67,12 @@ from a2tg_jax.renderer import Renderer as Renderer
 from a2tg_jax.startup import configure_cpu as configure_cpu
 from a2tg_jax.systems.a2tg import A2tg as A2tg
 from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig
+from a2tg_jax.systems.bbsplat import BBSplat as BBSplat
 from a2tg_jax.systems.gaussians_2d import Gaussians2d as Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc as Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import DensityConfig as DensityConfig
 from a2tg_jax.systems.stage1 import McmcConfig as McmcConfig
+from a2tg_jax.systems.supergaussians import SuperGaussians as SuperGaussians
 from a2tg_jax.systems.textured_gaussians import TexturedGaussians as TexturedGaussians
 from a2tg_jax.texture import AtlasLayout as AtlasLayout
 from a2tg_jax.texture import Textures as Textures

@@ -65,11 +65,11 @@ def ssim(image: Array, target: Array) -> Array:
         )
     x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
     if has_native():
-        from a2tg_jax.kernels import windows
+        from a2tg_jax.kernels.ssim import Score, least_width, mean_score
 
         is_supported = x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64)
-        if is_supported and x.shape[2] >= windows.least_width(x.dtype, SSIM_WINDOW):
-            return windows.mean_score(windows.Score(_similarity, SSIM_TAPS), x, y)
+        if is_supported and x.shape[2] >= least_width(x.dtype, SSIM_WINDOW):
+            return mean_score(Score(_similarity, SSIM_TAPS), x, y)
     # The target's own mean is blurred apart, so that no gradient is computed for it. The two second moments enter
     # SSIM only through their sum: four blurs instead of five.
     mean_x, mean_squares, mean_product = jnp.split(_window_mean(jnp.concatenate([x, x * x + y * y, x * y])), 3)

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax.kernels import lanes, library
+from a2tg_jax.kernels import jit, lanes
 from a2tg_jax.kernels.writer import LONG, Writer
 from benchmarks.timing import timed
 
 
 def measure_limit(case: dict) -> dict:
     """How long the processor takes for a number of multiply-adds and one exp per pixel and splat, and nothing else."""
-    module, width = ir.Module("limit"), library.vector_bytes() // 4
+    module, width = ir.Module("limit"), jit.vector_bytes() // 4
     writer = Writer(module, "limit", ("data",), ("num",), "float32")
     at = lanes.Lanes(writer.b, width)
     reals = at.vector(writer.real)
@@ -37,7 +37,7 @@ def measure_limit(case: dict) -> dict:
         writer.b.store(writer.b.fadd(result, writer.b.load(total, typ=reals)), total)
     writer.store(writer.b.load(total, typ=reals), writer.arguments["data"], 0)
     writer.b.ret_void()
-    run = library.as_function(library.compile_module(module)["limit"], 1, 1)
+    run = jit.as_function(jit.compile_module(module)["limit"], 1, 1)
     threads = len(os.sched_getaffinity(0))
     pool = concurrent.futures.ThreadPoolExecutor(threads)
     vectors = int(case["pairs"] / width / threads)

@@ -10,7 +10,8 @@ from skimage.metrics import structural_similarity
 from a2tg_jax import losses
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import init_from_points
-from a2tg_jax.kernels import threads, windows
+from a2tg_jax.kernels import ssim as kernel
+from a2tg_jax.kernels import threads
 from a2tg_jax.losses import (
     depth_normals,
     mean_opacity,
@@ -164,7 +165,7 @@ def test_regularisers_see_live_rows_only():
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-10), (np.float32, 2e-3)])
 def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x64, shape, dtype, rtol):
     """In float32 the variances, differences of means of about 0.3, keep four digits where they are about 0.01."""
-    monkeypatch.setattr(windows, "LEAST_PIXELS", 500)
+    monkeypatch.setattr(kernel, "LEAST_PIXELS", 500)
     monkeypatch.setattr(threads, "num_threads", lambda: 2)
     image, target = map(jnp.asarray, random_pair(*shape, 0.1, dtype))
     value, gradients = jax.value_and_grad(ssim, argnums=(0, 1))(image, target)
@@ -179,7 +180,7 @@ def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x
 def test_another_score_of_the_same_name_is_another():
     image, target = (jnp.asarray(x.transpose(2, 0, 1)) for x in random_pair(14, 40, 0.1, np.float32))
     scores = [
-        windows.mean_score(windows.Score(lambda x, y, squares, product, k=k: k * x, (0.5, 0.5)), image, target)
+        kernel.mean_score(kernel.Score(lambda x, y, squares, product, k=k: k * x, (0.5, 0.5)), image, target)
         for k in (1.0, 3.0)
     ]
     np.testing.assert_allclose(scores[1], 3 * scores[0], rtol=1e-6)

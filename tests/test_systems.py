@@ -1,4 +1,4 @@
-"""Systems as values: those of the library and a toy of one file, trained; what a sweep compiles, what the loop waits for."""
+"""Systems as values: those of the library and a toy of one file, trained; what sweeps compile and loops wait for."""
 
 import dataclasses
 

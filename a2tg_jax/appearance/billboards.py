@@ -119,6 +119,11 @@ class Billboards(Bucketed):
         """Alpha in [0, 1]."""
         return self._with_alpha(params, lambda alpha: jnp.clip(alpha, 0.0, 1.0))
 
+    def rates(self, rate: tuple[float, float]) -> Array:
+        """Of RGB and of alpha."""
+        rgb, alpha = rate
+        return jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
+
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
         """57 + 4·S² a splat; the Gaussian's own opacity is not trained."""
         return (FLOATS_PER_GAUSSIAN - 1 + 4 * self.side**2) * num

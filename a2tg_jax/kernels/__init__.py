@@ -1,7 +1,7 @@
 """Accelerated compositors behind the same function, made from the element-wise functions in `pixel`.
 
-`choice` says which one runs where. On CPUs, native loops: `functions` are what is applied, `lanes` translates it to
-LLVM vector code, `loops` and `lists` put that into loops (with `writer` and `texels`), `library` compiles, `foreign`
-lets XLA call the result, on `threads`, and `native` is what the renderer uses. On GPUs, `pallas`. `packing` is common
-to both. `windows` is for SSIM, made in the same way.
+`choice` says which one runs where. On CPUs, native loops (docs/compiler.md): `traced` has what is applied, `lanes`
+translates it to LLVM vector code, `loops` and `lists` put that into loops (with `writer` and `texels`), `jit` compiles,
+`ffi` lets XLA call the result, on `threads`, and `native` is what the renderer uses. On GPUs, `pallas`. `packing` is
+common to both. `ssim` is for SSIM, made in the same way.
 """

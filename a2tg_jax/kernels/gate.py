@@ -11,7 +11,7 @@ import time
 
 from llvmlite import ir
 
-from a2tg_jax.kernels import library
+from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import INT
 from a2tg_jax.kernels.writer import LONG, POINTER
 
@@ -28,7 +28,7 @@ def gated(entry: int, path: tuple[int, int], message: int) -> int:
         structure, at the second offset in that the function's.
       message: the pointer that this is called with.
     """
-    module, name = ir.Module("gate"), library.unique("gate")
+    module, name = ir.Module("gate"), jit.unique("gate")
     function = ir.Function(module, SIGNATURE, name)
     b = ir.IRBuilder(function.append_basic_block("come"))
     inside, outside = function.append_basic_block("inside"), function.append_basic_block("outside")
@@ -47,7 +47,7 @@ def gated(entry: int, path: tuple[int, int], message: int) -> int:
     structure = b.load(b.gep(frame, [LONG(path[0])], source_etype=ir.IntType(8)), typ=POINTER)
     make = b.load(b.gep(structure, [LONG(path[1])], source_etype=ir.IntType(8)), typ=LONG)
     leave_with(_call(b, make, _pointer(b, message)))
-    return library.compile_module(module)[name]
+    return jit.compile_module(module)[name]
 
 
 def _pointer(b: ir.IRBuilder, address: int) -> ir.Value:
@@ -65,5 +65,5 @@ def _close() -> None:
     while _num_inside.value:
         time.sleep(1e-3)
     # What the gate consists of is used as long as the process lives, longer than Python's objects.
-    for kept in (_num_inside, _is_closed, library._engine()):
+    for kept in (_num_inside, _is_closed, jit._engine()):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))

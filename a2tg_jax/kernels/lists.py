@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from llvmlite import ir
 
 from a2tg_jax.geometry import Outline, ScreenBounds, clipped_box, unclipped_bounds
-from a2tg_jax.kernels import library
+from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import INT, Lanes, trace
 from a2tg_jax.kernels.writer import LONG, Writer
 from a2tg_jax.tiles import TileGrid, outline_touches, tile_rectangles
@@ -154,13 +154,13 @@ class ListLoops:
 def list_loops(dtype: str, tile_size: int, near_plane: float) -> ListLoops:
     """The loops for homographies of a dtype and tiles of a size, compiled at the first call."""
     module = ir.Module("lists")
-    bound, find, place = (library.unique(name) for name in ("bound", "find", "place"))
+    bound, find, place = (jit.unique(name) for name in ("bound", "find", "place"))
     _Bound(module, bound, dtype, tile_size, near_plane).write()
     _Find(module, find, dtype, tile_size).write()
     _Place(module, place).write()
-    addresses = library.compile_module(module)
+    addresses = jit.compile_module(module)
     return ListLoops(
-        bound=library.as_function(addresses[bound], len(BOUND), 4),
-        find=library.as_function(addresses[find], len(FIND), 2),
-        place=library.as_function(addresses[place], len(PLACE), 1),
+        bound=jit.as_function(addresses[bound], len(BOUND), 4),
+        find=jit.as_function(addresses[find], len(FIND), 2),
+        place=jit.as_function(addresses[place], len(PLACE), 1),
     )

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax.kernels import library
-from a2tg_jax.kernels.functions import Functions, Kind
+from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import BOOL, INT, Lanes
 from a2tg_jax.kernels.texels import NativeImage, Place, TexelWriter
+from a2tg_jax.kernels.traced import Functions, Kind
 from a2tg_jax.kernels.writer import LONG
 
 INTEGERS = ("first", "last", "columns", "width", "height")
@@ -96,7 +96,7 @@ class _Compositing(TexelWriter):
     def _table(self, name: str, type_: ir.Type, numbers) -> ir.Value:
         array = ir.Constant(ir.ArrayType(type_, len(numbers)), np.asarray(numbers).tolist())
         table = ir.GlobalVariable(self.b.module, array.type, name)
-        table.initializer, table.global_constant, table.align = array, True, library.vector_bytes()
+        table.initializer, table.global_constant, table.align = array, True, jit.vector_bytes()
         table.type = ir.PointerType()
         return table
 
@@ -337,11 +337,11 @@ def loops(kind: Kind) -> Loops:
     """The loops of a kind, compiled at the first call."""
     functions = Functions(kind)
     module = ir.Module("loops")
-    forward, backward = (library.unique(name) for name in ("forward", "backward"))
+    forward, backward = (jit.unique(name) for name in ("forward", "backward"))
     _Forward(kind, functions, module, forward, FORWARD).write()
     _Backward(kind, functions, module, backward, BACKWARD).write()
-    addresses = library.compile_module(module)
+    addresses = jit.compile_module(module)
     return Loops(
-        forward=library.as_function(addresses[forward], len(FORWARD), len(INTEGERS)),
-        backward=library.as_function(addresses[backward], len(BACKWARD), len(INTEGERS)),
+        forward=jit.as_function(addresses[forward], len(FORWARD), len(INTEGERS)),
+        backward=jit.as_function(addresses[backward], len(BACKWARD), len(INTEGERS)),
     )

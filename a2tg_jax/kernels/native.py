@@ -16,7 +16,7 @@ from jax import Array
 
 from a2tg_jax.appearance import StaticRule
 from a2tg_jax.geometry import Outline
-from a2tg_jax.kernels import foreign, sums, threads
+from a2tg_jax.kernels import ffi, sums, threads
 from a2tg_jax.kernels.manual_axes import vary_with
 from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
 from a2tg_jax.tiles import TileGrid, TileLists
@@ -26,7 +26,7 @@ PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
 
 
 def _kind(how, rule, splats, table: Array, images):
-    from a2tg_jax.kernels.functions import Kind
+    from a2tg_jax.kernels.traced import Kind
 
     return Kind(
         rule=rule,
@@ -94,9 +94,7 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     from a2tg_jax.kernels.lists import list_loops
 
     key = str(M.dtype), grid.tile_size, near_plane
-    name = foreign.registered(
-        f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_loops(*key))
-    )
+    name = ffi.registered(f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_loops(*key)))
     shapes = (
         jax.ShapeDtypeStruct((capacity,), jnp.int32),
         jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32),
@@ -167,14 +165,14 @@ def _inputs(kind, how, splats, table: Array, images, cutoff: Array, lists) -> tu
     return lists.ids, lists.starts, packed, pack_images(images), table.astype(kind.dtype), size
 
 
-def _registered(kind, which: str, make_handler: Callable[[Any], foreign.Handler]) -> str:
+def _registered(kind, which: str, make_handler: Callable[[Any], ffi.Handler]) -> str:
     """The name under which XLA knows the loops of a kind."""
     from a2tg_jax.kernels.loops import loops
 
-    return foreign.registered(f"{which} {kind!r}", (which, kind), lambda: make_handler(getattr(loops(kind), which)))
+    return ffi.registered(f"{which} {kind!r}", (which, kind), lambda: make_handler(getattr(loops(kind), which)))
 
 
-def _forward_handler(run: Callable) -> foreign.Handler:
+def _forward_handler(run: Callable) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size = arguments
         starts = inputs[1]
@@ -188,7 +186,7 @@ def _forward_handler(run: Callable) -> foreign.Handler:
     return handler
 
 
-def _backward_handler(run: Callable) -> foreign.Handler:
+def _backward_handler(run: Callable) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size, g, behind, jacobian = arguments
         starts = inputs[1]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax.kernels import library
+from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import FLAGS, INT, scalar_type
 
 LONG = ir.IntType(64)
@@ -29,7 +29,7 @@ class Writer:
         """Room for `count` values on the stack."""
         with self.b.goto_entry_block():
             room = self.b.alloca(type_, count)
-            room.align, room.type = library.vector_bytes(), POINTER
+            room.align, room.type = jit.vector_bytes(), POINTER
         return room
 
     def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:

@@ -7,7 +7,17 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Plain, Textured, TextureOptions
 from a2tg_jax.events import Statistic
 from a2tg_jax.mcmc import Noise
-from a2tg_jax.systems.stage1 import QUICK_CAP, SMOKE, SMOKE_CAP, McmcConfig, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import (
+    QUICK_CAP,
+    QUICK_OPACITY,
+    QUICK_RATES,
+    QUICK_TEXELS,
+    SMOKE,
+    SMOKE_CAP,
+    McmcConfig,
+    growing_stage,
+    later_stage,
+)
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -98,14 +108,21 @@ class A2tg(System):
         return {
             "paper": cls(),
             "official": cls(noise_in_stage2=True, texture=TextureConfig.official()),
-            "quick": cls(stage1_iterations=2_000, stage2_iterations=1_000, densify=McmcConfig(cap=QUICK_CAP)),
+            "quick": cls(
+                stage1_iterations=2_000,
+                initial_opacity=QUICK_OPACITY,
+                rates=QUICK_RATES,
+                stage2_iterations=1_000,
+                densify=McmcConfig(cap=QUICK_CAP),
+                texture=TextureConfig(rate=QUICK_TEXELS),
+            ),
             "smoke": cls(
                 **SMOKE,
                 stage2_iterations=120,
                 densify=McmcConfig(cap=SMOKE_CAP),
                 texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), rate=1e-2),
             ),
-        }
+        }  # fmt: skip
 
     def check(self) -> None:
         super().check()

@@ -8,9 +8,13 @@ from a2tg_jax.densify import CloneSplitPrune, OpacityReset
 from a2tg_jax.events import Event
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.training.options import System
-from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.stage import LearningRates, Stage
 
 QUICK_CAP = 10_000
+QUICK_OPACITY = 0.5
+QUICK_RATES = LearningRates(means=3 * 1.6e-4, sh_degree0=2 * 2.5e-3)
+QUICK_TEXELS = 1e-2
+"""What short runs want (docs/quality.md): Gaussians that begin half opaque, and faster rates."""
 SMOKE: dict[str, Any] = {"stage1_iterations": 200, "initial_gaussians": 800}
 SMOKE_CAP = 1_000
 

@@ -4,7 +4,17 @@ import dataclasses
 from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Textured, TextureOptions
-from a2tg_jax.systems.stage1 import QUICK_CAP, SMOKE, SMOKE_CAP, McmcConfig, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import (
+    QUICK_CAP,
+    QUICK_OPACITY,
+    QUICK_RATES,
+    QUICK_TEXELS,
+    SMOKE,
+    SMOKE_CAP,
+    McmcConfig,
+    growing_stage,
+    later_stage,
+)
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -44,6 +54,13 @@ class TexturedGaussians(System):
     def presets(cls) -> dict[str, Self]:
         return {
             "paper": cls(),
-            "quick": cls(stage1_iterations=2_000, stage2_iterations=1_000, densify=McmcConfig(cap=QUICK_CAP)),
+            "quick": cls(
+                stage1_iterations=2_000,
+                initial_opacity=QUICK_OPACITY,
+                rates=QUICK_RATES,
+                stage2_iterations=1_000,
+                densify=McmcConfig(cap=QUICK_CAP),
+                texture=FixedTextureConfig(rate=QUICK_TEXELS),
+            ),
             "smoke": cls(**SMOKE, stage2_iterations=120, densify=McmcConfig(cap=SMOKE_CAP)),
-        }
+        }  # fmt: skip

@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 from llvmlite import ir
 
-from a2tg_jax.kernels import foreign, library, threads
+from a2tg_jax.kernels import ffi, jit, threads
 from a2tg_jax.kernels.lanes import INT, Lanes, trace
 from a2tg_jax.kernels.manual_axes import cotangent_of, vary_with
 from a2tg_jax.kernels.writer import LONG, Writer
@@ -46,7 +46,7 @@ class Score(NamedTuple):
 
 def least_width(dtype, num_taps: int) -> int:
     """The narrowest image that the loops can do: the windows of a row fill a vector."""
-    return library.vector_bytes() // np.dtype(dtype).itemsize + num_taps - 1
+    return jit.vector_bytes() // np.dtype(dtype).itemsize + num_taps - 1
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -92,7 +92,7 @@ mean_score.defvjp(_score_forward, _score_backward)
 def _registered(how: Score, dtype: str, which: str, handler: Callable) -> str:
     function = getattr(how.function, "__qualname__", type(how.function).__name__)
     make_handler = lambda: functools.partial(handler, getattr(_loops(how, dtype), which), len(how.taps) - 1)  # noqa: E731
-    return foreign.registered(f"{which} {dtype} {function} {how.taps}", (which, dtype, how), make_handler)
+    return ffi.registered(f"{which} {dtype} {function} {how.taps}", (which, dtype, how), make_handler)
 
 
 def _score_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
@@ -130,7 +130,7 @@ class _Rows(Writer):
     def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], how: Score, dtype: str):
         super().__init__(module, name, buffers, INTEGERS, dtype)
         self.how, self.margin = how, len(how.taps) - 1
-        self.lanes = Lanes(self.b, library.vector_bytes() // np.dtype(dtype).itemsize)
+        self.lanes = Lanes(self.b, jit.vector_bytes() // np.dtype(dtype).itemsize)
         self.reals = self.lanes.vector(self.real)
         self.channels, self.height, self.width = (self.long(self.arguments[name]) for name in INTEGERS[2:])
         self.down, self.across = (self.b.sub(size, LONG(self.margin)) for size in (self.height, self.width))
@@ -235,11 +235,11 @@ class _Loops:
 @functools.cache
 def _loops(how: Score, dtype: str) -> _Loops:
     module = ir.Module("windows")
-    score, pull_back = (library.unique(name) for name in ("score", "pull_back"))
+    score, pull_back = (jit.unique(name) for name in ("score", "pull_back"))
     _ScoreRows(module, score, SCORE, how, dtype).write(dtype)
     _PullBackRows(module, pull_back, PULL_BACK, how, dtype).write()
-    addresses = library.compile_module(module)
+    addresses = jit.compile_module(module)
     return _Loops(
-        score=library.as_function(addresses[score], len(SCORE), len(INTEGERS)),
-        pull_back=library.as_function(addresses[pull_back], len(PULL_BACK), len(INTEGERS)),
+        score=jit.as_function(addresses[score], len(SCORE), len(INTEGERS)),
+        pull_back=jit.as_function(addresses[pull_back], len(PULL_BACK), len(INTEGERS)),
     )

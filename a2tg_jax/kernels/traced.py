@@ -10,7 +10,7 @@ import numpy as np
 from a2tg_jax import pixel
 from a2tg_jax.appearance import StaticRule
 from a2tg_jax.bilinear import Image, Sample
-from a2tg_jax.kernels import library
+from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import trace
 from a2tg_jax.kernels.packing import num_numbers
 
@@ -43,7 +43,7 @@ class Kind:
     @property
     def lanes(self) -> int:
         """L."""
-        return library.vector_bytes() // np.dtype(self.dtype).itemsize
+        return jit.vector_bytes() // np.dtype(self.dtype).itemsize
 
     @property
     def num_vectors(self) -> int:

@@ -1,0 +1,67 @@
+"""BBSplat: RGBA billboards from the first iteration, densified by MCMC on the mean alpha of their pictures."""
+
+import dataclasses
+from typing import ClassVar, Self
+
+from a2tg_jax.appearance import Billboards
+from a2tg_jax.mcmc import Mcmc
+from a2tg_jax.systems.stage1 import QUICK_RATES, SMOKE, growing_stage, later_stage
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+
+
+@dataclasses.dataclass(frozen=True)
+class BillboardConfig:
+    """The pictures, and how many of them."""
+
+    side: int = 16
+    """Every picture is side × side texels, 2 to 16."""
+    rgb: float = 2.5e-3
+    """Adam's learning rate of the colours."""
+    alpha: float = 1e-3
+    """Adam's learning rate of the alpha."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BillboardMcmcConfig:
+    """MCMC densification of billboards."""
+
+    cap: int = 160_000
+    """Largest number of billboards, each as large as 4.6 textured Gaussians."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BBSplat(System):
+    """Flat RGBA pictures, whose alpha takes the place of opacity and Gaussian."""
+
+    stage1_iterations: int = 30_000
+    stage2_iterations: int = 2_000
+    """Iterations that follow without densification; 0: none."""
+    densify: BillboardMcmcConfig = dataclasses.field(default_factory=BillboardMcmcConfig)
+    billboard: BillboardConfig = dataclasses.field(default_factory=BillboardConfig)
+
+    name: ClassVar[str] = "bbsplat"
+
+    def stages(self) -> tuple[Stage, ...]:
+        if self.densify.cap < 2:
+            raise ValueError(f"densify.cap must be at least 2 billboards; got {self.densify.cap}")
+        pictures, rates = Billboards(self.billboard.side), (self.billboard.rgb, self.billboard.alpha)
+        events = (Mcmc(self.densify.cap),)
+        first = growing_stage(self, self.stage1_iterations, events, pictures, rates, name="billboards")
+        if not self.stage2_iterations:
+            return (first,)
+        return first, later_stage(self, "continued", pictures, (), self.stage2_iterations, rates)
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        return {
+            "paper": cls(),
+            "quick": cls(
+                stage1_iterations=2_000, stage2_iterations=1_000, rates=QUICK_RATES,
+                densify=BillboardMcmcConfig(cap=2_000), billboard=BillboardConfig(rgb=1e-2, alpha=4e-3),
+            ),
+            "smoke": cls(
+                **SMOKE, stage2_iterations=0, densify=BillboardMcmcConfig(cap=800),
+                billboard=BillboardConfig(side=8, rgb=1e-2, alpha=1e-2),
+            ),
+        }  # fmt: skip

@@ -1,0 +1,60 @@
+"""SuperGaussians: colour and opacity vary over each splat by four movable kernels; adaptive density control."""
+
+import dataclasses
+from typing import Any, ClassVar, Self
+
+from a2tg_jax.appearance import MovableKernels
+from a2tg_jax.appearance.movable_kernels import MovableKernelParams
+from a2tg_jax.systems.stage1 import QUICK_CAP, QUICK_RATES, SMOKE, SMOKE_CAP, DensityConfig, growing_stage, later_stage
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import LearningRates, Stage
+
+AUTHORS_LOG_SCALES = 3e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class KernelConfig:
+    """Adam's learning rates of the kernels."""
+
+    colors: float = 1.25e-3
+    logit_opacities: float = 3e-2
+    centers: float = 1.25e-3
+    sharpness: float = 1.25e-3
+
+    def rates(self) -> MovableKernelParams:
+        """One for each field of the kernels."""
+        fields: Any = (self.centers, self.sharpness, self.logit_opacities, self.colors)
+        return MovableKernelParams(*fields)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuperGaussians(System):
+    """Splats with four movable kernels each: clone, split, prune, opacity reset."""
+
+    stage1_iterations: int = 30_000
+    stage2_iterations: int = 0
+    """Iterations that follow without densification; 0: none."""
+    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(log_scales=AUTHORS_LOG_SCALES))
+    densify: DensityConfig = dataclasses.field(default_factory=DensityConfig)
+    kernels: KernelConfig = dataclasses.field(default_factory=KernelConfig)
+
+    name: ClassVar[str] = "supergaussians"
+
+    def stages(self) -> tuple[Stage, ...]:
+        kernels, rates = MovableKernels(), self.kernels.rates()
+        first = growing_stage(self, self.stage1_iterations, self.densify.events(), kernels, rates, name="kernels")
+        if not self.stage2_iterations:
+            return (first,)
+        return first, later_stage(self, "continued", kernels, (), self.stage2_iterations, rates)
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        quick = dataclasses.replace(QUICK_RATES, log_scales=AUTHORS_LOG_SCALES)
+        return {
+            "paper": cls(),
+            "quick": cls(
+                stage1_iterations=2_000, stage2_iterations=1_000, initial_opacity=0.5, rates=quick,
+                densify=DensityConfig(cap=QUICK_CAP),
+            ),
+            "smoke": cls(**SMOKE, densify=DensityConfig(cap=SMOKE_CAP)),
+        }  # fmt: skip
