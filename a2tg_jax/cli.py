@@ -111,7 +111,8 @@ class Train:
     test_every: int = 8
     """Every k-th image is kept for testing."""
     compare: UseAppendAction[tuple[str, ...]] = ()
-    """Also train this system, with the same options where it has options of the same name, to compare with."""
+    """Also train this system, with the same options where it has options of the same name and the preset's where not,
+    to compare with."""
     baseline: bool = False
     """Short for --compare gaussians-2d-mcmc: the same iterations without textures."""
     resume: bool = False
@@ -135,7 +136,7 @@ class Train:
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
         source = SceneSource(path, self.downscale, self.test_every)
-        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)))
+        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset)
 
     def _resumed(self) -> RunFolder:
         """The existing run folder, after a check that no flag contradicts it."""

@@ -34,6 +34,7 @@ from a2tg_jax.results.record import (
 from a2tg_jax.results.report import SECTIONS, Comparison, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, minutes, per_view_json, summary_text
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
+from a2tg_jax.systems.bbsplat import BBSplat
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -212,9 +213,11 @@ def test_configuration_file_says_a_part(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "system", "compare"),
+    ("name", "system", "compare", "preset"),
     [
-        ("a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc", "textured-gaussians")),
+        ("a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc", "textured-gaussians"), "quick"),
+        ("a2tg", A2tg.preset("quick"), (), None),
+        ("a2tg", A2tg(), (), "smoke"),
         (
             "a2tg",
             A2tg(
@@ -225,13 +228,14 @@ def test_configuration_file_says_a_part(tmp_path):
                 rates=LearningRates(quats=float("inf")),
             ),
             (),
+            None,
         ),
-        ("gaussians-2d", Gaussians2d(seed=5), ("gaussians-2d-mcmc",)),
+        ("gaussians-2d", Gaussians2d(seed=5), ("gaussians-2d-mcmc",), None),
     ],
 )
-def test_command_repeats_the_run(tmp_path, name, system, compare):
-    """run.toml holds every number, so that other defaults, or a preset, change nothing."""
-    record = RunRecord(SceneSource(str(tmp_path / "a b"), downscale=4), name, system, compare)
+def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
+    """run.toml holds every number, so that other defaults, or a preset, change nothing; None where a preset is not."""
+    record = RunRecord(SceneSource(str(tmp_path / "a b"), downscale=4), name, system, compare, preset)
     run = create_run(tmp_path / "run c")
     write_record(run, record)
     assert tomllib.loads(run.record.read_text())["options"]["stage1_iterations"] == system.stage1_iterations
@@ -241,7 +245,8 @@ def test_command_repeats_the_run(tmp_path, name, system, compare):
 
 
 def test_changed_numbers_are_named():
-    changed = dataclasses.replace(RECORD.system, seed=3, texture=TextureConfig(cap=8))
+    larger = dataclasses.replace(RECORD.system.texture, cap=8)
+    changed = dataclasses.replace(RECORD.system, seed=3, texture=larger)
     asked = dataclasses.replace(RECORD, scene=SceneSource("/scenes/a b", downscale=4), system=changed)
     assert changed_numbers(asked, RECORD) == ["downscale", "seed", "texture.cap"]
     assert changed_numbers(RECORD, RECORD) == []
@@ -291,8 +296,13 @@ def test_compared_systems_take_the_options(tmp_path, monkeypatch):
     record = dataclasses.replace(RECORD, compare=("variants_of_mine:SQUARE", "textured-gaussians"))
     square, fixed = list(record.systems.values())[1:]
     assert list(record.systems) == ["a2tg", "SQUARE", "textured-gaussians"]
-    assert square == dataclasses.replace(RECORD.system, texture=TextureConfig(anisotropic=False))
+    square_textures = dataclasses.replace(RECORD.system.texture, anisotropic=False)
+    assert square == dataclasses.replace(RECORD.system, texture=square_textures)
     assert (fixed.stage1_iterations, fixed.densify.cap) == (2_000, 10_000)
+    assert dataclasses.replace(RECORD, compare=("bbsplat",)).systems["bbsplat"].billboard == BBSplat().billboard
+    of_preset = dataclasses.replace(RECORD, compare=("bbsplat",), preset="quick").systems["bbsplat"]
+    assert of_preset.billboard == BBSplat.preset("quick").billboard != BBSplat().billboard
+    assert of_preset.densify.cap == RECORD.system.densify.cap
     with pytest.raises(ValueError, match="would be called 'a2tg'"):
         dataclasses.replace(RECORD, compare=("a2tg",)).check()
 

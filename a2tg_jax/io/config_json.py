@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 ConfigT = TypeVar("ConfigT")
+NONE = "None"
+"""None in a format that has no word for it, such as TOML."""
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:
@@ -70,7 +72,10 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
     is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
-    for alternative in typing.get_args(hint) if is_union else (hint,):
+    alternatives = typing.get_args(hint) if is_union else (hint,)
+    if value == NONE and type(None) in alternatives and str not in alternatives:
+        return None
+    for alternative in alternatives:
         if _fits(alternative, value):
             return _converted(alternative, value)
     raise ValueError(f"{where} must be {_told(hint)}; got {value!r}")

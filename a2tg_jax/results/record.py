@@ -68,6 +68,8 @@ class RunRecord:
     """With every number."""
     compare: tuple[str, ...] = ()
     """Names of the systems that are trained beside it, with its options where they have options of these names."""
+    preset: str | None = None
+    """What other options of these systems start from."""
 
     @property
     def systems(self) -> dict[str, System]:
@@ -80,7 +82,7 @@ class RunRecord:
         for name in self.compare:
             if label_of(name) in found:
                 raise ValueError(f"compare: two systems of the run would be called {label_of(name)!r}")
-            found[label_of(name)] = compared_system(name, self.system)
+            found[label_of(name)] = compared_system(name, self.system, self.preset)
         return found
 
     @property
@@ -98,7 +100,9 @@ class RunRecord:
             try:
                 system.check()
             except ValueError as error:
-                raise error if system is self.system else ValueError(f"compare {label}: {error}") from error
+                if system is self.system:
+                    raise
+                raise ValueError(f"compare {label}, which has the options of {self.name}: {error}") from error
         plan_run(self.systems)
 
     def leaves(self) -> dict[str, Any]:
@@ -143,14 +147,21 @@ def chosen_system(name: str, preset: str | None = None) -> System:
     return found if preset is None else with_changes(type(found).preset(preset), differences(found), name)
 
 
-def compared_system(name: str, other: System) -> System:
+def compared_system(name: str, other: System, preset: str | None = None) -> System:
     """A system by name, with another's options by name; those that an instance sets itself have precedence.
+
+    Args:
+      name: as `find_system` takes it.
+      other: the system that it is compared with.
+      preset: what its further options start from, where it has that preset.
 
     Raises:
       ValueError: if there is no such system.
     """
     found = find_system(name)
-    return with_changes(like(type(found), other), differences(found), name)
+    kind = type(found)
+    start = kind() if preset is None else kind.presets().get(preset, kind())
+    return with_changes(like(start, other), differences(found), name)
 
 
 def read_run_file(path: Path) -> RunFile:
@@ -174,13 +185,15 @@ def read_run_file(path: Path) -> RunFile:
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Writes run.toml: every number, so that it means the same whatever a later version's defaults are."""
+    start = config_to_dict(chosen_system(record.name, record.preset))
     table = {
         "scene": record.scene.path,
         "downscale": record.scene.downscale,
         "test_every": record.scene.test_every,
         "system": record.name,
+        **({} if record.preset is None else {"preset": record.preset}),
         "compare": list(record.compare),
-        "options": _without_none(config_to_dict(record.system)),
+        "options": _without_none(config_to_dict(record.system), start),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n{tomli_w.dumps(table)}"
     with replacing(run.own(run.record)) as temporary:
@@ -197,7 +210,7 @@ def read_record(run: RunFolder) -> RunRecord:
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every)
-    return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare)
+    return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare, file.preset)
 
 
 def repeating_command(run: RunFolder) -> str:
@@ -211,7 +224,12 @@ def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
     return [name for name, value in asked.leaves().items() if name not in before or value != before[name]]
 
 
-def _without_none(table: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no None: a key that is left out has its default, which is None for all that can be."""
-    kept = {name: value for name, value in table.items() if value is not None}
-    return {name: _without_none(value) if isinstance(value, dict) else value for name, value in kept.items()}
+def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no None: such a key is left out, or is "None", as on the command line, where `start` says otherwise."""
+    told: dict[str, Any] = {}
+    for name, value in table.items():
+        if isinstance(value, dict):
+            told[name] = _without_none(value, start[name])
+        elif value is not None or start[name] is not None:
+            told[name] = "None" if value is None else value
+    return told

@@ -50,4 +50,5 @@ def _train_stage(run: RunFolder, planned: PlannedStage, scene: Scene, progress: 
         on_checkpoint=keep,
         checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, planned.stage.iterations // 10)),
         progress=progress,
+        title=name,
     )

@@ -112,17 +112,19 @@ def fit_stage(
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
     progress: bool = True,
+    title: str | None = None,
 ) -> StageResult:
     """Trains one stage of a system. Arguments as in `fit`.
 
     Args:
       index: which stage, from 0.
       start: the model to start from; None: Gaussians at the scene's points.
+      title: of the progress bar; None: the stage's name.
     """
     system.check()
     if start is None and resume is None:
         start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume)
-    run.train(on_checkpoint, checkpoint_every, progress)
+    run.train(on_checkpoint, checkpoint_every, progress, title)
     model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)

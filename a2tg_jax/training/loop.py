@@ -90,10 +90,16 @@ class StageRun:
         """The Gaussians that exist, and what they show."""
         return self.state.model.live
 
-    def train(self, on_checkpoint: OnCheckpoint | None, checkpoint_every: int | None, progress: bool) -> None:
+    def train(
+        self,
+        on_checkpoint: OnCheckpoint | None,
+        checkpoint_every: int | None,
+        progress: bool,
+        title: str | None = None,
+    ) -> None:
         """Runs the stage to its end."""
         iteration, end = int(self.state.iteration), self.stage.iterations
-        with ProgressBar(self.stage.name, iteration, end, is_shown=progress) as bar:
+        with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress) as bar:
             while iteration < end:
                 stop = self._next_stop(iteration, checkpoint_every)
                 for info in self.steps(iteration + 1, stop):

@@ -107,9 +107,14 @@ class System:
             stage.check()
 
 
-def like(kind: type[System], other: System) -> System:
-    """A system of a kind that has the options of another, wherever both have an option of that name and type."""
-    return _like(kind(), other)
+def like(kind: type[System] | System, other: System) -> System:
+    """A system of a kind that has the options of another, wherever both have an option of that name and type.
+
+    Args:
+      kind: its defaults, or an instance's options, are what the other does not say.
+      other: the other system.
+    """
+    return _like(kind() if isinstance(kind, type) else kind, other)
 
 
 def _like(value: Any, other: Any) -> Any:
