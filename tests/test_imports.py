@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"cores"},
+    {"cores", "memory"},
     {"numerics", "startup", "bilinear", "checks"},
     {"gaussians", "cameras", "sh"},
     {"geometry", "sharing"},

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from a2tg_jax.appearance.base import BYTES_PER_FLOAT
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import HostEvent, StepEvent
+from a2tg_jax.memory import return_free_memory
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -151,9 +152,11 @@ class StageRun:
         indices = self.order.indices(iteration)
         photographs, views = self.photographs.batch(indices)
         how = StepSettings(self._settings(self._size(iteration)), self.system.background)
-        self.state, info = jitted_step()(
-            how, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
-        )
+        step = jitted_step()
+        num_compiled = step._cache_size()
+        self.state, info = step(how, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key)
+        if step._cache_size() > num_compiled:
+            return_free_memory()
         return info
 
     def _size(self, iteration: int) -> tuple[int, int]:
