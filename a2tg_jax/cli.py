@@ -257,7 +257,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if name not in COMMANDS:
         return _fail(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
-    configure_cpu()
+    try:
+        configure_cpu()
+    except ValueError as error:
+        return _fail(str(error))
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # Where the modules of one's own systems are.
     command: Command | None = None

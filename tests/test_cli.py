@@ -226,6 +226,13 @@ def test_wrong_system_is_one_clear_line(capsys, tmp_path, flags, message):
 # Settings of JAX
 
 
+def test_a_wrong_number_of_threads_is_one_clear_line(monkeypatch, capsys):
+    monkeypatch.setenv("A2TG_NUM_THREADS", "many")
+    monkeypatch.setattr(cli, "configure_cpu", startup.configure_cpu)
+    assert cli.main(["info", "nowhere"]) == 2
+    assert "A2TG_NUM_THREADS must be a positive integer; got 'many'" in capsys.readouterr().err
+
+
 def test_users_own_flags_stay(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=256 --xla_dump_to=x")
     startup.add_xla_flags(("--xla_cpu_prefer_vector_width=512", "--xla_other=1"))

@@ -7,6 +7,7 @@ goes back with an error, and whoever is inside is waited for.
 
 import atexit
 import ctypes
+import os
 import time
 
 from llvmlite import ir
@@ -56,6 +57,14 @@ def _pointer(b: ir.IRBuilder, address: int) -> ir.Value:
 
 def _call(b: ir.IRBuilder, address: ir.Value, argument: ir.Value) -> ir.Value:
     return b.call(b.inttoptr(address, SIGNATURE.as_pointer()), [argument])
+
+
+def _empty() -> None:
+    _num_inside.value = 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_empty)  # the parent's threads do not come along
 
 
 @atexit.register

@@ -227,7 +227,9 @@ _compiled_capacities: dict[tuple[int, int], set[int]] = {}
 def _shared_capacity(size: tuple[int, int], needed: int) -> int:
     """The least capacity that suffices and is compiled already, where it is not twice as large; else a new one."""
     known = _compiled_capacities.setdefault(size, set())
-    capacity = min((room for room in known if needed <= room <= 2 * needed), default=needed)
+    power = 2 ** (needed.bit_length() - 1)
+    rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
+    capacity = min((room for room in known if needed <= room <= 2 * needed), default=rounded)
     known.add(capacity)
     return capacity
 
