@@ -88,7 +88,14 @@ def test_used_folder_is_refused(capsys, tmp_path):
 
 @pytest.mark.parametrize(
     "mistake",
-    [("--texture.select", "budget"), ("--lpips-weights", "nowhere.npz"), ("--batch-size", "0"), ("--downscale", "0")],
+    [
+        ("--texture.select", "budget"),
+        ("--lpips-weights", "nowhere.npz"),
+        ("--batch-size", "0"),
+        ("--downscale", "0"),
+        ("--compare", "b2tg"),
+        ("--compare", "a2tg"),
+    ],
 )
 def test_nothing_is_overwritten_before_the_new_run_is_checked(capsys, tmp_path, mistake):
     run = create_run(tmp_path / "run")
