@@ -88,31 +88,28 @@ class Train:
       a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
       a2tg train scenes/fox --out runs/fox --resume
       a2tg train scenes/fox --out runs/small --texture.select budget --texture.budget-mb 20 --baseline
-      a2tg train synthetic --out runs/two --preset smoke --system bbsplat --compare textured-gaussians
+      a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
       a2tg train --config runs/fox/run.toml --out runs/again
 
     A checkpoint is written every tenth of a stage and at least every 500 iterations; the newest two are kept.
     """
 
-    scene: Positional[str]
-    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic" for the built-in scene."""
+    scene: Annotated[Positional[str], arg(metavar="SCENE")]
+    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; --config and --resume know it already."""
     out: Path
     """Run folder: models, checkpoints, metrics, pictures and report.html go there."""
     config: Path | None = None
     """A TOML file that says any of this, such as the run.toml of a run; flags have precedence."""
     system: str = DEFAULT_SYSTEM
-    """gaussians-2d, gaussians-2d-mcmc, textured-gaussians, supergaussians, bbsplat, a2tg; or your own as
-    package.module:NAME. Its options stand below."""
+    """One of those that a2tg --help lists, or your own as package.module:NAME; its options stand below."""
     preset: str | None = None
-    """Where the numbers below start from: paper, quick (useful on two cores in minutes), smoke (half a minute on the
-    built-in scene), or another that the system has."""
+    """Where the numbers below start from: paper (the defaults), quick (minutes on two cores), smoke (half a minute)."""
     downscale: int = 1
     """Use the images at 1/k of their size."""
     test_every: int = 8
     """Every k-th image is kept for testing."""
     compare: UseAppendAction[tuple[str, ...]] = ()
-    """Also train this system, with the same options where it has options of the same name and the preset's where not,
-    to compare with."""
+    """Also train this system, to compare with: with the options above and below, where it has any of that name."""
     baseline: bool = False
     """Short for --compare gaussians-2d-mcmc: the same iterations without textures."""
     resume: bool = False

@@ -88,7 +88,14 @@ def test_used_folder_is_refused(capsys, tmp_path):
 
 @pytest.mark.parametrize(
     "mistake",
-    [("--texture.select", "budget"), ("--lpips-weights", "nowhere.npz"), ("--batch-size", "0"), ("--downscale", "0")],
+    [
+        ("--texture.select", "budget"),
+        ("--lpips-weights", "nowhere.npz"),
+        ("--batch-size", "0"),
+        ("--downscale", "0"),
+        ("--compare", "b2tg"),
+        ("--compare", "a2tg"),
+    ],
 )
 def test_nothing_is_overwritten_before_the_new_run_is_checked(capsys, tmp_path, mistake):
     run = create_run(tmp_path / "run")
@@ -123,6 +130,7 @@ def test_overview_names_every_command(capsys):
         assert cli.main(arguments) == 0
         text = capsys.readouterr().out
         assert all(f"a2tg {name} " in text for name in cli.COMMANDS)
+        assert all(f" {name}" in text for name in SYSTEMS)
     assert cli.main(["--version"]) == 0
 
 
@@ -142,15 +150,15 @@ def test_preset_decides_the_defaults_of_the_numbers():
             assert (command.options.stage1_iterations, command.options.texture.cap) == (iterations, 8)
 
 
-@pytest.mark.parametrize("name", ["gaussians-2d", "gaussians-2d-mcmc", "textured-gaussians", "a2tg"])
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_help_tells_the_options_of_a_system(capsys, name):
     with pytest.raises(SystemExit):
         cli.main(["train", "--system", name, "--help"])
     text = capsys.readouterr().out
-    assert ("--densify.threshold" in text) == (name == "gaussians-2d")
+    assert ("--densify.threshold" in text) == (name in ("gaussians-2d", "supergaussians"))
     assert ("--texture.side" in text) == (name == "textured-gaussians")
     assert ("--texture.lookup.uv" in text) == (name in ("textured-gaussians", "a2tg"))
-    assert all(system in text for system in SYSTEMS)
+    assert ("--billboard.side" in text) == (name == "bbsplat")
 
 
 # Configuration files

@@ -328,10 +328,18 @@ def test_metrics_hold_means_of_the_views():
 
 
 def test_summary_has_a_column_for_each_model():
-    lines = summary_text(some_result()).splitlines()
+    lines = summary_text(some_result(), 80).splitlines()
     assert re.split(r"\s{2,}", lines[0])[1:] == NAMES
     assert lines[1].split() == ["test", "PSNR", "(dB)", "21.00", "24.00", "23.00"]
     assert lines[-1] == "a2tg-textures gains +1.00 dB over gaussians-2d-mcmc-continued"
+
+
+def test_summary_fits_the_terminal():
+    wide, narrow = (summary_text(some_result(), width).splitlines() for width in (80, 48))
+    table = narrow[: len(narrow) - 2]
+    assert max(map(len, table)) <= 48 and table.count("") == 1
+    assert sum(line.count("dB)") for line in table) == 2 * sum(line.count("dB)") for line in wide)
+    assert narrow[-2:] == wide[-2:]
 
 
 def test_published_bytes_stand_beside_other_counts():

@@ -2,8 +2,9 @@
 
 import dataclasses
 import platform
+import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -127,18 +128,42 @@ def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
     return ["", *result.models], rows
 
 
-def summary_text(result: RunResult) -> str:
-    """The headline table for a terminal, and the gains."""
+def summary_text(result: RunResult, width: int | None = None) -> str:
+    """The headline table for a terminal, and the gains.
+
+    Args:
+      result: the run.
+      width: in characters; models that do not fit beside each other follow below. None: the terminal's.
+    """
     titles, rows = summary_table(result)
-    name_width, *widths = (max(map(len, column)) for column in zip(titles, *rows, strict=True))
-    lines = []
-    for name, *cells in [titles, *rows]:
-        aligned = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
-        lines.append("  ".join([name.ljust(name_width), *aligned]).rstrip())
+    names, *columns = zip(titles, *rows, strict=True)
+    lines: list[str] = []
+    for block in _blocks(names, columns, width or shutil.get_terminal_size().columns):
+        lines += ["", *_aligned([names, *block])] if lines else _aligned([names, *block])
     if result.lpips_network:
         lines.append(f"LPIPS with {result.lpips_network}")
     lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
     return "\n".join(lines)
+
+
+def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: int) -> list[list[tuple[str, ...]]]:
+    """Columns in groups, each of which fits beside the names; one column at least."""
+    blocks: list[list[tuple[str, ...]]] = [[]]
+    for column in columns:
+        if blocks[-1] and max(map(len, _aligned([names, *blocks[-1], column]))) > width:
+            blocks.append([])
+        blocks[-1].append(column)
+    return blocks
+
+
+def _aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
+    """The lines of a table: the first column to the left, the others to the right; no line without a figure."""
+    name_width, *widths = (max(map(len, column)) for column in columns)
+    lines = []
+    for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
+        aligned = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
+        lines.append("  ".join([name.ljust(name_width), *aligned]).rstrip())
+    return lines
 
 
 def minutes(seconds: float) -> str:
