@@ -11,7 +11,7 @@ RECORD = pathlib.Path(__file__).with_name("golden_a2tg.json")
 
 
 def test_a_run_of_version_0_1_0_is_repeated():
-    """Processors round differently, and training amplifies it: the first losses agree to 1e-5, the last ones to 1e-2."""
+    """Processors round differently, and training amplifies it: the first losses agree to 1e-5, the last to 1e-2."""
     recorded = json.loads(RECORD.read_text())
     scene = a2tg.synthetic_scene(num_views=8, width=80, height=60, num_points=300)
     system = a2tg.A2tg(
