@@ -1,4 +1,4 @@
-"""What short runs want: the preset `quick` of A²TG with the paper's opacity and rates, with its own, and with all but one.
+"""What short runs want: the preset `quick` of A²TG with the numbers of the paper, with its own, and with all but one.
 
 Writes one JSON object, "scene/variant" → figures on the test views, and goes on where it stopped.
 

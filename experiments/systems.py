@@ -1,9 +1,9 @@
 """Every built-in system at the bytes of A²TG: its quality on the test views, its size, and the time of a step.
 
-A²TG trains first, with as many Gaussians as are asked for; the others get as many splats as fit in the bytes that it ends
-with. Writes one JSON object, "scene/system" → figures, and goes on where it stopped.
+A²TG trains first, with as many Gaussians as are asked for; the others get as many splats as fit in the bytes that it
+ends with. Writes one JSON object, "scene/system" → figures, and goes on where it stopped.
 
-    python experiments/systems.py SCENES/fox synthetic --gaussians 5000 --lpips-weights lpips_alex.npz --out systems.json
+    python experiments/systems.py SCENES/fox synthetic --gaussians 5000 --lpips-weights lpips_alex.npz
 """
 
 import argparse
