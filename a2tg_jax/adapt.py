@@ -23,8 +23,9 @@ from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_
 
 BYTES_PER_TEXEL = 16
 PAPER_ITERATIONS = 30_000
-EARLY_EVENTS = (0.15, 0.30)
-"""Upscaling in short second stages, where n/60 and n/30 would leave the statistic no time to settle."""
+PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
+"""Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and what short stages need, where
+that would leave the statistic no time to settle."""
 
 
 @jax.tree_util.register_dataclass
@@ -90,8 +91,8 @@ class Upscale(HostEvent):
     cap: int = static(default=4)
     """Largest texture side in texels (at most 16)."""
     at: tuple[float, ...] | None = static(default=None)
-    """Fractions of the stage after which textures grow; None: the paper's 1/60 and 1/30, under 30,000 iterations 0.15
-    and 0.30."""
+    """Fractions of the stage after which textures grow; None: so often that the cap can be reached, every 1/60 of the
+    stage as in the paper, under 30,000 iterations every 0.15."""
     gradient: Statistic = static(default="position")
     """The gradient that is averaged: by position in the world, as the paper has it, or "screen": by the position on
     the screen, in units of half an image, and only where the low-pass filter decides, as in the authors' program."""
@@ -103,7 +104,9 @@ class Upscale(HostEvent):
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         fractions = self.at
         if fractions is None:
-            fractions = EARLY_EVENTS if num_iterations < PAPER_ITERATIONS else (1 / 60, 1 / 30)
+            interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
+            rounds = math.ceil(math.log2(self.cap))
+            fractions = tuple(interval * (index + 1) for index in range(rounds))
         if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
             raise ValueError(f"texture.upscale_at must be ascending fractions between 0 and 1; got {fractions}")
         return tuple(max(1, round(fraction * num_iterations)) for fraction in fractions)

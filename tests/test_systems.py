@@ -109,6 +109,18 @@ def test_without_upscaling_textures_stay_at_one_texel(scene):
     assert result.model.layout.resolutions == ((1, 1),)
 
 
+@pytest.mark.parametrize("cap", [2, 4, 8, 16])
+def test_textures_reach_their_cap(scene, cap):
+    """As many upscalings as doublings; the Gaussians that are chosen each time become cap × cap, but for thin ones."""
+    texture = {"cap": cap, "fraction": 1.0, "anisotropic": False}
+    result = a2tg.fit(scene, tiny("a2tg", texture=texture, initial_gaussians=20, densify={"cap": 20}), progress=False)
+    sizes = result.model.layout.sizes
+    assert sizes.max() == cap and np.mean(sizes == cap) > 0.8
+    assert [round(n / 30_000, 4) for n in a2tg.Upscale(cap=cap).iterations(30_000)] == [
+        round(k / 60, 4) for k in range(1, cap.bit_length())
+    ]
+
+
 def test_official_is_a_preset_of_all_options():
     texture = a2tg.A2tg.preset("official").texture
     assert (texture.select, texture.threshold, texture.axes, texture.gradient) == (

@@ -50,8 +50,8 @@ class TextureConfig:
     cap: int = 4
     """Largest texture side in texels (at most 16)."""
     upscale_at: tuple[float, ...] | None = None
-    """Fractions of stage 2 at which textures grow; None: the paper's 1/60 and 1/30, under 30,000 iterations 0.15 and
-    0.30."""
+    """Fractions of stage 2 at which textures grow; None: so often that the cap can be reached, every 1/60 of the stage
+    as in the paper, under 30,000 iterations every 0.15."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)

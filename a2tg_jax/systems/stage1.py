@@ -15,7 +15,9 @@ QUICK_OPACITY = 0.5
 QUICK_RATES = LearningRates(means=3 * 1.6e-4, sh_degree0=2 * 2.5e-3)
 QUICK_TEXELS = 1e-2
 """What short runs want (docs/quality.md): Gaussians that begin half opaque, and faster rates."""
-SMOKE: dict[str, Any] = {"stage1_iterations": 200, "initial_gaussians": 800}
+SMOKE: dict[str, Any] = {
+    "stage1_iterations": 200, "initial_gaussians": 800, "initial_opacity": QUICK_OPACITY, "rates": QUICK_RATES,
+}  # fmt: skip
 SMOKE_CAP = 1_000
 
 

@@ -56,5 +56,5 @@ class SuperGaussians(System):
                 stage1_iterations=2_000, stage2_iterations=1_000, initial_opacity=0.5, rates=quick,
                 densify=DensityConfig(cap=QUICK_CAP),
             ),
-            "smoke": cls(**SMOKE, densify=DensityConfig(cap=SMOKE_CAP)),
+            "smoke": cls(**(SMOKE | {"rates": quick}), densify=DensityConfig(cap=SMOKE_CAP)),
         }  # fmt: skip

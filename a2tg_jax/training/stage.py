@@ -81,6 +81,10 @@ class Stage:
         wanted = {event.statistic for event in self.events} - {None}
         return next(iter(wanted), None)
 
+    def is_ahead(self, event: Event) -> bool:
+        """Whether an event happens at all (host)."""
+        return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
+
     def check(self) -> None:
         """Refuses what cannot be trained.
 

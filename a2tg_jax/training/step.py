@@ -71,7 +71,7 @@ def initial_state(stage: Stage, model: Model) -> TrainState:
     return TrainState(
         model=model,
         moments=adam_init((model.gaussians, model.params)),
-        events=tuple(event.init(model) for event in stage.events),
+        events=tuple(event.init(model) if stage.is_ahead(event) else None for event in stage.events),
         iteration=jnp.zeros((), jnp.int32),
         status=jnp.zeros((), jnp.int32),
     )
