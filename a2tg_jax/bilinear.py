@@ -1,7 +1,11 @@
-"""Bilinear interpolation in the image of a splat: a part of a table [T, C], row by row.
+"""Bilinear interpolation in a splat's texture: which texels a position lies between, and what they weigh.
 
-Every function is element-wise: it takes scalars, or arrays that broadcast. (x, y) counts texels from the centre of the
-first one and lies in [0, width − 1] × [0, height − 1].
+The arithmetic of a texture lookup. Where a splat's texture is looked up says its appearance rule (`appearance.rule`);
+how textures of many sizes are stored, `texture`; `kernels.texels` does the same for vectors of pixels.
+
+The textures of all splats lie in one array of texels [T, C], each a `TextureRegion` of it, row by row. Every function
+is element-wise: it takes scalars, or arrays that broadcast. (x, y) counts texels from the centre of the first one and
+lies in [0, width − 1] × [0, height − 1].
 """
 
 from typing import NamedTuple
@@ -11,55 +15,71 @@ import jax.numpy as jnp
 from jax import Array
 
 
-class Image(NamedTuple):
-    """Where the image of a splat lies in the table; int32."""
+class TextureRegion(NamedTuple):
+    """Where the texture of a splat lies among all texels; int32."""
 
     first: Array
-    """The entry that is its first texel."""
+    """Index of its first texel."""
     height: Array
+    """In texels, as the width."""
     width: Array
 
 
-class Tap(NamedTuple):
+class Corner(NamedTuple):
     """One of the four texels around (x, y)."""
 
-    entry: Array
-    """Of the table."""
+    texel: Array
+    """Its index among all texels."""
     weight: Array
+    """Bilinear weight, in [0, 1]."""
     slope_x: Array
     """Derivative of the weight by x, within the cell."""
     slope_y: Array
+    """Derivative of the weight by y, within the cell."""
 
 
 class Sample(NamedTuple):
-    """What an image shows at (x, y), C numbers each."""
+    """What a texture shows at (x, y): C values, and their derivatives."""
 
     values: tuple[Array, ...]
+    """The C interpolated numbers."""
     slope_x: tuple[Array, ...]
     """Derivatives by x, within the cell."""
     slope_y: tuple[Array, ...]
+    """Derivatives by y, within the cell."""
 
 
-def taps(image: Image, x: Array, y: Array) -> tuple[Tap, ...]:
+class Lookup(NamedTuple):
+    """What was read of a splat's texture, and where."""
+
+    region: TextureRegion
+    """The texture."""
+    sample: Sample
+    """What it shows."""
+    corners: tuple[Corner, ...] = ()
+    """The texels that were read; empty where their cotangents are found in another way."""
+
+
+def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
     """The texels above left, above right, below left and below right of (x, y)."""
-    right_most, bottom_most = image.width - 1, image.height - 1
-    # Whatever x and y are, nothing outside of the image is read.
+    right_most, bottom_most = region.width - 1, region.height - 1
+    # Whatever x and y are, nothing outside of the texture is read.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
     top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
     right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
-    above, below = image.first + top * image.width, image.first + bottom * image.width
+    above, below = region.first + top * region.width, region.first + bottom * region.width
     fx, fy = x - left.astype(x.dtype), y - top.astype(y.dtype)
     gx, gy = 1 - fx, 1 - fy
     return (
-        Tap(above + left, gx * gy, -gy, -gx),
-        Tap(above + right, fx * gy, gy, -fx),
-        Tap(below + left, gx * fy, -fy, gx),
-        Tap(below + right, fx * fy, fy, fx),
+        Corner(above + left, gx * gy, -gy, -gx),
+        Corner(above + right, fx * gy, gy, -fx),
+        Corner(below + left, gx * fy, -fy, gx),
+        Corner(below + right, fx * fy, fy, fx),
     )
 
 
-def interpolate(found: tuple[Tap, ...], texels: tuple[tuple[Array, ...], ...]) -> Sample:
-    """The sample, given the C numbers of each tap's texel."""
+def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ...]) -> Sample:
+    """The sample, given the C numbers of each corner's texel."""
 
     def weighed(weights):
         return tuple(
@@ -67,7 +87,7 @@ def interpolate(found: tuple[Tap, ...], texels: tuple[tuple[Array, ...], ...]) -
             for column in zip(*texels, strict=True)
         )
 
-    return Sample(*(weighed([tap[k] for tap in found]) for k in (1, 2, 3)))
+    return Sample(*(weighed([corner[k] for corner in corners]) for k in (1, 2, 3)))
 
 
 def follow(sample: Sample, x: Array, y: Array) -> tuple[Array, ...]:

@@ -73,16 +73,16 @@ def view_gradients(
     dtype = model.gaussians.means.dtype
     settings = with_capacity(settings, model.gaussians, camera, model.rule, model.num_live)
 
-    def of_parameters(gaussians, params, tap):
+    def of_parameters(gaussians, params, probe):
         shown = dataclasses.replace(model, gaussians=gaussians, params=params)
         output, num_pairs = render_traced(
             gaussians, camera, shown.rule, jnp.asarray(background, dtype), settings,
-            has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, tap=tap, statistic=statistic,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
         return loss(shown, output), (output, num_pairs)
 
-    tap = jnp.zeros((model.gaussians.num, 4), dtype)
+    probe = jnp.zeros((model.gaussians.num, 4), dtype)
     differentiate = jax.value_and_grad(of_parameters, argnums=(0, 1, 2), has_aux=True)
-    (value, (output, num_pairs)), (gaussians, params, found) = differentiate(model.gaussians, model.params, tap)
+    (value, (output, num_pairs)), (gaussians, params, found) = differentiate(model.gaussians, model.params, probe)
     norms, is_visible = safe_norm(found[:, :3]), found[:, 3] > 0
     return ViewGradients(value, gaussians, params, norms, is_visible, output, num_pairs)

@@ -1,9 +1,11 @@
-"""One splat at one pixel: where the ray meets it, what it shows there, how light passes it.
+"""One splat at one pixel: where the ray meets it, what it shows there, how much light it lets through.
 
 Every function here is element-wise: it takes scalars, or arrays that broadcast. It is the one definition of what is
-rendered; `compositor` runs it over arrays, `kernels` compiles it into loops, and both differentiate it by `jax.vjp`.
+rendered: `kernels.xla` runs it over arrays, the other kernels compile it into loops, and all differentiate it by
+`jax.vjp`.
 
-M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of a splat, g the cotangent of the channels.
+M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of a splat, g the cotangent of the channels, B
+(`suffix_sum`) what the splats from here to the last one make of g.
 """
 
 from typing import Literal, NamedTuple
@@ -14,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule
-from a2tg_jax.bilinear import Image, Sample, follow
+from a2tg_jax.bilinear import Lookup, follow
 
 MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
@@ -30,39 +32,46 @@ class Splat(NamedTuple):
     M: tuple[Triple, Triple, Triple]
     """Rows of the homography from (u, v, 1) to pixels."""
     opacity: Array
+    """Peak opacity, before the falloff."""
     color: Triple
+    """Red, green and blue of its spherical harmonics."""
     normal: Triple | None
     """In the world, facing the camera; None where only colour is composited."""
     numbers: tuple[Array, ...] = ()
-    """What else its appearance rule knows of it."""
+    """What else its appearance rule knows of it (`AppearanceRule.numbers`)."""
 
 
 class Planes(NamedTuple):
     """A splat seen from a tile: p = k × l is linear in the pixel (x, y), counted from the tile's centre."""
 
     p0: Triple
-    """Coefficients of x, y and 1."""
+    """Coefficients of x, y and 1 in p₀, where u = p₀/p₂."""
     p1: Triple
+    """The same of p₁, where v = p₁/p₂."""
     p2: Triple
+    """The same of p₂."""
     determinant: Array
+    """det(M); over p₂ it is the depth of the hit."""
     center_x: Array
-    """The projected mean."""
+    """The projected mean, in pixels from the tile's centre."""
     center_y: Array
+    """Its other coordinate."""
     depth: Array
-    """Of the mean."""
+    """Depth of the mean."""
 
 
 class Hit(NamedTuple):
     """Where the ray of a pixel meets a splat."""
 
     u: Array
-    """In standard deviations; (0, 0) without a hit."""
+    """Along the first axis, in standard deviations; 0 without a hit."""
     v: Array
+    """Along the second axis."""
     rho: Array
     """min(u² + v², 2·|(x, y) − c|²), the squared distance that the falloff sees. Without the low-pass filter u² + v²,
     infinite without a hit."""
     depth: Array
-    """Of the hit; of the mean where the low-pass filter decides."""
+    """Depth of the hit; of the mean where the low-pass filter decides."""
     is_ray: Array
     """Whether the hit decides ρ, not the low-pass filter."""
 
@@ -71,6 +80,7 @@ class Shown(NamedTuple):
     """What a splat shows at a pixel."""
 
     alpha: Array
+    """In [0, max_alpha]; 0 where it would be less than 1/255."""
     channels: tuple[Array, ...]
     """Red, green, blue; and depth, depth², normal x, y, z where the splat has a normal."""
 
@@ -125,15 +135,15 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth), is_ray)
 
 
-def values_at(rule: AppearanceRule, image: Image | None, sample: Sample | None, hit: Hit, values: tuple[Array, ...]):
-    """The values of a sample, differentiable in themselves and in where the ray meets the splat."""
-    if image is None or sample is None:
+def values_at(rule: AppearanceRule, lookup: Lookup | None, hit: Hit, values: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The values of a lookup, differentiable in themselves and in where the ray meets the splat."""
+    if lookup is None:
         return ()
-    return follow(sample._replace(values=values), *rule.texel(image, hit.u, hit.v))
+    return follow(lookup.sample._replace(values=values), *rule.texel_position(lookup.region, hit.u, hit.v))
 
 
 def show(
-    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_tap: Array | None = None
+    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_probe: Array | None = None
 ) -> Shown:
     """α = min(rule.max_alpha, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
 
@@ -141,13 +151,13 @@ def show(
       rule: the appearance rule.
       splat: its homography is not read.
       hit: where the ray meets the splat.
-      values: what the splat's image shows there.
-      rho_tap: zero, added to what the falloff is given, to read the gradient there; or None.
+      values: what the splat's texture shows there.
+      rho_probe: zero, added to what the falloff is given, to read the gradient there; or None.
     """
     residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
     # No falloff is asked for its slope at infinity, which need not be a number.
     rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
-    rho = rho if rho_tap is None else rho + rho_tap
+    rho = rho if rho_probe is None else rho + rho_probe
     a = splat.opacity * rule.falloff(splat.numbers, rho)
     a = a if factor is None else a * factor
     # What is not a number stays so, here and in `absorb`: it must not vanish.
@@ -161,32 +171,32 @@ def show(
     return Shown(alpha, channels)
 
 
-def absorb(alpha: Array, light: Array, is_live: Array) -> Triple:
+def absorb(alpha: Array, transmittance: Array, is_live: Array) -> Triple:
     """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
     leave less than 10⁻⁴."""
-    is_live = is_live & ~(light * (1 - alpha) < MIN_TRANSMITTANCE)
-    weight = jnp.where(is_live, alpha * light, 0.0)
-    return weight, light - weight, is_live
+    is_live = is_live & ~(transmittance * (1 - alpha) < MIN_TRANSMITTANCE)
+    weight = jnp.where(is_live, alpha * transmittance, 0.0)
+    return weight, transmittance - weight, is_live
 
 
-def absorb_vjp(alpha: Array, light: Array, is_live: Array, behind: Array, shown: Array):
+def absorb_vjp(alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, shown: Array):
     """`absorb`, and ∂L/∂α, walking front to back.
 
     With B = Σ g·c·α·T over the splats behind + g_T·T_final, all of which is linear in what this splat lets through,
     ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never reaches 1.
 
     Args:
-      alpha, light, is_live: as for `absorb`.
-      behind: B with this splat's own g·c·α·T still in it.
+      alpha, transmittance, is_live: as for `absorb`.
+      suffix_sum: B with this splat's own g·c·α·T still in it.
       shown: g·c, the cotangent's product with this splat's channels.
 
     Returns:
-      weight, light and is_live behind the splat, B, and ∂L/∂α.
+      weight; transmittance and is_live behind the splat; B of the splats behind it; and ∂L/∂α.
     """
-    weight, after, live_after = absorb(alpha, light, is_live)
-    behind = behind - weight * shown
-    d_alpha = jnp.where(live_after, light * shown - behind / (1 - alpha), 0.0)
-    return weight, after, live_after, behind, d_alpha
+    weight, after, live_after = absorb(alpha, transmittance, is_live)
+    suffix_sum = suffix_sum - weight * shown
+    d_alpha = jnp.where(live_after, transmittance * shown - suffix_sum / (1 - alpha), 0.0)
+    return weight, after, live_after, suffix_sum, d_alpha
 
 
 class Cotangents(NamedTuple):
@@ -198,42 +208,43 @@ class Cotangents(NamedTuple):
     normal: Triple | None
     numbers: tuple[Array, ...]
     values: tuple[Array, ...]
-    """Of what the splat's image shows."""
+    """Of what the splat's texture shows."""
     rho: Array | None
     """∂L/∂ρ through the falloff, where asked for."""
 
 
-def composite(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, light, is_live):
-    """One splat at one pixel of the forward pass: what it adds to the channels, and light and liveness behind it."""
+def blend(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, transmittance, is_live):
+    """One splat at one pixel, forward: what it adds to the channels, and transmittance and liveness behind it."""
     shown = show(rule, splat, intersect(planes, x, y, near_plane, rule.has_low_pass), values)
-    weight, light, is_live = absorb(shown.alpha, light, is_live)
-    return tuple(weight * channel for channel in shown.channels), light, is_live
+    weight, transmittance, is_live = absorb(shown.alpha, transmittance, is_live)
+    return tuple(weight * channel for channel in shown.channels), transmittance, is_live
 
 
-def composite_vjp(
-    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, image: Image | None, sample: Sample | None,
-    x, y, light, is_live, behind, g, has_rho: bool,
+def blend_vjp(
+    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x, y,
+    transmittance, is_live, suffix_sum, g, has_rho: bool,
 ):  # fmt: skip
-    """One splat at one pixel of the backward pass; `behind` and `g` as in `absorb_vjp`, g channel by channel.
+    """One splat at one pixel, backward; `suffix_sum` and `g` as in `absorb_vjp`, g channel by channel.
 
     Returns:
-      (light, is_live, behind) behind the splat, its weight, and its Cotangents, which mean something only where the
-      weight is positive: elsewhere they may not even be finite.
+      (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents, which mean something only
+      where the weight is positive: elsewhere they may not even be finite.
     """
 
-    def of_floats(planes, opacity, color, normal, numbers, values, rho_tap):
+    def of_floats(planes, opacity, color, normal, numbers, values, rho_probe):
         hit = intersect(planes, x, y, near_plane, rule.has_low_pass)
-        values = values_at(rule, image, sample, hit, values)
-        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_tap)
+        values = values_at(rule, lookup, hit, values)
+        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_probe)
 
-    rho_tap = jnp.zeros_like(light) if has_rho else None
-    values = () if sample is None else sample.values
-    floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, rho_tap
+    rho_probe = jnp.zeros_like(transmittance) if has_rho else None
+    values = () if lookup is None else lookup.sample.values
+    floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, rho_probe
     shown, pull_back = jax.vjp(of_floats, *floats)
     seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
-    weight, light, is_live, behind, d_alpha = absorb_vjp(shown.alpha, light, is_live, behind, seen)
+    state = transmittance, is_live, suffix_sum
+    weight, *state, d_alpha = absorb_vjp(shown.alpha, *state, seen)
     cotangents = Cotangents(*pull_back(Shown(d_alpha, tuple(weight * g_k for g_k in g))))
-    return (light, is_live, behind), weight, cotangents
+    return tuple(state), weight, cotangents
 
 
 def positional_gradient(

@@ -17,13 +17,14 @@ from jax import Array
 from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
 from a2tg_jax.cameras import Camera, check_camera
 from a2tg_jax.checks import check_shape
-from a2tg_jax.compositor import Compositing, Splats, composite
+from a2tg_jax.compositor import composite
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose, instead_of_native
 from a2tg_jax.pixel import Statistic
 from a2tg_jax.sh import sh_colors
+from a2tg_jax.splats import CompositingSettings, Splats
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
 
@@ -155,7 +156,7 @@ def render_traced(
     has_geometry: bool = True,
     sh_degree: Any = None,
     num_live: Any = None,
-    tap: Array | None = None,
+    probe: Array | None = None,
     statistic: Statistic | None = "position",
 ) -> tuple[RenderOutput, Array]:
     """What training differentiates: the output, and how many pairs the view has, for `capacity_for`.
@@ -166,47 +167,47 @@ def render_traced(
       has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
       sh_degree: overrides the settings' by a value that may be traced.
       num_live: only the first so many rows show; may be traced.
-      tap: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
-      statistic: which (`pixel.positional_gradient`); not used without a tap.
+      probe: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
+      statistic: which (`pixel.positional_gradient`); not used without a probe.
     """
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     compositor = choose(settings.compositor, settings.tile_size)
-    how = Compositing(
+    compositing = CompositingSettings(
         grid=grid,
         near_plane=settings.near_plane,
         has_geometry=has_geometry,
-        statistic=None if tap is None else statistic,
+        statistic=None if probe is None else statistic,
         compositor=compositor,
         tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
     )
     if gaussians.num == 0:
         dtype = background.dtype
-        channels = jnp.zeros((how.num_channels, grid.height, grid.width), dtype)
+        channels = jnp.zeros((compositing.num_channels, grid.height, grid.width), dtype)
         transmittance = jnp.ones((grid.height, grid.width), dtype)
-        return _output(how, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
+        return _output(compositing, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings, degree, num_live)
-    if compositor == "native" and (reason := native.refusal(how, rule, splats)):
+    if compositor == "native" and (reason := native.refusal(compositing, rule, splats)):
         settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
         return render_traced(
             gaussians, camera, rule, background, settings,
-            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, tap=tap, statistic=statistic,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
     M = jax.lax.stop_gradient(splats.M)
     lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
-    tap = jnp.zeros((gaussians.num, 4), splats.M.dtype) if tap is None else tap
-    channels, transmittance = composite(how, splats, rule, cutoff, lists, jacobian, tap)
+    probe = jnp.zeros((gaussians.num, 4), splats.M.dtype) if probe is None else probe
+    channels, transmittance = composite(compositing, splats, rule, cutoff, lists, jacobian, probe)
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
     channels, transmittance = channels + taint, transmittance + taint
-    return _output(how, channels, transmittance, background, lists.overflow), lists.num_pairs
+    return _output(compositing, channels, transmittance, background, lists.overflow), lists.num_pairs
 
 
-def _output(how: Compositing, channels, transmittance, background, overflow) -> RenderOutput:
+def _output(compositing: CompositingSettings, channels, transmittance, background, overflow) -> RenderOutput:
     color = jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
-    if not how.has_geometry:
+    if not compositing.has_geometry:
         nothing = jnp.zeros_like(alpha)
         return RenderOutput(color, alpha, nothing, jnp.zeros_like(color), overflow, nothing)
     depth, squared = channels[3], channels[4]

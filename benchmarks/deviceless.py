@@ -42,8 +42,9 @@ def programs():
     import jax.numpy as jnp
 
     from a2tg_jax.appearance import PlainRule, TexturedRule, TextureOptions
-    from a2tg_jax.compositor import Compositing, Splats, composite
+    from a2tg_jax.compositor import composite
     from a2tg_jax.kernels import pallas
+    from a2tg_jax.splats import CompositingSettings, Splats
     from a2tg_jax.tiles import TileGrid, TileLists
 
     pallas.IS_COMPILED_AHEAD = True
@@ -56,19 +57,19 @@ def programs():
 
     for name, rule in (("plain", PlainRule()), ("textured", textured)):
         for statistic in (None, "position"):
-            how = Compositing(grid, 0.2, False, statistic, "pallas", 1)
+            settings = CompositingSettings(grid, 0.2, False, statistic, "pallas", 1)
             inputs = splats, rule, floats(num), lists, floats(3, 3), floats(num, 4)
 
-            def forward(*inputs, how=how):
-                return composite(how, *inputs)
+            def forward(*inputs, settings=settings):
+                return composite(settings, *inputs)
 
-            def backward(splats, rule, cutoff, lists, jacobian, tap, how=how):
-                def loss(splats, params, tap):
-                    shown = dataclasses.replace(rule, table=params) if params.shape[1] else rule
-                    channels, transmittance = composite(how, splats, shown, cutoff, lists, jacobian, tap)
+            def backward(splats, rule, cutoff, lists, jacobian, probe, settings=settings):
+                def loss(splats, params, probe):
+                    shown = dataclasses.replace(rule, texels=params) if params.shape[1] else rule
+                    channels, transmittance = composite(settings, splats, shown, cutoff, lists, jacobian, probe)
                     return jnp.sum(channels) + jnp.sum(transmittance)
 
-                return jax.grad(loss, argnums=(0, 1, 2))(splats, rule.table, tap)
+                return jax.grad(loss, argnums=(0, 1, 2))(splats, rule.texels, probe)
 
             if not statistic:
                 yield f"{name}, forward", forward, inputs

@@ -70,7 +70,7 @@ class Passes(NamedTuple):
     both: Callable
     """The gradient of L1 against a fixed random image."""
     counts: Callable
-    """Of a tap, too: its gradient (`compositor.composite`)."""
+    """Of the statistic's probe, too: its gradient (`compositor.composite`)."""
 
 
 def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSettings) -> Passes:
@@ -78,12 +78,12 @@ def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSetting
     settings = a2tg_jax.plan_render(gaussians, camera, textures, layout, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 
-    def image(gaussians, textures, tap=None):
+    def image(gaussians, textures, probe=None):
         rule = appearance_of(gaussians, textures, layout, settings)
-        return render_traced(gaussians, camera, rule, jnp.zeros(3), settings, has_geometry=False, tap=tap)[0].color
+        return render_traced(gaussians, camera, rule, jnp.zeros(3), settings, has_geometry=False, probe=probe)[0].color
 
-    def loss(gaussians, textures, tap=None):
-        return jnp.mean(jnp.abs(image(gaussians, textures, tap) - target))
+    def loss(gaussians, textures, probe=None):
+        return jnp.mean(jnp.abs(image(gaussians, textures, probe) - target))
 
     both, counts = jax.grad(loss, argnums=(0, 1)), jax.grad(loss, argnums=2)
     return Passes(jax.jit(image), jax.jit(both), jax.jit(counts))

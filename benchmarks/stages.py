@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 
 import a2tg_jax
-from a2tg_jax.compositor import Compositing, composite
+from a2tg_jax.compositor import composite
 from a2tg_jax.kernels import native
 from a2tg_jax.optim import adam_init, adam_update
 from a2tg_jax.render import appearance_of, project_gaussians
+from a2tg_jax.splats import CompositingSettings
 from a2tg_jax.tiles import TileGrid
 from benchmarks import timing
 from benchmarks.workload import random_scene, random_textures
@@ -29,11 +30,11 @@ def measure_stages(case: dict) -> dict:
     splats, cutoff = project(gaussians)
     find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)
-    how = Compositing(grid, settings.near_plane, False, False, "native", 1)
-    jacobian, tap = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
+    compositing = CompositingSettings(grid, settings.near_plane, False, None, "native", 1)
+    jacobian, probe = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 
     def colors(splats, rule):
-        return composite(how, splats, rule, lists, jacobian, tap)[0]
+        return composite(compositing, splats, rule, cutoff, lists, jacobian, probe)[0]
 
     def all_of_it(splats, rule):
         _, pull_back = jax.vjp(colors, splats, rule)

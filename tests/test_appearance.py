@@ -180,8 +180,8 @@ def test_official_texels_are_left_as_trained():
     _, params, layout = allocated(appearance)
     raw = moved(params)
     np.testing.assert_array_equal(appearance.project(raw).buckets[0], raw.buckets[0])
-    table = appearance.rule(raw, layout).table
-    assert table.min() == 0 and 0.999 < table[:, 3].max() <= 1
+    texels = appearance.rule(raw, layout).texels
+    assert texels.min() == 0 and 0.999 < texels[:, 3].max() <= 1
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from a2tg_jax.bilinear import Image, follow, interpolate, taps
+from a2tg_jax.bilinear import TextureRegion, corners_of, follow, interpolate
 
 SIZES = [(1, 1), (1, 8), (8, 2), (5, 3), (16, 16)]
 FIRST = 7
@@ -16,8 +16,10 @@ def sample(texels: np.ndarray, x, y):
     """The sample of one channel of an image [h, w] that lies in a table of others."""
     height, width = texels.shape
     table = jnp.concatenate([jnp.full(FIRST, 1e6), jnp.asarray(texels).reshape(-1), jnp.full(50, 1e6)])
-    found = taps(Image(jnp.int32(FIRST), jnp.int32(height), jnp.int32(width)), jnp.asarray(x), jnp.asarray(y))
-    return interpolate(found, tuple((table[tap.entry],) for tap in found))
+    found = corners_of(
+        TextureRegion(jnp.int32(FIRST), jnp.int32(height), jnp.int32(width)), jnp.asarray(x), jnp.asarray(y)
+    )
+    return interpolate(found, tuple((table[corner.texel],) for corner in found))
 
 
 def draw(size: tuple[int, int], count: int = 200):
@@ -52,9 +54,11 @@ def test_slopes_at_texels_are_those_ahead_and_zero_at_the_end(x64):
 def test_nothing_outside_of_the_image_is_read():
     texels = np.ones((2, 3), np.float32)
     x = np.float32([-5, 9, np.nan, np.inf])
-    found = taps(Image(jnp.int32(FIRST), jnp.int32(2), jnp.int32(3)), jnp.asarray(x), jnp.asarray(x[::-1]))
-    for tap in found:
-        assert tap.entry.min() >= FIRST and tap.entry.max() < FIRST + texels.size
+    found = corners_of(
+        TextureRegion(jnp.int32(FIRST), jnp.int32(2), jnp.int32(3)), jnp.asarray(x), jnp.asarray(x[::-1])
+    )
+    for corner in found:
+        assert corner.texel.min() >= FIRST and corner.texel.max() < FIRST + texels.size
 
 
 def test_following_a_sample_gives_its_slopes(x64):

@@ -18,6 +18,7 @@ LAYERS = (
     {"texture", "tiles", "data"},
     {"appearance", "transform", "paths", "origin"},
     {"pixel"},
+    {"splats"},
     {"kernels"},
     {"compositor", "losses"},
     {"render", "optim", "metrics"},

@@ -13,7 +13,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import AppearanceRule, PlainRule, gaussian_cutoff
-from a2tg_jax.bilinear import Image
+from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.geometry import homographies
 from a2tg_jax.kernels import native, threads
 from a2tg_jax.render import appearance_of, render_traced
@@ -80,15 +80,15 @@ def test_parts_cover_all_tiles():
 class HalvesRule(AppearanceRule):
     """A rule of another kind: two colours and one opacity a splat, [2N, 3], by the sign of u, and another falloff."""
 
-    table: jax.Array
+    texels: jax.Array
     first: jax.Array
     sharpness: float = dataclasses.field(metadata={"static": True})
 
     @property
-    def images(self):
-        return Image(self.first, jnp.ones_like(self.first), jnp.full_like(self.first, 2))
+    def regions(self):
+        return TextureRegion(self.first, jnp.ones_like(self.first), jnp.full_like(self.first, 2))
 
-    def texel(self, image, u, v):
+    def texel_position(self, region, u, v):
         return (u > 0).astype(u.dtype), jnp.zeros_like(v)
 
     def shade(self, numbers, values, u, v):
@@ -149,10 +149,10 @@ def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
     textures, layout = as_textures(scene, "float32") if has_textures else (None, None)
 
-    def loss(gaussians, textures, tap, compositor):
+    def loss(gaussians, textures, probe, compositor):
         settings = RenderSettings(compositor=compositor, capacity=1024)
         rule = appearance_of(gaussians, textures, layout, settings)
-        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, tap=tap, statistic=statistic)
+        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, probe=probe, statistic=statistic)
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)

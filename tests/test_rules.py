@@ -227,16 +227,16 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     settings = RenderSettings(compositor=compositor, capacity=1024, sh_degree=0)
     camera, background = as_camera(scene, "float64"), jnp.zeros(3)
 
-    def loss(gaussians, tap, rule):
-        output, _ = render_traced(gaussians, camera, rule, background, settings, has_geometry=False, tap=tap)
+    def loss(gaussians, probe, rule):
+        output, _ = render_traced(gaussians, camera, rule, background, settings, has_geometry=False, probe=probe)
         return jnp.sum(output.color)
 
     differentiate = jax.jit(jax.grad(loss, argnums=(0, 1)))
-    gaussians, tap = as_gaussians(scene, "float64"), jnp.zeros((len(scene.means), 4))
-    by_mean, statistic = differentiate(gaussians, tap, glossy_rule(params))
+    gaussians, probe = as_gaussians(scene, "float64"), jnp.zeros((len(scene.means), 4))
+    by_mean, statistic = differentiate(gaussians, probe, glossy_rule(params))
     assert jnp.max(jnp.abs(by_mean.means)) > 1e-2
     np.testing.assert_allclose(statistic[:, :3], jnp.abs(by_mean.means), atol=1e-12)
-    _, statistic = differentiate(gaussians, tap, billboard_rule(billboard_params(len(scene.means))))
+    _, statistic = differentiate(gaussians, probe, billboard_rule(billboard_params(len(scene.means))))
     np.testing.assert_array_equal(statistic[:, :3], 0)
 
 

@@ -14,15 +14,15 @@ from a2tg_jax.render import RenderSettings, appearance_of, render_traced
 
 
 def statistic(scene: Scene, cotangent: np.ndarray, settings: RenderSettings, which: str) -> np.ndarray:
-    """[N, 4] gradient at the tap: the statistic, and the number of pixels composited."""
+    """[N, 4] gradient at the probe: the statistic, and the number of pixels composited."""
     gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
     settings = dataclasses.replace(settings, capacity=CAPACITY)
     rule = appearance_of(gaussians, *as_textures(scene, "float64"), settings)
 
-    def loss(tap):
+    def loss(probe):
         background = jnp.asarray(scene.background)
         output, _ = render_traced(
-            gaussians, camera, rule, background, settings, has_geometry=False, tap=tap, statistic=which
+            gaussians, camera, rule, background, settings, has_geometry=False, probe=probe, statistic=which
         )
         return jnp.sum(output.color * jnp.asarray(cotangent))
 

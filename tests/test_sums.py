@@ -38,25 +38,27 @@ def numbers_of(position: int, count: int) -> np.ndarray:
     return np.random.default_rng(position).normal(size=count).astype(np.float32)
 
 
-def add(ids, starts, part, images, splats, table, tap):
+def add(ids, starts, part, images, splats, texels, probe):
     """What a thread does, in numpy."""
     for position in range(starts[part[0]], starts[part[1]]):
         splat = ids[position]
         splats[splat] += numbers_of(position, 5)
-        if len(tap) == NUM:
-            tap[splat] += numbers_of(position, 4)
-        if table is not None:
+        if len(probe) == NUM:
+            probe[splat] += numbers_of(position, 4)
+        if texels is not None:
             first, height, width = images[splat]
-            table[first : first + height * width] += numbers_of(position, COLUMNS)
+            texels[first : first + height * width] += numbers_of(position, COLUMNS)
 
 
-def add_beside(ids, starts, part, images, splats, table, tap, places, more_splats, more_table, more_tap, more_first):
+def add_beside(
+    ids, starts, part, images, splats, texels, probe, places, more_splats, more_texels, more_probe, more_first
+):
     """The same, with the rows that the loop is given."""
     for position in range(starts[part[0]], starts[part[1]]):
         splat, place = ids[position], places[position]
-        rows = (splats, table, tap, splat) if place < 0 else (more_splats, more_table, more_tap, place)
+        rows = (splats, texels, probe, splat) if place < 0 else (more_splats, more_texels, more_probe, place)
         rows[0][rows[3]] += numbers_of(position, 5)
-        if len(tap) == NUM:
+        if len(probe) == NUM:
             rows[2][rows[3]] += numbers_of(position, 4)
         first, height, width = images[splat]
         first = first if place < 0 else more_first[place]
@@ -95,6 +97,6 @@ def test_a_part_has_room_for_what_it_shares_only():
     results = [np.ones((num, 17), np.float32), np.ones((16 * num, 4), np.float32), np.ones((1, 4), np.float32)]
     room = SumsOfParts(ids, starts, images, results, [(0, 499), (499, num)])
     assert room.splats.tolist() == [7, 8, 9]
-    _, _, _, _, more_splats, more_table, *_ = room.outputs(1)
-    assert more_splats.shape == (3, 17) and more_table.shape == (48, 4)
+    _, _, _, _, more_splats, more_texels, *_ = room.outputs(1)
+    assert more_splats.shape == (3, 17) and more_texels.shape == (48, 4)
     assert not any(result.any() for result in results)

@@ -19,7 +19,7 @@ from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule
-from a2tg_jax.bilinear import Image
+from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
 from a2tg_jax.numerics import safe_divide
 from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures
@@ -34,8 +34,8 @@ LEAST_PEAK = 0.999 / 255
 class BillboardRule(AppearanceRule):
     """An appearance rule: RGB residual and alpha from each splat's own picture."""
 
-    table: Array
-    """[texels, 4] all pictures, RGB in (0, 1) and alpha."""
+    texels: Array
+    """[T, 4] of all pictures, RGB in (0, 1) and alpha."""
     first: Array
     """[N] where the pictures begin."""
     peaks: Array
@@ -48,14 +48,14 @@ class BillboardRule(AppearanceRule):
     has_low_pass: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @property
-    def images(self) -> Image:  # type: ignore[override]
+    def regions(self) -> TextureRegion:  # type: ignore[override]
         side = jnp.full_like(self.first, self.side)
-        return Image(self.first, side, side)
+        return TextureRegion(self.first, side, side)
 
     def opacities(self, gaussians: Gaussians) -> Array:
         return jnp.ones(gaussians.num, gaussians.means.dtype)
 
-    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
+    def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         return jnp.clip(self._place(u), 0.0, self.side - 1.0), jnp.clip(self._place(v), 0.0, self.side - 1.0)
 
     def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):

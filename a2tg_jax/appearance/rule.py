@@ -1,15 +1,15 @@
 """Appearance rules: what a splat shows at (u, v). The compositor is given one and knows nothing else about it.
 
-Each of N splats may own an image of one texel or more in a table [T, C], and K numbers. At (u, v), in standard
-deviations, the rule says where the image is looked up (`texel`), and what the C values found there, with the K numbers,
-make visible (`shade`):
+Each of N splats may own a texture of one texel or more among all texels [T, C], and K numbers. At (u, v), in standard
+deviations, the rule says where the texture is looked up (`texel_position`), and what the C values found there
+(`bilinear`), with the K numbers, make visible (`shade`):
 
-    residual, factor = rule.shade(numbers, interpolated image at rule.texel(image, u, v), u, v)
+    residual, factor = rule.shade(numbers, texture interpolated at rule.texel_position(region, u, v), u, v)
     α = min(max_alpha, opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
 
-`texel`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They see the rule without its
-arrays (`StaticRule`): whatever is differentiated, or differs between splats, is in the table or in the numbers. All
-else is computed by XLA for the N splats at once, and may use any field.
+`texel_position`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They see the rule
+without its arrays (`StaticRule`): whatever is differentiated, or differs between splats, is in the texels or in the
+numbers. All else is computed by XLA for the N splats at once, and may use any field.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.bilinear import Image
+from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import Gaussians
 
@@ -38,10 +38,10 @@ class AppearanceRule:
     """Static. The low-pass filter of 2DGS shows splats that are smaller than a pixel, or seen edge-on. Without it, ρ is
     u² + v² where the pixel's ray meets the splat, and nothing shows where it does not."""
 
-    table: Array
-    """[T, C] the entries of all images, differentiable; T >= 1, and C >= 1 where there are images."""
-    images: Image | None
-    """[N] each: the splats' images in the table. None where nothing of it is read."""
+    texels: Array
+    """[T, C] the texels of all splats, differentiable; T >= 1, and C >= 1 where there are textures."""
+    regions: TextureRegion | None
+    """[N] each: where the splats' textures lie among the texels. None where nothing of them is read."""
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
         """[N, K] what else `shade` and `falloff` know of each splat, differentiable; it may depend on the view.
@@ -54,14 +54,14 @@ class AppearanceRule:
         """[N] peak opacities."""
         return gaussians.opacities
 
-    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
-        """(x, y) where an image is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""
-        raise NotImplementedError(f"{type(self).__name__} has images, but does not say where they are looked up")
+    def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
+        """(x, y) where a texture is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""
+        raise NotImplementedError(f"{type(self).__name__} has textures, but does not say where they are looked up")
 
     def shade(
         self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
     ) -> tuple[Residual, Factor]:
-        """Colour residual and alpha factor at (u, v), given the splat's K numbers and the C values of its image."""
+        """Colour residual and alpha factor at (u, v), given the splat's K numbers and the C values of its texture."""
         return None, None
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
@@ -79,16 +79,16 @@ class AppearanceRule:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PlainRule(AppearanceRule):
-    """Plain 2DGS; also what a rule without images derives from."""
+    """Plain 2DGS; also what a rule without textures derives from."""
 
     max_alpha: float = dataclasses.field(default=0.99, kw_only=True, metadata={"static": True})
 
     @property
-    def table(self) -> Array:  # type: ignore[override]
+    def texels(self) -> Array:  # type: ignore[override]
         return jnp.zeros((1, 0), jnp.float32)
 
     @property
-    def images(self) -> None:  # type: ignore[override]
+    def regions(self) -> None:  # type: ignore[override]
         return None
 
 
@@ -122,8 +122,8 @@ class _LeftOut:
 
     def _refuse(self, *_: Any) -> NoReturn:
         raise ValueError(
-            f"{self._name} is an array, and texel, shade and falloff see the static fields of a rule only: "
-            "return it from numbers(), or put it in the table"
+            f"{self._name} is an array, and texel_position, shade and falloff see the static fields of a rule only: "
+            "return it from numbers(), or put it in the texels"
         )
 
     def __getattr__(self, name: str) -> Any:

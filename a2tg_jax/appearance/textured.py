@@ -1,6 +1,8 @@
 """The appearance of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
 
-All textures lie one after the other in a table [texels, 4], row by row.
+What a texture is taken for: where (u, v) lies in it, and what its RGB and alpha make of the splat. How textures are
+stored is in `texture`, how one is interpolated in `bilinear`, the interface in `appearance.rule`. The renderer sees all
+textures one after the other as texels [T, 4], each row by row.
 """
 
 import dataclasses
@@ -13,7 +15,7 @@ from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
-from a2tg_jax.bilinear import Image
+from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
 from a2tg_jax.texture import AtlasLayout, Textures, allocate_textures
 
@@ -52,9 +54,9 @@ class TextureOptions:
 class TexturedRule(AppearanceRule):
     """An appearance rule: RGB residual and alpha factor from each splat's own texture."""
 
-    table: Array
-    """[texels, 4] all textures."""
-    images: Image
+    texels: Array
+    """[T, 4] of all textures."""
+    regions: TextureRegion
     """[N] each: where the textures lie, Tv × Tu."""
     peaks: Array
     """[N] the largest alpha factor of each splat; bounds only, without gradient."""
@@ -64,10 +66,10 @@ class TexturedRule(AppearanceRule):
     def max_alpha(self) -> float:  # type: ignore[override]
         return self.options.max_alpha
 
-    def texel(self, image: Image, u: Array, v: Array) -> tuple[Array, Array]:
+    def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         if not self.options.uv_gradient:
             u, v = jax.lax.stop_gradient((u, v))
-        width, height = image.width.astype(u.dtype), image.height.astype(v.dtype)
+        width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
         return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
 
     def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
@@ -95,8 +97,8 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
     offsets = bucket_starts[layout.bucket] + layout.row * bucket_areas[layout.bucket]
     texels = jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets])
     return TexturedRule(
-        table=texels,
-        images=Image(offsets, sizes[:, 0], sizes[:, 1]),
+        texels=texels,
+        regions=TextureRegion(offsets, sizes[:, 0], sizes[:, 1]),
         peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
         options=options,
     )

@@ -8,9 +8,10 @@ from typing import Literal
 
 import jax
 
+from a2tg_jax.splats import Compositor
+
 MAX_TILE_SIZE = 64
 """Native loops keep a tile on the stack."""
-Compositor = Literal["native", "pallas", "xla"]
 
 
 def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -> Compositor:

@@ -4,15 +4,15 @@ One call composites the tiles from `first` up to `last`. Every splat of a tile's
 then applied to the tile's pixels, L at a time (vector code). Where no pixel of the L can be reached, they are passed
 over.
 
-    forward(ids, starts, splats, images, table, result; first, last, columns, width, height)
-    backward(ids, starts, splats, images, table, g, behind, jacobian, d_splats, d_table, d_tap,
-             places, more_splats, more_table, more_tap, more_first; the same)
+    forward(ids, starts, splats, regions, texels, result; first, last, columns, width, height)
+    backward(ids, starts, splats, regions, texels, g, suffix_sum, jacobian, d_splats, d_texels, d_probe,
+             places, more_splats, more_texels, more_probe, more_first; the same)
 
-Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), images [N, 3], table [entries, C],
-result [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], behind [tiles, P], jacobian [3, 3];
-d_splats [N, S], d_table [entries, C] and d_tap [N, 4] are added to. A pair whose number in `places` [pairs] is k, not
-−1, adds to row k of more_splats, more_tap and, from entry more_first[k], of more_table instead: its splat's own rows
-are another thread's.
+Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), regions [N, 3], texels [T, C],
+result [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], suffix_sum [tiles, P], jacobian [3, 3];
+d_splats [N, S], d_texels [T, C] and d_probe [N, 4] are added to. A pair whose number in `places` [pairs] is k, not
+−1, adds to row k of more_splats, more_probe and, from texel more_first[k], of more_texels instead: its splat's own
+rows are another thread's.
 """
 
 import dataclasses
@@ -25,15 +25,15 @@ from llvmlite import ir
 
 from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import BOOL, INT, Lanes
-from a2tg_jax.kernels.texels import NativeImage, Place, TexelWriter
-from a2tg_jax.kernels.traced import Functions, Kind
+from a2tg_jax.kernels.texels import NativeTexture, Place, TexelWriter
+from a2tg_jax.kernels.traced import Functions, KernelSpec
 from a2tg_jax.kernels.writer import LONG
 
 INTEGERS = ("first", "last", "columns", "width", "height")
-FORWARD = ("ids", "starts", "splats", "images", "table", "result")
+FORWARD = ("ids", "starts", "splats", "regions", "texels", "result")
 BACKWARD = (
-    *("ids", "starts", "splats", "images", "table", "g", "behind", "jacobian", "d_splats", "d_table", "d_tap"),
-    *("places", "more_splats", "more_table", "more_tap", "more_first"),
+    *("ids", "starts", "splats", "regions", "texels", "g", "suffix_sum", "jacobian", "d_splats", "d_texels", "d_probe"),
+    *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
 CUTOFF_SLACK = 1e-3
 """Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
@@ -57,11 +57,11 @@ class _LoadedSplat(NamedTuple):
     numbers: list[ir.Value]
     """As they lie in memory, without the cutoff."""
     planes: list[ir.Value]
-    """In every lane, as all that follows."""
+    """`pixel.Planes`, the same in every lane, as all that follows."""
     spread: list[ir.Value]
-    """The numbers."""
-    image: NativeImage | None
-    spread_image: list[ir.Value]
+    """`numbers` in every lane."""
+    texture: NativeTexture | None
+    spread_region: list[ir.Value]
     limit: ir.Value
     """Squared distance within which a pixel is looked at."""
 
@@ -70,30 +70,30 @@ class _Rows(NamedTuple):
     """The addresses to which the cotangents of a splat are added."""
 
     splat: ir.Value
-    tap: ir.Value
-    image: NativeImage | None
+    probe: ir.Value
+    texture: NativeTexture | None
 
 
 class _Compositing(TexelWriter):
     """What both passes share."""
 
-    def __init__(self, kind: Kind, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
-        super().__init__(module, name, buffers, INTEGERS, kind.dtype)
-        self.kind, self.functions, self.num_columns = kind, functions, kind.num_columns
-        self.lanes, self.scalars = Lanes(self.b, kind.lanes), Lanes(self.b, 1)
+    def __init__(self, spec: KernelSpec, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
+        super().__init__(module, name, buffers, INTEGERS, spec.dtype)
+        self.spec, self.functions, self.num_columns = spec, functions, spec.num_columns
+        self.lanes, self.scalars = Lanes(self.b, spec.lanes), Lanes(self.b, 1)
         self.reals = self.lanes.vector(self.real)
         self.integers = self.lanes.vector(INT)
-        order = pixel_order(kind.tile_size, kind.lanes)
-        y, x = np.stack(np.divmod(order, kind.tile_size)) - (kind.tile_size - 1) / 2
+        order = pixel_order(spec.tile_size, spec.lanes)
+        y, x = np.stack(np.divmod(order, spec.tile_size)) - (spec.tile_size - 1) / 2
         # Lanes past the last pixel lie outside of every image.
-        past = np.full(-len(order) % kind.lanes, 1e9)
-        self.light = self.variable(self.reals, kind.num_vectors)
-        self.live = self.variable(self.integers, kind.num_vectors)
-        self.pixel_x = self._table(f"{name}.x", self.real, [*x, *past])
-        self.pixel_y = self._table(f"{name}.y", self.real, [*y, *past])
-        self.order = self._table(f"{name}.order", INT, order)
+        past = np.full(-len(order) % spec.lanes, 1e9)
+        self.transmittance = self.variable(self.reals, spec.num_vectors)
+        self.live = self.variable(self.integers, spec.num_vectors)
+        self.pixel_x = self._constants(f"{name}.x", self.real, [*x, *past])
+        self.pixel_y = self._constants(f"{name}.y", self.real, [*y, *past])
+        self.order = self._constants(f"{name}.order", INT, order)
 
-    def _table(self, name: str, type_: ir.Type, numbers) -> ir.Value:
+    def _constants(self, name: str, type_: ir.Type, numbers) -> ir.Value:
         array = ir.Constant(ir.ArrayType(type_, len(numbers)), np.asarray(numbers).tolist())
         table = ir.GlobalVariable(self.b.module, array.type, name)
         table.initializer, table.global_constant, table.align = array, True, jit.vector_bytes()
@@ -102,12 +102,12 @@ class _Compositing(TexelWriter):
 
     def all_tiles(self, composite_tile) -> None:
         """Calls composite_tile(tile, tile_x, tile_y) in a loop, and ends the function."""
-        kind, b, given = self.kind, self.b, self.arguments
+        spec, b, given = self.spec, self.b, self.arguments
         with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
             columns = self.long(given["columns"])
             place = b.srem(tile, columns), b.sdiv(tile, columns)
             center = [
-                b.fadd(b.fmul(b.sitofp(index, self.real), self.real(kind.tile_size)), self.real(kind.tile_size / 2))
+                b.fadd(b.fmul(b.sitofp(index, self.real), self.real(spec.tile_size)), self.real(spec.tile_size / 2))
                 for index in place
             ]
             composite_tile(tile, *center)
@@ -124,7 +124,7 @@ class _Compositing(TexelWriter):
             b.position_at_end(going_on)
 
     def all_vectors(self):
-        return self.loop(LONG(0), LONG(self.kind.num_vectors))
+        return self.loop(LONG(0), LONG(self.spec.num_vectors))
 
     def live_at_first(self, index: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> ir.Value:
         """Which pixels of a vector lie inside the image, as 0 and 1."""
@@ -137,12 +137,12 @@ class _Compositing(TexelWriter):
 
     def pixel(self, k: ir.Value, channel: int) -> ir.Value:
         """Where the pixel that is lane k of a tile lies among a tile's numbers [channels, P]."""
-        return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.kind.tile_size**2))
+        return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.spec.tile_size**2))
 
     def begin_tile(self, tile_x: ir.Value, tile_y: ir.Value) -> None:
-        """Full light everywhere; live are the pixels inside the image."""
+        """Full transmittance everywhere; live are the pixels inside the image."""
         with self.all_vectors() as (k, _):
-            self.store(self.lanes.constant(1.0, self.real), self.light, k)
+            self.store(self.lanes.constant(1.0, self.real), self.transmittance, k)
             self.store(self.live_at_first(k, tile_x, tile_y), self.live, k)
 
     def load_splat(self, id_: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> _LoadedSplat:
@@ -150,35 +150,35 @@ class _Compositing(TexelWriter):
         *numbers, cutoff = self.splat_numbers(id_)
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], tile_x, tile_y])
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
-        image = self.image_numbers(id_)
+        region = self.region_numbers(id_)
         spread = self.spread(planes), self.spread(numbers)
-        texels = self.image(self.arguments["table"], *map(self.long, image)) if image else None
-        return _LoadedSplat(numbers, *spread, texels, self.spread(image), self.lanes.broadcast(limit))
+        texture = self.texture(self.arguments["texels"], *map(self.long, region)) if region else None
+        return _LoadedSplat(numbers, *spread, texture, self.spread(region), self.lanes.broadcast(limit))
 
     def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
         """Calls composite(k, x, y, place, is_live) for every vector k of the tile's pixels that the splat may reach,
-        and that looks at this place of its image; returns whether a pixel of the tile is still live."""
+        and that looks at this place of its texture; returns whether a pixel of the tile is still live."""
         b, lanes = self.b, self.lanes
         none = lanes.constant(0, INT)
         any_live = self.variable(self.integers)
         b.store(none, any_live)
         with self.all_vectors() as (k, _):
             x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
-            rho, *texel = lanes.emit(self.functions.reach, [*splat.planes, *splat.spread_image, x, y])
+            rho, *position = lanes.emit(self.functions.reach, [*splat.planes, *splat.spread_region, x, y])
             is_live = b.icmp_signed("!=", self.load(self.live, k, self.integers), none)
             is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, splat.limit))
             with b.if_then(lanes.any(is_reached)):
-                composite(k, x, y, Place(texel[0], texel[1], is_reached) if texel else None, is_live)
+                composite(k, x, y, Place(position[0], position[1], is_reached) if position else None, is_live)
             now = self.load(self.live, k, self.integers)
             b.store(b.or_(now, b.load(any_live, typ=self.integers)), any_live)
         return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), none))
 
     def splat_numbers(self, id_: ir.Value) -> list[ir.Value]:
-        base = self.at(self.arguments["splats"], self.times(id_, self.kind.num_floats), self.real)
-        return [self.load(base, k, self.real) for k in range(self.kind.num_floats)]
+        base = self.at(self.arguments["splats"], self.times(id_, self.spec.num_floats), self.real)
+        return [self.load(base, k, self.real) for k in range(self.spec.num_floats)]
 
-    def image_numbers(self, id_: ir.Value) -> list[ir.Value]:
-        base = self.at(self.arguments["images"], self.times(id_, 3), INT)
+    def region_numbers(self, id_: ir.Value) -> list[ir.Value]:
+        base = self.at(self.arguments["regions"], self.times(id_, 3), INT)
         return [self.load(base, k, INT) for k in range(3)] if self.num_columns else []
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
@@ -189,7 +189,7 @@ class _Forward(_Compositing):
     """Channels and transmittance of the tiles."""
 
     def write(self) -> None:
-        channels = [self.variable(self.reals, self.kind.num_vectors) for _ in range(self.kind.num_channels)]
+        channels = [self.variable(self.reals, self.spec.num_vectors) for _ in range(self.spec.num_channels)]
 
         def tile(tile, tile_x, tile_y):
             self.begin_tile(tile_x, tile_y)
@@ -197,7 +197,7 @@ class _Forward(_Compositing):
                 for channel in channels:
                     self.store(self.lanes.constant(0.0, self.real), channel, k)
             self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, channels))
-            self.write_tile(tile, [*channels, self.light])
+            self.write_tile(tile, [*channels, self.transmittance])
 
         self.all_tiles(tile)
 
@@ -206,11 +206,15 @@ class _Forward(_Compositing):
         splat = self.load_splat(id_, tile_x, tile_y)
 
         def composite(k, x, y, place, is_live):
-            values = self.sample(splat.image, place, has_slopes=False) if splat.image else []
-            state = [self.load(self.light, k, self.reals), is_live, *(self.load(c, k, self.reals) for c in channels)]
+            values = self.sample(splat.texture, place, has_slopes=False) if splat.texture else []
+            state = [
+                self.load(self.transmittance, k, self.reals),
+                is_live,
+                *(self.load(c, k, self.reals) for c in channels),
+            ]
             at_pixel = [*splat.planes, *splat.spread, *values, x, y, *state]
             after, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
-            self.store(after, self.light, k)
+            self.store(after, self.transmittance, k)
             self.store(self.b.zext(still_live, self.integers), self.live, k)
             for total, channel in zip(totals, channels, strict=True):
                 self.store(total, channel, k)
@@ -218,7 +222,7 @@ class _Forward(_Compositing):
         return self.reached_vectors(splat, composite)
 
     def write_tile(self, tile: ir.Value, arrays: Sequence[ir.Value]) -> None:
-        num_pixels = self.kind.tile_size**2
+        num_pixels = self.spec.tile_size**2
         base = self.at(self.arguments["result"], self.times(tile, num_pixels * len(arrays)), self.real)
         for index, array in enumerate(arrays):
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
@@ -226,55 +230,55 @@ class _Forward(_Compositing):
 
 
 class _Backward(_Compositing):
-    """Cotangents of the splats, of the table, and the statistic."""
+    """Cotangents of the splats and of the texels, and the statistic."""
 
     def write(self) -> None:
-        behind, *g = (self.variable(self.reals, self.kind.num_vectors) for _ in range(1 + self.kind.num_channels))
+        suffix_sum, *g = (self.variable(self.reals, self.spec.num_vectors) for _ in range(1 + self.spec.num_channels))
         self.sums = self.variable(self.reals, self.num_sums)
         for k in range(self.num_sums):
             self.store(self.lanes.constant(0.0, self.real), self.sums, k)
 
         def tile(tile, tile_x, tile_y):
             self.begin_tile(tile_x, tile_y)
-            self.read_tile(tile, [behind], self.arguments["behind"])
+            self.read_tile(tile, [suffix_sum], self.arguments["suffix_sum"])
             self.read_tile(tile, g, self.arguments["g"])
-            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, behind, g))
+            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, suffix_sum, g))
 
         self.all_tiles(tile)
 
     def read_tile(self, tile: ir.Value, arrays: Sequence[ir.Value], source: ir.Value) -> None:
-        num_pixels = self.kind.tile_size**2
+        num_pixels = self.spec.tile_size**2
         base = self.at(source, self.times(tile, num_pixels * len(arrays)), self.real)
         for index, array in enumerate(arrays):
-            with self.loop(LONG(num_pixels), LONG(self.kind.num_vectors * self.kind.lanes)) as (k, _):
+            with self.loop(LONG(num_pixels), LONG(self.spec.num_vectors * self.spec.lanes)) as (k, _):
                 self.store(self.real(0.0), array, k)
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
                 self.store(self.load(base, self.pixel(k, index), self.real), array, k)
 
-    def splat(self, tile_x, tile_y, behind, g, id_, position) -> ir.Value:
+    def splat(self, tile_x, tile_y, suffix_sum, g, id_, position) -> ir.Value:
         """Adds the cotangents of one splat in a tile; returns whether a pixel is still live."""
-        b, lanes, kind = self.b, self.lanes, self.kind
+        b, lanes, spec = self.b, self.lanes, self.spec
         splat, zero = self.load_splat(id_, tile_x, tile_y), self.lanes.constant(0.0, self.real)
         tile_center = self.spread([tile_x, tile_y])
         jacobian = self.spread([self.load(self.arguments["jacobian"], k, self.real) for k in range(9)])
-        rows = self.rows_of(id_, position, splat.image)
+        rows = self.rows_of(id_, position, splat.texture)
         any_contributes = self.variable(BOOL)
         b.store(BOOL(0), any_contributes)
-        num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if kind.statistic else 0)
+        num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if spec.statistic else 0)
         totals = self.zeros(num_sums)
 
         def composite(k, x, y, place, is_live):
-            sample = self.sample(splat.image, place, has_slopes=True) if splat.image else []
-            state = [self.load(self.light, k, self.reals), is_live, self.load(behind, k, self.reals)]
+            sample = self.sample(splat.texture, place, has_slopes=True) if splat.texture else []
+            state = [self.load(self.transmittance, k, self.reals), is_live, self.load(suffix_sum, k, self.reals)]
             cotangents = [self.load(channel, k, self.reals) for channel in g]
-            at_pixel = [*splat.planes, *splat.spread, *splat.spread_image, *sample, x, y]
+            at_pixel = [*splat.planes, *splat.spread, *splat.spread_region, *sample, x, y]
             at_pixel += [*state, *cotangents, *tile_center, *jacobian]
             after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
-            self.store(after, self.light, k)
+            self.store(after, self.transmittance, k)
             self.store(b.zext(still_live, self.integers), self.live, k)
-            self.store(left, behind, k)
+            self.store(left, suffix_sum, k)
             d_values, sums = rest[: self.num_columns], rest[self.num_columns :]
-            if kind.statistic:
+            if spec.statistic:
                 sums.append(lanes.constant(1.0, self.real))
             # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
             chosen = functools.partial(b.select, contributes, rhs=zero)
@@ -282,42 +286,43 @@ class _Backward(_Compositing):
                 b.store(BOOL(1), any_contributes)
                 for total, value in zip(totals, sums, strict=True):
                     b.store(b.fadd(b.load(total, typ=self.reals), chosen(value)), total)
-                if rows.image:
-                    self.add_to_texels(rows.image, place, [chosen(value) for value in d_values])
+                if rows.texture:
+                    self.add_to_texels(rows.texture, place, [chosen(value) for value in d_values])
 
         is_live = self.reached_vectors(splat, composite)
         with b.if_then(b.load(any_contributes, typ=BOOL)):
             self.add_totals(rows, splat.numbers, tile_x, tile_y, totals)
-            if rows.image:
-                self.finish_texels(rows.image)
+            if rows.texture:
+                self.finish_texels(rows.texture)
         return is_live
 
-    def rows_of(self, id_: ir.Value, position: ir.Value, image: NativeImage | None) -> _Rows:
+    def rows_of(self, id_: ir.Value, position: ir.Value, texture: NativeTexture | None) -> _Rows:
         """Where the cotangents of one pair are added."""
         b, arguments = self.b, self.arguments
         place = self.long(self.load(arguments["places"], position, INT))
         is_own = b.icmp_signed("<", place, LONG(0))
         row = b.select(is_own, id_, place)
-        splats, table, tap = (
-            b.select(is_own, arguments[f"d_{name}"], arguments[f"more_{name}"]) for name in ("splats", "table", "tap")
+        splats, texels, probe = (
+            b.select(is_own, arguments[f"d_{name}"], arguments[f"more_{name}"])
+            for name in ("splats", "texels", "probe")
         )
-        if image:
-            own_first = self.long(self.load(arguments["images"], self.times(id_, 3), INT))
+        if texture:
+            own_first = self.long(self.load(arguments["regions"], self.times(id_, 3), INT))
             more_first = self.long(self.load(arguments["more_first"], b.select(is_own, LONG(0), place), INT))
-            image = self.image(table, b.select(is_own, own_first, more_first), image.height, image.width)
+            texture = self.texture(texels, b.select(is_own, own_first, more_first), texture.height, texture.width)
         at_row = functools.partial(self.at, type_=self.real)
-        return _Rows(at_row(splats, self.times(row, self.kind.num_floats)), at_row(tap, self.times(row, 4)), image)
+        return _Rows(at_row(splats, self.times(row, self.spec.num_floats)), at_row(probe, self.times(row, 4)), texture)
 
     def add_totals(self, rows, numbers, tile_x, tile_y, totals) -> None:
         """Sums over lanes, carried from the planes to the homography, added to the splat's rows of the results."""
-        kind, functions = self.kind, self.functions
+        spec, functions = self.spec, self.functions
         sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
         d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
         d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], tile_x, tile_y, *d_planes])
         num_others = len(numbers) - 9
         self.add(rows.splat, [*d_M, *others[:num_others]])
-        if kind.statistic:
-            self.add(rows.tap, others[num_others:])
+        if spec.statistic:
+            self.add(rows.probe, others[num_others:])
 
     def add(self, base: ir.Value, values: Sequence[ir.Value]) -> None:
         for k, value in enumerate(values):
@@ -333,13 +338,13 @@ class Loops:
 
 
 @functools.cache
-def loops(kind: Kind) -> Loops:
-    """The loops of a kind, compiled at the first call."""
-    functions = Functions(kind)
+def loops(spec: KernelSpec) -> Loops:
+    """The loops that a spec describes, compiled at the first call."""
+    functions = Functions(spec)
     module = ir.Module("loops")
     forward, backward = (jit.unique(name) for name in ("forward", "backward"))
-    _Forward(kind, functions, module, forward, FORWARD).write()
-    _Backward(kind, functions, module, backward, BACKWARD).write()
+    _Forward(spec, functions, module, forward, FORWARD).write()
+    _Backward(spec, functions, module, backward, BACKWARD).write()
     addresses = jit.compile_module(module)
     return Loops(
         forward=jit.as_function(addresses[forward], len(FORWARD), len(INTEGERS)),

@@ -7,86 +7,99 @@ the last bits, on the number of threads (`sums`).
 import functools
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import StaticRule
+from a2tg_jax.appearance import AppearanceRule, StaticRule
+from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.geometry import Outline
 from a2tg_jax.kernels import ffi, sums, threads
 from a2tg_jax.kernels.manual_axes import vary_with
-from a2tg_jax.kernels.packing import pack_images, pack_splats, unpack_splats
+from a2tg_jax.kernels.packing import pack_regions, pack_splats, unpack_splats
+from a2tg_jax.splats import CompositingSettings, Splats
 from a2tg_jax.tiles import TileGrid, TileLists
+
+if TYPE_CHECKING:
+    from a2tg_jax.kernels.lists import ListLoops
+    from a2tg_jax.kernels.traced import KernelSpec
 
 PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
 """Fewer than these are not worth another thread."""
 
 
-def _kind(how, rule, splats, table: Array, images):
-    from a2tg_jax.kernels.traced import Kind
+def _spec(
+    settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None
+) -> "KernelSpec":
+    """What the loops for these inputs are compiled for."""
+    from a2tg_jax.kernels.traced import KernelSpec
 
-    return Kind(
+    return KernelSpec(
         rule=rule,
         num_rule_numbers=splats.numbers.shape[1],
-        num_columns=0 if images is None else table.shape[1],
+        num_columns=0 if regions is None else texels.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
-        tile_size=how.grid.tile_size,
-        near_plane=how.near_plane,
-        has_geometry=how.has_geometry,
-        statistic=how.statistic,
+        tile_size=settings.grid.tile_size,
+        near_plane=settings.near_plane,
+        has_geometry=settings.has_geometry,
+        statistic=settings.statistic,
     )
 
 
-def refusal(how, rule, splats) -> str | None:
+def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats) -> str | None:
     """Why there can be no native loops for a rule; None where there are, which are then compiled."""
-    return _refusal(_kind(how, StaticRule.of(rule), splats, rule.table, rule.images))
+    return _refusal(_spec(settings, StaticRule.of(rule), splats, rule.texels, rule.regions))
 
 
 @functools.cache
-def _refusal(kind) -> str | None:
+def _refusal(spec: "KernelSpec") -> str | None:
     from a2tg_jax.kernels.lanes import Untranslatable
     from a2tg_jax.kernels.loops import loops
 
     try:
-        loops(kind)
+        loops(spec)
     except Untranslatable as error:
         return str(error)
     return None
 
 
-def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:
-    """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    kind = _kind(how, rule, splats, table, images)
-    name = _registered(kind, "forward", _forward_handler)
-    shape = jax.ShapeDtypeStruct((how.grid.num, kind.num_channels + 1, kind.tile_size**2), splats.M.dtype)
+def forward(
+    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists,
+) -> tuple[Array, Array]:  # fmt: skip
+    """As `xla.forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
+    spec = _spec(settings, static, splats, texels, regions)
+    name = _registered(spec, "forward", _forward_handler)
+    shape = jax.ShapeDtypeStruct((settings.grid.num, spec.num_channels + 1, spec.tile_size**2), splats.M.dtype)
     call = jax.ffi.ffi_call(name, shape, vmap_method="sequential")
-    inputs = _inputs(kind, how, splats, table, images, cutoff, lists)
+    inputs = _inputs(spec, settings, splats, texels, regions, cutoff, lists)
     image = vary_with(inputs, call(*inputs))[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
 def backward(
-    how, rule, splats, table: Array, images, cutoff: Array, lists, jacobian, tap: Array, g: Array, behind: Array
-):
-    """As `compositor._backward`."""
-    kind = _kind(how, rule, splats, table, images)
-    name = _registered(kind, "backward", _backward_handler)
+    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
+) -> tuple[Splats, Array, Array]:  # fmt: skip
+    """As `xla.backward`."""
+    spec = _spec(settings, static, splats, texels, regions)
+    name = _registered(spec, "backward", _backward_handler)
     dtype, num = splats.M.dtype, splats.M.shape[0]
     shapes = (
-        jax.ShapeDtypeStruct((num, kind.num_floats), dtype),
-        jax.ShapeDtypeStruct(table.shape, dtype),
-        jax.ShapeDtypeStruct(tap.shape if kind.statistic else (1, 4), dtype),
+        jax.ShapeDtypeStruct((num, spec.num_floats), dtype),
+        jax.ShapeDtypeStruct(texels.shape, dtype),
+        jax.ShapeDtypeStruct(probe.shape if spec.statistic else (1, 4), dtype),
     )
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    cotangents = [array.astype(dtype) for array in (g, behind, jacobian)]
-    inputs = (*_inputs(kind, how, splats, table, images, cutoff, lists), *cotangents)
-    packed, d_table, d_tap = vary_with(inputs, call(*inputs))
-    d_splats = unpack_splats(packed, splats, kind.has_geometry)
-    d_tap = d_tap.astype(tap.dtype) if kind.statistic else jnp.zeros_like(tap)
-    return d_splats, d_table.astype(table.dtype), d_tap
+    cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
+    inputs = (*_inputs(spec, settings, splats, texels, regions, cutoff, lists), *cotangents)
+    packed, d_texels, d_probe = vary_with(inputs, call(*inputs))
+    d_splats = unpack_splats(packed, splats, spec.has_geometry)
+    d_probe = d_probe.astype(probe.dtype) if spec.statistic else jnp.zeros_like(probe)
+    return d_splats, d_texels.astype(texels.dtype), d_probe
 
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
@@ -107,7 +120,7 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     return TileLists(*vary_with(inputs, call(*inputs)))
 
 
-def _list_handler(loops, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+def _list_handler(loops: "ListLoops", arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
     M, cutoff, size = arguments
     ids, starts, total, overflow = results
     columns, width, height = map(int, size)
@@ -158,18 +171,21 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
     return visible[order].astype(np.int32)
 
 
-def _inputs(kind, how, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, ...]:
-    """ids, starts, splats, images, table, and (columns, width, height)."""
-    packed = pack_splats(splats, kind.has_geometry, cutoff).astype(kind.dtype)
-    size = jnp.asarray([how.grid.columns, how.grid.width, how.grid.height], jnp.int32)
-    return lists.ids, lists.starts, packed, pack_images(images), table.astype(kind.dtype), size
+def _inputs(
+    spec: "KernelSpec", settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists,
+) -> tuple[Array, ...]:  # fmt: skip
+    """ids, starts, splats, regions, texels, and (columns, width, height)."""
+    packed = pack_splats(splats, spec.has_geometry, cutoff).astype(spec.dtype)
+    size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
+    return lists.ids, lists.starts, packed, pack_regions(regions), texels.astype(spec.dtype), size
 
 
-def _registered(kind, which: str, make_handler: Callable[[Any], ffi.Handler]) -> str:
-    """The name under which XLA knows the loops of a kind."""
+def _registered(spec: "KernelSpec", which: str, make_handler: Callable[[Any], ffi.Handler]) -> str:
+    """The name under which XLA knows the loops that a spec describes."""
     from a2tg_jax.kernels.loops import loops
 
-    return ffi.registered(f"{which} {kind!r}", (which, kind), lambda: make_handler(getattr(loops(kind), which)))
+    return ffi.registered(f"{which} {spec!r}", (which, spec), lambda: make_handler(getattr(loops(spec), which)))
 
 
 def _forward_handler(run: Callable) -> ffi.Handler:
@@ -188,11 +204,11 @@ def _forward_handler(run: Callable) -> ffi.Handler:
 
 def _backward_handler(run: Callable) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
-        *inputs, size, g, behind, jacobian = arguments
+        *inputs, size, g, suffix_sum, jacobian = arguments
         starts = inputs[1]
         parts = _parts(starts)
         room = sums.SumsOfParts(inputs[0], starts, inputs[3], results, parts)
-        given = [array.ctypes.data for array in (*inputs, g, behind, jacobian)]
+        given = [array.ctypes.data for array in (*inputs, g, suffix_sum, jacobian)]
 
         def part(first: int, last: int, index: int) -> None:
             outputs = [array.ctypes.data for array in room.outputs(index)]

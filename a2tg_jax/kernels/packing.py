@@ -1,7 +1,10 @@
-"""The splats, their images and the table as plain arrays, as kernels read them; and their cotangents back again."""
+"""The splats and their texture regions as plain arrays, as kernels read them; and their cotangents back again."""
 
 import jax.numpy as jnp
 from jax import Array
+
+from a2tg_jax.bilinear import TextureRegion
+from a2tg_jax.splats import Splats
 
 
 def num_numbers(has_geometry: bool) -> int:
@@ -9,17 +12,17 @@ def num_numbers(has_geometry: bool) -> int:
     return 16 if has_geometry else 13
 
 
-def pack_splats(splats, has_geometry: bool, *more: Array) -> Array:
+def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
     """[N, S] with one splat a row, in the order of `pixel.Splat`, and further columns [N] after it."""
     columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
     columns += [splats.normals] if has_geometry else []
     return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
 
 
-def unpack_splats(packed: Array, like, has_geometry: bool):
+def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
     """Cotangents [N, S] as those of splats."""
     first = num_numbers(has_geometry)
-    return type(like)(
+    return Splats(
         M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
         opacities=packed[:, 9].astype(like.opacities.dtype),
         colors=packed[:, 10:13].astype(like.colors.dtype),
@@ -28,8 +31,8 @@ def unpack_splats(packed: Array, like, has_geometry: bool):
     )
 
 
-def pack_images(images, least_columns: int = 0) -> Array:
-    """[N, 3] int32 `bilinear.Image` of every splat; without images there is one row of `least_columns`."""
-    if images is None:
+def pack_regions(regions: TextureRegion | None, least_columns: int = 0) -> Array:
+    """[N, 3] int32 `bilinear.TextureRegion` of every splat; without textures there is one row of `least_columns`."""
+    if regions is None:
         return jnp.zeros((1, least_columns), jnp.int32)
-    return jnp.stack(images, axis=1).astype(jnp.int32)
+    return jnp.stack(regions, axis=1).astype(jnp.int32)

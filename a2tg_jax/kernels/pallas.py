@@ -13,10 +13,12 @@ from jax import Array
 from jax.experimental import pallas as pl
 
 from a2tg_jax import bilinear, pixel
-from a2tg_jax.bilinear import Image
+from a2tg_jax.appearance import StaticRule
+from a2tg_jax.bilinear import Lookup, TextureRegion
 from a2tg_jax.kernels.choice import triton
-from a2tg_jax.kernels.packing import num_numbers, pack_images, pack_splats, unpack_splats
-from a2tg_jax.tiles import TileGrid
+from a2tg_jax.kernels.packing import num_numbers, pack_regions, pack_splats, unpack_splats
+from a2tg_jax.splats import CompositingSettings, Splats
+from a2tg_jax.tiles import TileGrid, TileLists
 
 IS_COMPILED_AHEAD = False
 """Set where kernels are compiled on a machine that has no GPU, for one that has; else CPUs interpret them."""
@@ -30,16 +32,23 @@ class _Tile(NamedTuple):
     """Where a program's pixels are."""
 
     center_x: Array
+    """In pixels of the image."""
     center_y: Array
+    """In pixels of the image."""
     x: Array
-    """[P] from the centre."""
+    """[P] pixels, counted from the centre."""
     y: Array
+    """[P] pixels, counted from the centre."""
     is_inside: Array
+    """[P] whether the pixels belong to the image."""
     first: Array
+    """Where the tile's list begins."""
     last: Array
+    """Where it ends."""
 
 
 def _tile(grid: TileGrid, starts, dtype) -> _Tile:
+    """The tile of this program."""
     index, size = pl.program_id(0), grid.tile_size
     center_x = ((index % grid.columns) * size).astype(dtype) + size / 2
     center_y = ((index // grid.columns) * size).astype(dtype) + size / 2
@@ -51,6 +60,7 @@ def _tile(grid: TileGrid, starts, dtype) -> _Tile:
 
 
 def _splat(splats, id_, has_geometry: bool) -> pixel.Splat:
+    """A splat of those packed by `pack_splats`."""
     first_of_rule = num_numbers(has_geometry)
     numbers = [splats[id_, k] for k in range(splats.shape[1])]
     M = tuple(tuple(numbers[3 * i : 3 * i + 3]) for i in range(3))
@@ -59,24 +69,18 @@ def _splat(splats, id_, has_geometry: bool) -> pixel.Splat:
     return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal, of_rule)  # type: ignore[arg-type]
 
 
-class _Read(NamedTuple):
-    """What the pixels of a tile see of an image; [P] each."""
-
-    image: Image
-    """Scalars."""
-    taps: tuple[bilinear.Tap, ...]
-    sample: bilinear.Sample
-
-
-def _read(how, rule, images, table, id_, planes, tile: _Tile) -> _Read | None:
-    """None where the rule has no images: there is then but one column, of nothing."""
-    if images.shape[1] < len(Image._fields):
+def _look_up(
+    settings: CompositingSettings, rule, regions, texels, id_, planes: pixel.Planes, tile: _Tile
+) -> Lookup | None:
+    """What the pixels of a tile read of a splat's texture, [P] each; None where the rule has no textures: `regions` has
+    then but one column, of nothing."""
+    if regions.shape[1] < len(TextureRegion._fields):
         return None
-    hit = pixel.intersect(planes, tile.x, tile.y, how.near_plane, rule.has_low_pass)
-    image = Image(*(images[id_, k] for k in range(len(Image._fields))))
-    taps = bilinear.taps(image, *rule.texel(image, hit.u, hit.v))
-    texels = tuple(tuple(table[tap.entry, column] for column in range(table.shape[1])) for tap in taps)
-    return _Read(image, taps, bilinear.interpolate(taps, texels))
+    hit = pixel.intersect(planes, tile.x, tile.y, settings.near_plane, rule.has_low_pass)
+    region = TextureRegion(*(regions[id_, k] for k in range(len(TextureRegion._fields))))
+    corners = bilinear.corners_of(region, *rule.texel_position(region, hit.u, hit.v))
+    at_corners = tuple(tuple(texels[corner.texel, column] for column in range(texels.shape[1])) for corner in corners)
+    return Lookup(region, bilinear.interpolate(corners, at_corners), corners)
 
 
 def _is_unfinished(tile: _Tile, carry) -> Array:
@@ -84,49 +88,49 @@ def _is_unfinished(tile: _Tile, carry) -> Array:
     return (at < tile.last) & (jnp.max(live) > 0)
 
 
-def _forward_kernel(how, rule, ids, starts, splats, images, table, result):
-    tile = _tile(how.grid, starts, splats.dtype)
+def _forward_kernel(settings: CompositingSettings, rule, ids, starts, splats, regions, texels, result):
+    tile = _tile(settings.grid, starts, splats.dtype)
 
     def add_splat(carry):
-        at, light, live, channels = carry
+        at, transmittance, live, channels = carry
         id_ = ids[at]
-        splat = _splat(splats, id_, how.has_geometry)
+        splat = _splat(splats, id_, settings.has_geometry)
         planes = pixel.planes_of(splat.M, tile.center_x, tile.center_y)
-        read = _read(how, rule, images, table, id_, planes, tile)
-        values = () if read is None else read.sample.values
-        at_pixel = planes, splat, values, tile.x, tile.y, light, live > 0
-        added, light, is_live = pixel.composite(rule, how.near_plane, *at_pixel)
+        lookup = _look_up(settings, rule, regions, texels, id_, planes, tile)
+        values = () if lookup is None else lookup.sample.values
+        at_pixel = planes, splat, values, tile.x, tile.y, transmittance, live > 0
+        added, transmittance, is_live = pixel.blend(rule, settings.near_plane, *at_pixel)
         channels = tuple(total + more for total, more in zip(channels, added, strict=True))
-        return at + 1, light, is_live.astype(jnp.int32), channels
+        return at + 1, transmittance, is_live.astype(jnp.int32), channels
 
     dark = jnp.zeros_like(tile.x)
-    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), (dark,) * how.num_channels)
-    _, light, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tile), add_splat, carry)
-    for k, channel in enumerate((*channels, light)):
+    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), (dark,) * settings.num_channels)
+    _, transmittance, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tile), add_splat, carry)
+    for k, channel in enumerate((*channels, transmittance)):
         result[pl.program_id(0), k, :] = channel
 
 
 def _backward_kernel(
-    how, rule, ids, starts, splats, images, table, g, behind, jacobian, *zeros_and_results
+    settings: CompositingSettings, rule, ids, starts, splats, regions, texels, g, suffix_sum, jacobian,
+    *zeros_and_results,
 ):  # fmt: skip
-    d_splats, d_table, d_tap = zeros_and_results[3:]
-    tile = _tile(how.grid, starts, splats.dtype)
+    d_splats, d_texels, d_probe = zeros_and_results[3:]
+    tile = _tile(settings.grid, starts, splats.dtype)
     index = pl.program_id(0)
-    cotangents = tuple(g[index, k, :] for k in range(how.num_channels))
+    cotangents = tuple(g[index, k, :] for k in range(settings.num_channels))
     axes = tuple(tuple(jacobian[i, k] for k in range(3)) for i in range(3))
 
     def add_splat(carry):
-        at, light, live, behind = carry
+        at, transmittance, live, suffix_sum = carry
         id_ = ids[at]
-        splat = _splat(splats, id_, how.has_geometry)
+        splat = _splat(splats, id_, settings.has_geometry)
         planes, to_M = jax.vjp(lambda M: pixel.planes_of(M, tile.center_x, tile.center_y), splat.M)
-        read = _read(how, rule, images, table, id_, planes, tile)
-        image, sample = (None, None) if read is None else (read.image, read.sample)
+        lookup = _look_up(settings, rule, regions, texels, id_, planes, tile)
         # A number per pixel, so that each pixel has a cotangent of its own.
         spread = lambda tree: jax.tree.map(lambda number: jnp.broadcast_to(number, tile.x.shape), tree)  # noqa: E731
-        at_pixel = spread(planes), spread(splat), image, sample, tile.x, tile.y, light, live > 0
-        (light, is_live, behind), weight, d = pixel.composite_vjp(
-            rule, how.near_plane, *at_pixel, behind, cotangents, how.statistic is not None
+        at_pixel = spread(planes), spread(splat), lookup, tile.x, tile.y, transmittance, live > 0
+        (transmittance, is_live, suffix_sum), weight, d = pixel.blend_vjp(
+            rule, settings.near_plane, *at_pixel, suffix_sum, cotangents, settings.statistic is not None
         )
         contributes = weight != 0
         # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
@@ -134,16 +138,16 @@ def _backward_kernel(
         d_planes, *others = jax.tree.map(total, (d.planes, d.opacity, d.color, d.normal, d.numbers))
         for k, number in enumerate(jax.tree.leaves((to_M(d_planes), *others))):
             _add(d_splats, (id_, k), number)
-        if read is not None:
-            _add_texels(d_table, read, [jnp.where(contributes, value, jnp.zeros_like(value)) for value in d.values])
-        if how.statistic:
+        if lookup is not None:
+            _add_texels(d_texels, lookup, [jnp.where(contributes, value, jnp.zeros_like(value)) for value in d.values])
+        if settings.statistic:
             moved = splat.M, tile.x, tile.y, tile.center_x, tile.center_y, d.rho, axes
-            added = pixel.positional_gradient(how.statistic, *moved, how.near_plane, rule.has_low_pass)
+            added = pixel.positional_gradient(settings.statistic, *moved, settings.near_plane, rule.has_low_pass)
             for k, number in enumerate((*map(total, added), jnp.sum(contributes.astype(weight.dtype)))):
-                _add(d_tap, (id_, k), number)
-        return at + 1, light, is_live.astype(jnp.int32), behind
+                _add(d_probe, (id_, k), number)
+        return at + 1, transmittance, is_live.astype(jnp.int32), suffix_sum
 
-    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), behind[index, :])
+    carry = (tile.first, jnp.ones_like(tile.x), tile.is_inside.astype(jnp.int32), suffix_sum[index, :])
     jax.lax.while_loop(functools.partial(_is_unfinished, tile), add_splat, carry)
 
 
@@ -163,20 +167,20 @@ def _add(total, place: tuple[Array, int], number: Array) -> None:
         _triton().atomic_add(total, (row, jnp.int32(column)), number)
 
 
-def _add_texels(d_table, read: _Read, d_values: list[Array]) -> None:
+def _add_texels(d_texels, lookup: Lookup, d_values: list[Array]) -> None:
     """Adds the cotangents of C values [P] to the texels that they were read from."""
 
     def add_sums() -> None:
         for column, d_value in enumerate(d_values):
-            _add(d_table, (read.image.first, column), jnp.sum(d_value))
+            _add(d_texels, (lookup.region.first, column), jnp.sum(d_value))
 
     def add_each() -> None:
-        for tap in read.taps:
+        for corner in lookup.corners:
             for column, d_value in enumerate(d_values):
-                _add_all(d_table, tap.entry, column, tap.weight * d_value)
+                _add_all(d_texels, corner.texel, column, corner.weight * d_value)
 
     # All pixels would add to one and the same texel, one after the other.
-    jax.lax.cond(read.image.height * read.image.width == 1, add_sums, add_each)
+    jax.lax.cond(lookup.region.height * lookup.region.width == 1, add_sums, add_each)
 
 
 def _add_all(total, rows: Array, column: int, numbers: Array) -> None:
@@ -211,32 +215,45 @@ def _call(grid: TileGrid, kernel, shapes, num_inputs: int, aliases: dict[int, in
     )
 
 
-def _inputs(how, splats, table: Array, images, lists) -> tuple[Array, ...]:
-    """ids, starts, splats, images and table; without images or columns there is one that is not read."""
-    packed = pack_splats(splats, how.has_geometry)
-    table = table if table.shape[1] else jnp.zeros((1, 1), packed.dtype)
-    return lists.ids, lists.starts, packed, pack_images(images, least_columns=1), table
+def _inputs(
+    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None, lists: TileLists
+) -> tuple[Array, ...]:
+    """ids, starts, splats, regions and texels; without textures or columns there is one that is not read."""
+    packed = pack_splats(splats, settings.has_geometry)
+    texels = texels if texels.shape[1] else jnp.zeros((1, 1), packed.dtype)
+    return lists.ids, lists.starts, packed, pack_regions(regions, least_columns=1), texels
 
 
-def forward(how, rule, splats, table: Array, images, cutoff: Array, lists) -> tuple[Array, Array]:
-    """As `compositor._forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    kernel = functools.partial(_forward_kernel, how, rule.rule)
-    shape = jax.ShapeDtypeStruct((how.grid.num, how.num_channels + 1, how.grid.tile_size**2), splats.M.dtype)
-    inputs = _inputs(how, splats, table, images, lists)
-    image = _call(how.grid, kernel, shape, len(inputs), {})(*inputs)[:, None]
+def forward(
+    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists,
+) -> tuple[Array, Array]:  # fmt: skip
+    """As `xla.forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
+    kernel = functools.partial(_forward_kernel, settings, static.rule)
+    shape = jax.ShapeDtypeStruct(
+        (settings.grid.num, settings.num_channels + 1, settings.grid.tile_size**2), splats.M.dtype
+    )
+    inputs = _inputs(settings, splats, texels, regions, lists)
+    image = _call(settings.grid, kernel, shape, len(inputs), {})(*inputs)[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
 def backward(
-    how, rule, splats, table: Array, images, cutoff: Array, lists, jacobian, tap: Array, g: Array, behind: Array
-):
-    """As `compositor._backward`."""
-    kernel = functools.partial(_backward_kernel, how, rule.rule)
-    inputs = (*_inputs(how, splats, table, images, lists), g[:, 0], behind[:, 0], jacobian.astype(splats.M.dtype))
-    zeros = (jnp.zeros_like(inputs[2]), jnp.zeros_like(inputs[4]), jnp.zeros_like(tap))
+    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
+) -> tuple[Splats, Array, Array]:  # fmt: skip
+    """As `xla.backward`."""
+    kernel = functools.partial(_backward_kernel, settings, static.rule)
+    inputs = (
+        *_inputs(settings, splats, texels, regions, lists),
+        g[:, 0],
+        suffix_sum[:, 0],
+        jacobian.astype(splats.M.dtype),
+    )
+    zeros = (jnp.zeros_like(inputs[2]), jnp.zeros_like(inputs[4]), jnp.zeros_like(probe))
     shapes = tuple(jax.ShapeDtypeStruct(zero.shape, zero.dtype) for zero in zeros)
     aliases = {len(inputs) + k: k for k in range(3)}
-    call = _call(how.grid, kernel, shapes, len(inputs) + 3, aliases)
-    packed, d_table, d_tap = call(*inputs, *zeros)
-    d_splats = unpack_splats(packed, splats, how.has_geometry)
-    return d_splats, d_table if table.shape[1] else jnp.zeros_like(table), d_tap
+    call = _call(settings.grid, kernel, shapes, len(inputs) + 3, aliases)
+    packed, d_texels, d_probe = call(*inputs, *zeros)
+    d_splats = unpack_splats(packed, splats, settings.has_geometry)
+    return d_splats, d_texels if texels.shape[1] else jnp.zeros_like(texels), d_probe

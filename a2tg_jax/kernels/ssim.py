@@ -50,36 +50,36 @@ def least_width(dtype, num_taps: int) -> int:
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def mean_score(how: Score, x: Array, y: Array) -> Array:
+def mean_score(score: Score, x: Array, y: Array) -> Array:
     """The average over all windows of images [C, H, W], float32 or float64, which are at least `least_width` wide."""
-    return _score(how, x, y)[0]
+    return _score(score, x, y)[0]
 
 
-def _score(how: Score, x: Array, y: Array) -> tuple[Array, Array]:
+def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:
     count, height, width = x.shape
-    margin = len(how.taps) - 1
+    margin = len(score.taps) - 1
     down, across = height - margin, width - margin
     shapes = (
         jax.ShapeDtypeStruct((count * down,), x.dtype),
         jax.ShapeDtypeStruct((4, count, down + 2 * margin, across), x.dtype),
     )
-    name = _registered(how, str(x.dtype), "score", _score_handler)
+    name = _registered(score, str(x.dtype), "score", _score_handler)
     call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
     sums, d_means = vary_with((x, y), call(x, y))
     return jnp.sum(sums) / (count * down * across), d_means
 
 
-def _score_forward(how: Score, x: Array, y: Array):
-    value, d_means = _score(how, x, y)
+def _score_forward(score: Score, x: Array, y: Array):
+    value, d_means = _score(score, x, y)
     return value, (x, y, d_means)
 
 
-def _score_backward(how: Score, residuals, cotangent: Array) -> tuple[Array, Array]:
+def _score_backward(score: Score, residuals, cotangent: Array) -> tuple[Array, Array]:
     x, y, (d_x_mean, d_y_mean, *d_products) = residuals
     count, height, _ = x.shape
-    name = _registered(how, str(x.dtype), "pull_back", _pull_back_handler)
+    name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
     call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype), vmap_method="sequential")
-    num_windows = count * (height - len(how.taps) + 1) * d_x_mean.shape[2]
+    num_windows = count * (height - len(score.taps) + 1) * d_x_mean.shape[2]
     share = cotangent[None] / num_windows
     inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
     # Where nobody asks for the second, XLA leaves it out.
@@ -89,10 +89,10 @@ def _score_backward(how: Score, residuals, cotangent: Array) -> tuple[Array, Arr
 mean_score.defvjp(_score_forward, _score_backward)
 
 
-def _registered(how: Score, dtype: str, which: str, handler: Callable) -> str:
-    function = getattr(how.function, "__qualname__", type(how.function).__name__)
-    make_handler = lambda: functools.partial(handler, getattr(_loops(how, dtype), which), len(how.taps) - 1)  # noqa: E731
-    return ffi.registered(f"{which} {dtype} {function} {how.taps}", (which, dtype, how), make_handler)
+def _registered(score: Score, dtype: str, which: str, handler: Callable) -> str:
+    function = getattr(score.function, "__qualname__", type(score.function).__name__)
+    make_handler = lambda: functools.partial(handler, getattr(_loops(score, dtype), which), len(score.taps) - 1)  # noqa: E731
+    return ffi.registered(f"{which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
 
 
 def _score_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
@@ -127,9 +127,9 @@ def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: 
 class _Rows(Writer):
     """What both loops share."""
 
-    def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], how: Score, dtype: str):
+    def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], score: Score, dtype: str):
         super().__init__(module, name, buffers, INTEGERS, dtype)
-        self.how, self.margin = how, len(how.taps) - 1
+        self.score, self.margin = score, len(score.taps) - 1
         self.lanes = Lanes(self.b, jit.vector_bytes() // np.dtype(dtype).itemsize)
         self.reals = self.lanes.vector(self.real)
         self.channels, self.height, self.width = (self.long(self.arguments[name]) for name in INTEGERS[2:])
@@ -170,7 +170,7 @@ class _Rows(Writer):
 class _ScoreRows(_Rows):
     def write(self, dtype: str) -> None:
         b, number = self.b, jax.ShapeDtypeStruct((), dtype)
-        score, _ = trace(jax.value_and_grad(self.how.function, argnums=(0, 1, 2, 3)), *[number] * 4)
+        with_slopes, _ = trace(jax.value_and_grad(self.score.function, argnums=(0, 1, 2, 3)), *[number] * 4)
         lane = ir.Constant(self.lanes.vector(INT), list(range(self.lanes.width)))
         total, zero = self.variable(self.reals), self.lanes.constant(0.0, self.real)
         means = [self.row("rows", LONG(k), self.width) for k in range(4)]
@@ -183,11 +183,11 @@ class _ScoreRows(_Rows):
                 squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
                 products = list(map(self.product, xs, ys))
                 for mean, numbers in zip(means, (xs, ys, squares, products), strict=True):
-                    self.store(self.weighed(numbers, self.how.taps), self.at(mean, start, self.real), 0)
+                    self.store(self.weighed(numbers, self.score.taps), self.at(mean, start, self.real), 0)
             b.store(zero, total)
             with self.vectors(self.across) as (start, num_done):
-                windows = [self.weighed(self.along(mean, start, LONG(1)), self.how.taps) for mean in means]
-                value, *slopes = self.lanes.emit(score, windows)
+                windows = [self.weighed(self.along(mean, start, LONG(1)), self.score.taps) for mean in means]
+                value, *slopes = self.lanes.emit(with_slopes, windows)
                 is_new = b.icmp_signed(">=", lane, self.lanes.broadcast(b.trunc(num_done, INT)))
                 b.store(self.sum(b.load(total, typ=self.reals), b.select(is_new, value, zero)), total)
                 for k, slope in enumerate(slopes):
@@ -201,7 +201,7 @@ class _ScoreRows(_Rows):
 
 class _PullBackRows(_Rows):
     def write(self) -> None:
-        b, taps = self.b, self.how.taps[::-1]
+        b, taps = self.b, self.score.taps[::-1]
         length = b.add(self.width, LONG(self.margin))
         rows = [self.row("rows", LONG(k), length) for k in range(3)]
         two, share = (
@@ -233,13 +233,13 @@ class _Loops:
 
 
 @functools.cache
-def _loops(how: Score, dtype: str) -> _Loops:
+def _loops(score: Score, dtype: str) -> _Loops:
     module = ir.Module("windows")
-    score, pull_back = (jit.unique(name) for name in ("score", "pull_back"))
-    _ScoreRows(module, score, SCORE, how, dtype).write(dtype)
-    _PullBackRows(module, pull_back, PULL_BACK, how, dtype).write()
+    forward, backward = (jit.unique(name) for name in ("score", "pull_back"))
+    _ScoreRows(module, forward, SCORE, score, dtype).write(dtype)
+    _PullBackRows(module, backward, PULL_BACK, score, dtype).write()
     addresses = jit.compile_module(module)
     return _Loops(
-        score=jit.as_function(addresses[score], len(SCORE), len(INTEGERS)),
-        pull_back=jit.as_function(addresses[pull_back], len(PULL_BACK), len(INTEGERS)),
+        score=jit.as_function(addresses[forward], len(SCORE), len(INTEGERS)),
+        pull_back=jit.as_function(addresses[backward], len(PULL_BACK), len(INTEGERS)),
     )

@@ -21,39 +21,39 @@ class SumsOfParts:
     Args:
       ids: [pairs] splats.
       starts: [tiles + 1] where the pairs of each tile begin.
-      images: [N, 3] first entry, height and width of each splat's image in the table; of another length without images.
-      results: [N, S] of splats, [entries, C] of the table, and [N, 4], or [1, 4] where nobody asks for these.
+      regions: [N, 3] first texel, height and width of each splat's texture; of another length without textures.
+      results: [N, S] of splats, [T, C] of texels, and [N, 4], or [1, 4] where nobody asks for these.
       parts: ranges of tiles.
     """
 
-    def __init__(self, ids: np.ndarray, starts: np.ndarray, images: np.ndarray, results, parts: list[threads.Span]):
+    def __init__(self, ids: np.ndarray, starts: np.ndarray, regions: np.ndarray, results, parts: list[threads.Span]):
         for result in results:
             result[...] = 0
-        d_splats, d_table, d_tap = self.results = results
+        d_splats, d_texels, d_probe = self.results = results
         spans = [(int(starts[first]), int(starts[last])) for first, last in parts]
         self.places, self.splats, self.borders = _places(ids, spans, len(d_splats))
         num = max(1, len(self.splats))
         self.more_splats = np.zeros((num, d_splats.shape[1]), d_splats.dtype)
-        self.more_tap = np.zeros((num, d_tap.shape[1]), d_tap.dtype)
-        has_images = d_table.shape[1] > 0 and len(images) == len(d_splats)
-        self.images = images[self.splats] if has_images else np.zeros((0, 3), np.int32)
-        areas = self.images[:, 1].astype(np.int64) * self.images[:, 2]
-        self.is_shared = has_images and len(parts) > 1 and _overlap(images)
+        self.more_probe = np.zeros((num, d_probe.shape[1]), d_probe.dtype)
+        has_textures = d_texels.shape[1] > 0 and len(regions) == len(d_splats)
+        self.regions = regions[self.splats] if has_textures else np.zeros((0, 3), np.int32)
+        areas = self.regions[:, 1].astype(np.int64) * self.regions[:, 2]
+        self.is_shared = has_textures and len(parts) > 1 and _overlap(regions)
         if self.is_shared:
-            self.tables = [d_table, *(np.zeros_like(d_table) for _ in parts[1:])]
-            self.more_tables, self.more_first = self.tables, self.images[:, 0]
+            self.texels_of_parts = [d_texels, *(np.zeros_like(d_texels) for _ in parts[1:])]
+            self.more_texels, self.more_first = self.texels_of_parts, self.regions[:, 0]
         else:
             self.ends = np.concatenate([[0], np.cumsum(areas)])
-            self.tables = [d_table] * len(parts)
-            self.more_tables = [np.zeros((max(1, self.ends[-1]), d_table.shape[1]), d_table.dtype)] * len(parts)
+            self.texels_of_parts = [d_texels] * len(parts)
+            self.more_texels = [np.zeros((max(1, self.ends[-1]), d_texels.shape[1]), d_texels.dtype)] * len(parts)
             self.more_first = self.ends[:-1]
         self.more_first = np.append(self.more_first, 0).astype(np.int32)
 
     def outputs(self, index: int) -> list[np.ndarray]:
         """What the loop adds to in a part, from `d_splats` on."""
-        d_splats, _, d_tap = self.results
-        more = self.more_splats, self.more_tables[index], self.more_tap, self.more_first
-        return [d_splats, self.tables[index], d_tap, self.places, *more]
+        d_splats, _, d_probe = self.results
+        more = self.more_splats, self.more_texels[index], self.more_probe, self.more_first
+        return [d_splats, self.texels_of_parts[index], d_probe, self.places, *more]
 
     def add_up(self) -> None:
         """Adds the further rows to the results, in the order of the parts."""
@@ -61,20 +61,20 @@ class SumsOfParts:
             # A splat has at most one row of a part, so that threads may share these.
             spans = threads.even_spans(last - first, ROWS_PER_THREAD)
             threads.run_spans(self._add_rows, [(first + begin, first + end) for begin, end in spans])
-        for table in self.tables[1:] if self.is_shared else ():
-            self.results[1][...] += table
+        for texels in self.texels_of_parts[1:] if self.is_shared else ():
+            self.results[1][...] += texels
 
     def _add_rows(self, first: int, last: int, _: int) -> None:
-        d_splats, d_table, d_tap = self.results
+        d_splats, d_texels, d_probe = self.results
         splats = self.splats[first:last]
         d_splats[splats] += self.more_splats[first:last]
-        if len(d_tap) == len(d_splats):
-            d_tap[splats] += self.more_tap[first:last]
-        if not self.is_shared and len(self.images):
+        if len(d_probe) == len(d_splats):
+            d_probe[splats] += self.more_probe[first:last]
+        if not self.is_shared and len(self.regions):
             begins, ends = self.ends[first:last], self.ends[first + 1 : last + 1]
             entries = np.arange(self.ends[first], self.ends[last])
-            more = self.more_tables[0][self.ends[first] : self.ends[last]]
-            d_table[entries + np.repeat(self.images[first:last, 0] - begins, ends - begins)] += more
+            more = self.more_texels[0][self.ends[first] : self.ends[last]]
+            d_texels[entries + np.repeat(self.regions[first:last, 0] - begins, ends - begins)] += more
 
 
 def _places(ids: np.ndarray, spans: list[threads.Span], num: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
@@ -101,9 +101,9 @@ def _places(ids: np.ndarray, spans: list[threads.Span], num: int) -> tuple[np.nd
     return places, np.concatenate(again), borders
 
 
-def _overlap(images: np.ndarray) -> bool:
-    """Whether two images share entries of the table."""
-    first, area = images[:, 0].astype(np.int64), images[:, 1].astype(np.int64) * images[:, 2]
+def _overlap(regions: np.ndarray) -> bool:
+    """Whether two textures share texels."""
+    first, area = regions[:, 0].astype(np.int64), regions[:, 1].astype(np.int64) * regions[:, 2]
     both = np.sort(first << 32 | area)
     first, area = both >> 32, both & 0xFFFFFFFF
     return bool(np.any(first[:-1] + area[:-1] > first[1:]))

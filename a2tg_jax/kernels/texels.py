@@ -1,8 +1,8 @@
-"""Reading the images of splats from vector code, and adding to their cotangents, without gathers.
+"""Texture lookups in vector code, without gathers: reading the splats' textures, and adding to their cotangents.
 
 Every texel that a vector of L neighbouring pixels may see is loaded once, for all lanes, which weigh it by how near
-they are: what `bilinear` says with four taps is the same sum. Images of up to 4×4 are visited whole, by code that is
-unrolled along a row; of larger ones the texels between the least and the largest coordinate of the lanes.
+they are: what `bilinear` says with four corners is the same sum. Textures of up to 4×4 are visited whole, by code that
+is unrolled along a row; of larger ones the texels between the least and the largest coordinate of the lanes.
 """
 
 import contextlib
@@ -16,12 +16,12 @@ from a2tg_jax.kernels.lanes import INT, Lanes
 from a2tg_jax.kernels.writer import LONG, Writer
 
 SMALL_WIDTHS = (1, 2, 4)
-"""Images of these widths, and up to the largest of them high, are small."""
+"""Textures of these widths, and up to the largest of them high, are small."""
 SMALL_HEIGHT = max(SMALL_WIDTHS)
 
 
-class NativeImage(NamedTuple):
-    """An image in the table, or its cotangents in theirs."""
+class NativeTexture(NamedTuple):
+    """A splat's texture among all texels, or its cotangents among theirs."""
 
     first: ir.Value
     """The address of its first texel."""
@@ -31,7 +31,7 @@ class NativeImage(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where L lanes look in an image."""
+    """Where L lanes look in a texture."""
 
     x: ir.Value
     """Texel coordinates."""
@@ -51,86 +51,88 @@ class Line(NamedTuple):
 
 
 class TexelWriter(Writer):
-    """A function that reads images in a table [entries, C], or adds to their cotangents."""
+    """A function that reads textures in texels [T, C], or adds to their cotangents."""
 
     lanes: Lanes
     reals: ir.Type
     num_columns: int
     sums: ir.Value
-    """Cotangents of the texels of a small image per lane, `num_sums` vectors; zero before a splat."""
+    """Cotangents of the texels of a small texture per lane, `num_sums` vectors; zero before a splat."""
 
     @property
     def num_sums(self) -> int:
-        """C for every texel of the largest small image."""
+        """C for every texel of the largest small texture."""
         return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
 
-    def image(self, table: ir.Value, first: ir.Value, height: ir.Value, width: ir.Value) -> NativeImage:
-        """The image that begins with an entry of a table."""
-        return NativeImage(self.at(table, self.times(first, self.num_columns), self.real), height, width)
+    def texture(self, texels: ir.Value, first: ir.Value, height: ir.Value, width: ir.Value) -> NativeTexture:
+        """The texture that begins with texel `first`."""
+        return NativeTexture(self.at(texels, self.times(first, self.num_columns), self.real), height, width)
 
-    def sample(self, image: NativeImage, place: Place, has_slopes: bool) -> list[ir.Value]:
+    def sample(self, texture: NativeTexture, place: Place, has_slopes: bool) -> list[ir.Value]:
         """C values; and C slopes along x and C along y, where asked for."""
         count = self.num_columns
         num_slopes = count if has_slopes else 0
         values, along_x, along_y = (self.zeros(num) for num in (count, num_slopes, num_slopes))
-        for width in self.cases(image):
-            with self.rows(image, width, place, has_slopes) as row:
+        for width in self.cases(texture):
+            with self.rows(texture, width, place, has_slopes) as row:
                 in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
 
                 def add_texel(column: Line, row=row, in_row=in_row, in_row_along_x=in_row_along_x) -> None:
-                    texel = self.texel(image, column, row)
+                    texel = self.texel(texture, column, row)
                     numbers = [self.lanes.broadcast(self.load(texel, k, self.real)) for k in range(count)]
                     self.accumulate(in_row, column.weight, numbers)
                     self.accumulate(in_row_along_x, column.slope, numbers)
 
-                self.each_column(image, width, place, has_slopes, add_texel)
+                self.each_column(texture, width, place, has_slopes, add_texel)
                 numbers = self.loads(in_row)
                 self.accumulate(values, row.weight, numbers)
                 self.accumulate(along_y, row.slope, numbers)
                 self.accumulate(along_x, row.weight, self.loads(in_row_along_x))
         return self.loads([*values, *along_x, *along_y])
 
-    def add_to_texels(self, image: NativeImage, place: Place, d_values: Sequence[ir.Value]) -> None:
+    def add_to_texels(self, texture: NativeTexture, place: Place, d_values: Sequence[ir.Value]) -> None:
         """Adds the cotangents of C values, which are zero in lanes that do not count; `finish_texels` completes it."""
-        for width in self.cases(image):
-            with self.rows(image, width, place, False) as row:
+        for width in self.cases(texture):
+            with self.rows(texture, width, place, False) as row:
                 in_row = [self.product(row.weight, d_value) for d_value in d_values]
 
                 def add_texel(column: Line, width=width, row=row, in_row=in_row) -> None:
                     addends = [self.product(column.weight, d_value) for d_value in in_row]
                     if width is None:
-                        self.add_sums(self.texel(image, column, row), addends)
+                        self.add_sums(self.texel(texture, column, row), addends)
                         return
                     texel = self.b.add(self.times(row.index, width), column.index)
                     for k, addend in enumerate(addends):
                         index = self.b.add(self.times(texel, self.num_columns), LONG(k))
                         self.store(self.b.fadd(self.load(self.sums, index, self.reals), addend), self.sums, index)
 
-                self.each_column(image, width, place, False, add_texel)
+                self.each_column(texture, width, place, False, add_texel)
 
-    def finish_texels(self, image: NativeImage) -> None:
-        """Adds what the lanes have summed of a small image to the cotangents of the table."""
+    def finish_texels(self, texture: NativeTexture) -> None:
+        """Adds what the lanes have summed of a small texture to the cotangents of the texels."""
         b, zero = self.b, self.lanes.constant(0.0, self.real)
-        num = b.select(b.icmp_signed(">", self.small_width(image), LONG(0)), b.mul(image.height, image.width), LONG(0))
+        num = b.select(
+            b.icmp_signed(">", self.small_width(texture), LONG(0)), b.mul(texture.height, texture.width), LONG(0)
+        )
         with self.loop(LONG(0), num) as (place, _):
             base = self.at(self.sums, self.times(place, self.num_columns), self.reals)
             addends = [self.load(base, k, self.reals) for k in range(self.num_columns)]
             for k in range(self.num_columns):
                 self.store(zero, base, k)
-            self.add_sums(self.entry(image, place), addends)
+            self.add_sums(self.entry(texture, place), addends)
 
-    def small_width(self, image: NativeImage) -> ir.Value:
-        """The width of a small image; 0 for a large one."""
+    def small_width(self, texture: NativeTexture) -> ir.Value:
+        """The width of a small texture; 0 for a large one."""
         b = self.b
-        is_width = [b.icmp_signed("==", image.width, LONG(width)) for width in SMALL_WIDTHS]
-        is_low = b.icmp_signed("<=", image.height, LONG(SMALL_HEIGHT))
-        return b.select(b.and_(is_low, functools.reduce(b.or_, is_width)), image.width, LONG(0))
+        is_width = [b.icmp_signed("==", texture.width, LONG(width)) for width in SMALL_WIDTHS]
+        is_low = b.icmp_signed("<=", texture.height, LONG(SMALL_HEIGHT))
+        return b.select(b.and_(is_low, functools.reduce(b.or_, is_width)), texture.width, LONG(0))
 
-    def cases(self, image: NativeImage) -> Iterator[int | None]:
-        """Branches, which the caller fills: one per width of a small image, and one (None) for all that are large."""
+    def cases(self, texture: NativeTexture) -> Iterator[int | None]:
+        """Branches, which the caller fills: one per width of a small texture, and one (None) for all that are large."""
         b = self.b
         large, end = b.append_basic_block("large"), b.append_basic_block("end")
-        switch = b.switch(self.small_width(image), large)
+        switch = b.switch(self.small_width(texture), large)
         for width in (*SMALL_WIDTHS, None):
             block = large if width is None else b.append_basic_block(f"width{width}")
             if width is not None:
@@ -141,23 +143,23 @@ class TexelWriter(Writer):
         b.position_at_end(end)
 
     @contextlib.contextmanager
-    def rows(self, image: NativeImage, width: int | None, place: Place, has_slope: bool) -> Iterator[Line]:
-        """A loop over the rows that may be seen; all of them, where the width is that of a small image."""
+    def rows(self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool) -> Iterator[Line]:
+        """A loop over the rows that may be seen; all of them, where the width is that of a small texture."""
         if width is None:
-            span, y = self.seen(place.y, place.is_reached, image.height)
+            span, y = self.seen(place.y, place.is_reached, texture.height)
         else:
-            span, y = (LONG(0), image.height), place.y
+            span, y = (LONG(0), texture.height), place.y
         with self.loop(*span) as (index, _):
-            yield self.line(index, y, image.height, has_slope)
+            yield self.line(index, y, texture.height, has_slope)
 
     def each_column(
-        self, image: NativeImage, width: int | None, place: Place, has_slope: bool, visit: Callable[[Line], None]
+        self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool, visit: Callable[[Line], None]
     ) -> None:
-        """Calls `visit` for the columns that may be seen: in a loop, or unrolled for a small image."""
+        """Calls `visit` for the columns that may be seen: in a loop, or unrolled for a small texture."""
         if width is None:
-            span, x = self.seen(place.x, place.is_reached, image.width)
+            span, x = self.seen(place.x, place.is_reached, texture.width)
             with self.loop(*span) as (index, _):
-                visit(self.line(index, x, image.width, has_slope))
+                visit(self.line(index, x, texture.width, has_slope))
         elif width == 1:
             visit(Line(LONG(0), self.lanes.constant(1.0, self.real), None))
         else:
@@ -171,7 +173,7 @@ class TexelWriter(Writer):
         other lanes moved between the reached ones."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
         most = self.lanes.broadcast(b.sitofp(b.sub(size, LONG(1)), self.real))
-        # Whatever a lane holds, even if it is no number, nothing outside of the image is read.
+        # Whatever a lane holds, even if it is no number, nothing outside of the texture is read.
         places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
         places = b.select(b.fcmp_ordered("<", places, most), places, most)
         least = self.lanes.smallest(b.select(is_reached, places, most))
@@ -197,13 +199,13 @@ class TexelWriter(Writer):
         is_in_cell = b.fcmp_ordered("<", distance, number(1.0)), b.fcmp_ordered(">=", distance, number(-1.0))
         return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
 
-    def texel(self, image: NativeImage, column: Line, row: Line) -> ir.Value:
+    def texel(self, texture: NativeTexture, column: Line, row: Line) -> ir.Value:
         """The address of a texel."""
-        return self.entry(image, self.b.add(self.b.mul(row.index, image.width), column.index))
+        return self.entry(texture, self.b.add(self.b.mul(row.index, texture.width), column.index))
 
-    def entry(self, image: NativeImage, index: ir.Value) -> ir.Value:
+    def entry(self, texture: NativeTexture, index: ir.Value) -> ir.Value:
         """The address of a texel, counted row by row."""
-        return self.at(image.first, self.times(index, self.num_columns), self.real)
+        return self.at(texture.first, self.times(index, self.num_columns), self.real)
 
     def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
         """Adds the sums over lanes of C vectors to an entry."""

@@ -1,4 +1,4 @@
-"""What native loops are made for, and the scalar functions that they apply."""
+"""What native loops are made for (`KernelSpec`), and the scalar functions that they apply, traced to jaxprs."""
 
 import dataclasses
 from typing import Any
@@ -9,14 +9,14 @@ import numpy as np
 
 from a2tg_jax import pixel
 from a2tg_jax.appearance import StaticRule
-from a2tg_jax.bilinear import Image, Sample
+from a2tg_jax.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.kernels import jit
 from a2tg_jax.kernels.lanes import trace
 from a2tg_jax.kernels.packing import num_numbers
 
 
 @dataclasses.dataclass(frozen=True)
-class Kind:
+class KernelSpec:
     """What a pair of loops is made for; hashable."""
 
     rule: StaticRule
@@ -24,8 +24,9 @@ class Kind:
     num_rule_numbers: int
     """K, what else the rule knows of a splat."""
     num_columns: int
-    """C, numbers in an entry of its table; 0 where it has no images."""
+    """C, numbers of a texel; 0 where its splats have no textures."""
     dtype: str
+    """Of all that is computed: "float32" or "float64"."""
     tile_size: int
     near_plane: float
     has_geometry: bool
@@ -42,7 +43,7 @@ class Kind:
 
     @property
     def lanes(self) -> int:
-        """L."""
+        """L, numbers that fit the processor's vectors."""
         return jit.vector_bytes() // np.dtype(self.dtype).itemsize
 
     @property
@@ -52,19 +53,19 @@ class Kind:
 
 
 class Functions:
-    """The jaxprs of one kind, all of scalars."""
+    """The jaxprs of one spec, all of scalars."""
 
-    def __init__(self, kind: Kind):
-        rule = kind.rule.rule
-        number: Any = jax.ShapeDtypeStruct((), kind.dtype)
+    def __init__(self, spec: KernelSpec):
+        rule = spec.rule.rule
+        number: Any = jax.ShapeDtypeStruct((), spec.dtype)
         integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
         flag = jax.ShapeDtypeStruct((), jnp.bool_)
-        triple, near_plane = (number,) * 3, kind.near_plane
-        normal, numbers = triple if kind.has_geometry else None, (number,) * kind.num_rule_numbers
+        triple, near_plane = (number,) * 3, spec.near_plane
+        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
         splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
-        values = (number,) * kind.num_columns
-        image = Image(integer, integer, integer) if values else None
-        sample = Sample(values, values, values) if values else None
+        values = (number,) * spec.num_columns
+        region = TextureRegion(integer, integer, integer) if values else None
+        lookup = Lookup(region, Sample(values, values, values)) if region else None
 
         self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
@@ -75,28 +76,28 @@ class Functions:
 
         self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
 
-        def reach(planes, image, x, y):
+        def reach(planes, region, x, y):
             hit = pixel.intersect(planes, x, y, near_plane, rule.has_low_pass)
-            return hit.rho, () if image is None else rule.texel(image, hit.u, hit.v)
+            return hit.rho, () if region is None else rule.texel_position(region, hit.u, hit.v)
 
-        self.reach, _ = trace(reach, planes, image, number, number)
+        self.reach, _ = trace(reach, planes, region, number, number)
 
-        def forward(planes, splat, values, x, y, light, is_live, channels):
-            at_pixel = planes, splat, values, x, y, light, is_live
-            added, light, is_live = pixel.composite(rule, near_plane, *at_pixel)
-            return light, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
+        def forward(planes, splat, values, x, y, transmittance, is_live, channels):
+            at_pixel = planes, splat, values, x, y, transmittance, is_live
+            added, transmittance, is_live = pixel.blend(rule, near_plane, *at_pixel)
+            return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
 
-        def backward(planes, splat, image, sample, x, y, light, is_live, behind, g, center, jacobian):
-            at_pixel = planes, splat, image, sample, x, y, light, is_live, behind, g
-            state, weight, d = pixel.composite_vjp(rule, near_plane, *at_pixel, kind.statistic is not None)
-            tap = ()
-            if kind.statistic:
+        def backward(planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g, center, jacobian):
+            at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
+            state, weight, d = pixel.blend_vjp(rule, near_plane, *at_pixel, spec.statistic is not None)
+            added = ()
+            if spec.statistic:
                 moved = splat.M, x, y, *center, d.rho, jacobian
-                tap = pixel.positional_gradient(kind.statistic, *moved, near_plane, rule.has_low_pass)
-            return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, tap)
+                added = pixel.positional_gradient(spec.statistic, *moved, near_plane, rule.has_low_pass)
+            return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
         at_pixel = number, number, number, flag
-        channels = (number,) * kind.num_channels
+        channels = (number,) * spec.num_channels
         self.forward, _ = trace(forward, planes, splat, values, *at_pixel, channels)
         last = number, channels, (number, number), (triple,) * 3
-        self.backward, _ = trace(backward, planes, splat, image, sample, *at_pixel, *last)
+        self.backward, _ = trace(backward, planes, splat, lookup, *at_pixel, *last)

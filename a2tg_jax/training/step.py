@@ -143,18 +143,18 @@ def _gradients(how: StepSettings, stage: Stage, clock: Clock, state: TrainState,
     model, highest = state.model, how.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    tap = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if is_gathering else None
+    probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if is_gathering else None
     has_geometry = any(term.has_geometry for term in stage.losses)
 
     def one_view(view):
         viewmat, K, image, alpha, background = view
         target = Target(Camera(viewmat, K, width, height), _over(image, alpha, background), background)
 
-        def loss(gaussians, params, tap):
+        def loss(gaussians, params, probe):
             shown = dataclasses.replace(model, gaussians=gaussians, params=params)
             output, num_pairs = render_traced(
                 gaussians, target.camera, shown.rule, background, how.render,
-                has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, tap=tap,
+                has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, probe=probe,
                 statistic=stage.statistic,
             )  # fmt: skip
             value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
@@ -162,7 +162,7 @@ def _gradients(how: StepSettings, stage: Stage, clock: Clock, state: TrainState,
             return value, (error, num_pairs, output.overflow)
 
         differentiate = jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)
-        (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, tap)
+        (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, probe)
         return _ViewGradients(value, -10 * jnp.log10(error), num_pairs, overflow, grads[:2], grads[2])
 
     return jax.lax.map(one_view, (batch.viewmats, batch.Ks, batch.images, batch.alphas, backgrounds))
