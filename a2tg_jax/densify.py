@@ -78,6 +78,10 @@ class CloneSplitPrune(StepEvent):
     def times(self, num_iterations: int) -> Times:
         return Times(num_iterations // 60 + 1, num_iterations // 2 - 1, max(10, round(num_iterations / 300)))
 
+    @property
+    def most_gaussians(self) -> int:
+        return self.cap
+
     def num_rows(self, num: int, num_iterations: int) -> int:
         return max(num, self.cap)
 
