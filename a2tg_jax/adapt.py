@@ -1,4 +1,4 @@
-"""Where texels go: the gradient statistic, the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
+"""Where texels go: the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
 
 The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select` choose who gets them, and calls
 `reallocate`. All but the statistic runs on the host, on whole arrays.
@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from a2tg_jax.checks import check_floats, check_shape
+from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
+from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
-from a2tg_jax.numerics import safe_divide, safe_norm
+from a2tg_jax.numerics import safe_norm
 from a2tg_jax.optim import AdamState
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
 
@@ -26,33 +26,6 @@ PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 """Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and what short stages need, where
 that would leave the statistic no time to settle."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class GradientStatistics:
-    """Sums for the average, over views, of the norm of Σ_pixels |∂L/∂mean| (A²TG, gradient-driven selection)."""
-
-    total: Array
-    """[N] sum of the norms since the last event."""
-    views: Array
-    """[N] int32, views so far in which the Gaussian was composited at one pixel at least."""
-
-    @staticmethod
-    def init(num: int, dtype=jnp.float32) -> "GradientStatistics":
-        """Empty sums for `num` Gaussians."""
-        return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
-
-    def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
-        """Adds one view: `norms` [N] counts where `is_visible` [N]."""
-        check_floats("norms", norms, self.total.shape)
-        check_shape("is_visible", is_visible, self.total.shape)
-        total = self.total + jnp.where(is_visible, norms, 0.0)
-        return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
-
-    def average(self) -> Array:
-        """[N] average norm over the views that saw the Gaussian; 0 where none did."""
-        return safe_divide(self.total, self.views.astype(self.total.dtype))
 
 
 class ReallocateResult(NamedTuple):

@@ -293,7 +293,7 @@ def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
-        cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
+        cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
     bounds = screen_bounds(M, cutoff, near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 
@@ -353,7 +353,7 @@ def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) ->
     # Not >=: a depth that is no number is not behind the camera.
     is_drawn = ~(M[:, 2, 2] < settings.near_plane)
     if num_live is not None:
-        is_drawn &= jnp.arange(gaussians.num) < num_live
+        is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
     is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)

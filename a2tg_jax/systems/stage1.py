@@ -57,6 +57,8 @@ class DensityConfig:
         """Clone, split and prune; reset opacities."""
         if self.cap < 2:
             raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
+        if not 0 < self.reset_opacity < 1:
+            raise ValueError(f"densify.reset_opacity must lie between 0 and 1; got {self.reset_opacity}")
         density = CloneSplitPrune(self.cap, threshold=self.threshold, least_opacity=self.least_opacity)
         return (density, OpacityReset(self.reset_opacity))
 
