@@ -65,7 +65,7 @@ def contrast(model, target, output):
 class Toy(a2tg.System):
     """One stage of all that; the fields are the options, and flags of the command line."""
 
-    iterations: int = 20
+    stage1_iterations: int = 20
     factor: float = 0.9
     contrast_weight: float = 0.1
     rings_rate: float = 1e-2
@@ -74,5 +74,5 @@ class Toy(a2tg.System):
 
     def stages(self):
         losses = (*self.loss.terms(), a2tg.Term(contrast, self.contrast_weight))
-        events = (Shrink(self.factor),)
-        return (a2tg.Stage("rings", Rings(), events, losses, self.rates, self.iterations, self.rings_rate),)
+        rings, events = Rings(), (Shrink(self.factor),)
+        return (a2tg.Stage("rings", rings, events, losses, self.rates, self.stage1_iterations, self.rings_rate),)
