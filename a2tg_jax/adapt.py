@@ -34,7 +34,7 @@ class ReallocateResult(NamedTuple):
     textures: Textures
     layout: AtlasLayout
     moments: Any
-    """As given, carried along with the texels."""
+    """As given, its textures rebuilt as the texels were."""
 
 
 _compiled_shapes: set[Shape] = set()
@@ -105,13 +105,10 @@ class Upscale(HostEvent):
         mask = select(np.asarray(state.average()), layout.sizes, proposed, **how)
         mask &= np.arange(layout.num) < num
         new_sizes = np.where(mask[:, None], proposed, layout.sizes)
-        (mu_gaussians, mu), (nu_gaussians, nu) = moments.mu, moments.nu
-        rebuilt = reallocate(model.params, layout, new_sizes, (mu, nu), tuple(_compiled_shapes))
-        mu, nu = rebuilt.moments
+        rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes))
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
-        moments = dataclasses.replace(moments, mu=(mu_gaussians, mu), nu=(nu_gaussians, nu))
         model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
-        return Change(model, moments, self.init(model))
+        return Change(model, rebuilt.moments, self.init(model))
 
     def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
         """The keyword that tells `select` how to choose."""
@@ -238,7 +235,7 @@ def reallocate(
       textures: the present texels.
       layout: their layout, of N Gaussians.
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
-      moments: any pytree of `Textures`, such as (mu, nu) of Adam.
+      moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay as they are.
       known: shapes of buckets to prefer (`texture.plan_layout`).
 
     Raises:
@@ -254,9 +251,11 @@ def reallocate(
         old = [np.asarray(bucket) for bucket in tree.buckets]
         return _move_texels(old, new_layout.resolutions, capacities, moves, padding)
 
-    def rebuild_moments(tree: Textures) -> Textures:
-        check_textures(tree, layout, layout.num, "moments")
-        return rebuild(tree, (0.0, 0.0, 0.0, 0.0))
+    def rebuild_moments(leaf):
+        if not isinstance(leaf, Textures):
+            return leaf
+        check_textures(leaf, layout, layout.num, "moments")
+        return rebuild(leaf, (0.0, 0.0, 0.0, 0.0))
 
     moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
     return ReallocateResult(rebuild(textures, NEUTRAL_TEXEL), new_layout, moments)
