@@ -63,7 +63,7 @@ def test_norms_are_those_that_events_average(event):
 
     def of_tap(tap):
         output, _ = render_traced(
-            model.gaussians, camera, model.rule, jnp.zeros(3), settings, tap=tap, statistic=event.statistic
+            model.gaussians, camera, model.rule, jnp.zeros(3), settings, probe=tap, statistic=event.statistic
         )
         return loss(model, output)
 
