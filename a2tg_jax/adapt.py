@@ -97,14 +97,16 @@ class Upscale(HostEvent):
 
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         layout, num = model.layout, model.num
+        new_sizes, scales, averages = layout.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
+        # Rows that do not exist yet count for nothing, and get nothing.
+        sizes = new_sizes[:num]
         proposed = next_sizes(
-            layout.sizes, np.asarray(model.gaussians.scales), k_a=self.k_a, k_s=self.k_s, cap=self.cap,
+            sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap,
             anisotropic=self.anisotropic, axes=self.axes,
         )  # fmt: skip
         how = self._how_to_select(model.num_bytes, index, count)
-        mask = select(np.asarray(state.average()), layout.sizes, proposed, **how)
-        mask &= np.arange(layout.num) < num
-        new_sizes = np.where(mask[:, None], proposed, layout.sizes)
+        mask = select(averages[:num], sizes, proposed, **how)
+        new_sizes[:num] = np.where(mask[:, None], proposed, sizes)
         rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes))
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
         model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)

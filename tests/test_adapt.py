@@ -7,8 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.adapt import event_budget, next_sizes, reallocate, select
+from a2tg_jax.adapt import Upscale, event_budget, next_sizes, reallocate, select
+from a2tg_jax.appearance import Textured
+from a2tg_jax.gaussians import init_from_points
 from a2tg_jax.gradient_statistics import GradientStatistics
+from a2tg_jax.model import Model
+from a2tg_jax.optim import adam_init
 from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
@@ -200,6 +204,23 @@ def test_padding_is_neutral_and_has_no_moments():
     for bucket, moment in zip(new_textures.buckets, moments.buckets, strict=True):
         np.testing.assert_array_equal(bucket, np.broadcast_to(np.float32([0, 0, 0, 1]), bucket.shape))
         np.testing.assert_array_equal(moment, 0)
+
+
+@pytest.mark.parametrize("select, number", [("fraction", 0.5), ("budget", (2 * 248 + 48) / 1e6)])
+def test_rows_that_do_not_exist_take_no_share(select, number):
+    """Two Gaussians in ten rows: half of two grow, and a budget is theirs alone."""
+    gaussians = init_from_points(np.random.default_rng(0).normal(size=(10, 3)), np.zeros((10, 3)))
+    appearance = Textured()
+    params, layout = appearance.allocate(jax.random.key(0), gaussians)
+    model = Model(gaussians, params, layout, num_live=jnp.int32(2), appearance=appearance)
+    name = {"fraction": "fraction", "budget": "budget_mb"}[select]
+    event = Upscale(select, k_s=0.0, **{name: number})
+    seen = GradientStatistics(jnp.asarray([0.0, 0.0, *[9.0] * 8]), jnp.ones(10, jnp.int32))
+    if select == "fraction":
+        seen = GradientStatistics(jnp.asarray([1.0, 2.0, *[0.0] * 8]), jnp.ones(10, jnp.int32))
+    change = event.apply(1, 1, model, adam_init((gaussians, params)), seen)
+    sizes = change.model.layout.sizes
+    assert np.prod(sizes[:2], axis=1).sum() == 1 + 4 and np.all(sizes[2:] == 1)
 
 
 def test_reallocate_refuses_other_counts():
