@@ -184,6 +184,13 @@ def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
     return Textures(tuple(jnp.asarray(bucket) for bucket in filled)), layout
 
 
+def packed_textures(textures: Textures, layout: AtlasLayout) -> tuple[Textures, AtlasLayout]:
+    """The same textures, or moments of them, in buckets of no more room than `plan_layout` gives them (host)."""
+    new, capacities = plan_layout(layout.sizes)
+    kept = [textures.buckets[layout.resolutions.index(resolution)] for resolution in new.resolutions]
+    return Textures(tuple(bucket[:capacity] for bucket, capacity in zip(kept, capacities, strict=True))), new
+
+
 def first_textures(textures: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
     """The textures of the first `num` Gaussians, in buckets of their own (host)."""
     new, capacities = plan_layout(layout.sizes[:num])

@@ -3,16 +3,20 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import A2tg, fit, load_checkpoint, save_checkpoint, synthetic_scene
+from a2tg_jax import A2tg, adapt, fit, load_checkpoint, save_checkpoint, synthetic_scene
+from a2tg_jax.appearance import Textured
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.training import LearningRates, fit_stage, like
+from a2tg_jax.texture import Shape
+from a2tg_jax.training import LearningRates, Stage, fit_stage, like
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.start import initial_model
+from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 
 CONFIG = A2tg(
@@ -77,6 +81,39 @@ def test_resumed_run_is_the_same(scene, trained, tmp_path, which):
     save_checkpoint(tmp_path / "checkpoint.npz", checkpoints[which])
     resumed = fit(scene, CONFIG, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False)
     assert_same(resumed, result)
+
+
+def test_shapes_of_earlier_runs_change_nothing(scene, trained, tmp_path, monkeypatch):
+    """Buckets with the room of another run's textures, one of them for a size that nobody has here."""
+    model = trained[0].model
+    capacities = (*(len(bucket) + 2 for bucket in model.params.buckets), 1)
+    monkeypatch.setattr(adapt, "_compiled_shapes", {Shape((*model.layout.resolutions, (5, 5)), capacities)})
+    path, rooms = tmp_path / "checkpoint.npz", []
+
+    def keep(checkpoint):
+        if checkpoint.iteration == 16 and checkpoint.stage == 1:
+            save_checkpoint(path, checkpoint)
+            rooms.append(tuple(map(len, checkpoint.state.model.params.buckets)))
+
+    assert_same(fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, progress=False), trained[0])
+    assert rooms == [capacities]
+    assert_same(fit(scene, CONFIG, resume=load_checkpoint(path), progress=False), trained[0])
+
+
+def test_rows_that_do_not_exist_are_not_trained(scene, trained):
+    first = trained[0].stages[0].model
+    padded_first = dataclasses.replace(first, num_live=jnp.int32(60))
+    run = StageRun(scene, CONFIG, 1, padded_first)
+    assert run.model.num == 60 == run.state.model.gaussians.num
+
+
+def test_rows_are_not_added_to_textures_of_another_size(trained):
+    start, textured = trained[0].stages[0].model, Textured((2, 2))
+    other = dataclasses.replace(start, appearance=textured)
+    params, layout = Textured((1, 1)).allocate(jax.random.key(0), start.gaussians)
+    stage = Stage("more", textured, (Mcmc(500),), (), CONFIG.rates, 3_000)
+    with pytest.raises(ValueError, match="stage 'more' would add Gaussians to a model whose textures have grown"):
+        padded(dataclasses.replace(other, params=params, layout=layout), stage, CONFIG)
 
 
 def test_what_is_passed_in_stays_usable(scene, trained):

@@ -77,7 +77,8 @@ class Appearance:
         return dataclasses.replace(gaussians, logit_opacities=limited), params
 
     def first_rows(self, params: Any, layout: Any, num: int) -> tuple[Any, Any]:
-        """Parameters and layout of the first `num` rows (host)."""
+        """Parameters, or moments of them, and layout of the first `num` rows, in the room that `from_arrays` makes
+        (host)."""
         return jax.tree.map(lambda x: x[:num], params), layout
 
     # Files.

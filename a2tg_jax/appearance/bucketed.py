@@ -7,7 +7,14 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
-from a2tg_jax.texture import AtlasLayout, Textures, first_textures, texture_arrays, textures_from_arrays
+from a2tg_jax.texture import (
+    AtlasLayout,
+    Textures,
+    first_textures,
+    packed_textures,
+    texture_arrays,
+    textures_from_arrays,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +31,7 @@ class Bucketed(Appearance):
         return Textures((jnp.where(is_cleared[:, None, None, None], jnp.zeros_like(bucket), bucket),))
 
     def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
-        return (params, layout) if num == layout.num else first_textures(params, layout, num)
+        return packed_textures(params, layout) if num == layout.num else first_textures(params, layout, num)
 
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
         """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""

@@ -11,6 +11,7 @@ import numpy as np
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.model import Model
+from a2tg_jax.optim import AdamState
 from a2tg_jax.training.options import System
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.stage import Stage
@@ -87,6 +88,7 @@ def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
     }
     shown = model.appearance.arrays(model.params, model.layout)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
+    state = dataclasses.replace(state, moments=_packed(model, state.moments))
     rest = _rest(state), dataclasses.asdict(checkpoint.history)
     write_archive(path, header, arrays | _named_arrays((model.gaussians, rest)))
 
@@ -126,6 +128,16 @@ SHOWN = "shown/"
 def _rest(state: TrainState) -> tuple:
     """What a checkpoint keeps besides Gaussians and what they show."""
     return state.moments, state.model.num_live, state.events, state.iteration, state.status
+
+
+def _packed(model: Model, moments: AdamState) -> AdamState:
+    """Moments in the room that parameters have when they are read again, whatever more of it training gave them."""
+
+    def packed(moment):
+        gaussians, params = moment
+        return gaussians, model.appearance.first_rows(params, model.layout, model.gaussians.num)[0]
+
+    return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
 
 def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class StageRun:
         scene: its training views are trained on.
         system: the options.
         index: which of its stages, from 0.
-        start: the model to start from, all of whose rows exist; None where `resume` is given.
+        start: the model to start from; None where `resume` is given.
         resume: a checkpoint of this stage.
         """
         self.views, self.system, self.index = scene.train, system, index
@@ -71,7 +71,7 @@ class StageRun:
             self.history, self.earlier_seconds = resume.history, resume.history.last_seconds
         elif start is not None:
             # Steps take over the buffers they are given: the caller keeps his own.
-            self.state = initial_state(self.stage, padded(jax.tree.map(jnp.array, start), self.stage, system))
+            self.state = initial_state(self.stage, padded(jax.tree.map(jnp.array, start.live), self.stage, system))
         else:
             raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
         self.scene_scale = jnp.asarray(scene.scale, jnp.float32)

@@ -40,11 +40,15 @@ def padded(model: Model, stage: Stage, system: System) -> Model:
         key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS)
         params, layout = stage.appearance.allocate(key, gaussians)
     if model.appearance == stage.appearance and room > num:
-        was: Any = jax.tree.structure(model.params)
-        if jax.tree.structure(params) != was:
+        if _rows_of(params) != _rows_of(model.params):
             raise ValueError(f"stage {stage.name!r} would add Gaussians to a model whose textures have grown already")
         params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
     return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+
+
+def _rows_of(params: Any) -> Any:
+    """What one row of the parameters is, however many there are."""
+    return jax.tree.structure(params), [leaf.shape[1:] for leaf in jax.tree.leaves(params)]
 
 
 def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
