@@ -1,6 +1,5 @@
 """Adaptive anisotropic textured Gaussians as a functional JAX library: the public names."""
 
-from a2tg_jax.adapt import GradientStatistics as GradientStatistics
 from a2tg_jax.adapt import Upscale as Upscale
 from a2tg_jax.adapt import event_budget as event_budget
 from a2tg_jax.adapt import next_sizes as next_sizes
@@ -35,6 +34,7 @@ from a2tg_jax.events import event as event
 from a2tg_jax.events import static as static
 from a2tg_jax.gaussians import Gaussians as Gaussians
 from a2tg_jax.gaussians import init_from_points as init_from_points
+from a2tg_jax.gradient_statistics import GradientStatistics as GradientStatistics
 from a2tg_jax.gradients import ViewGradients as ViewGradients
 from a2tg_jax.gradients import view_gradients as view_gradients
 from a2tg_jax.io.model import load_model as load_model

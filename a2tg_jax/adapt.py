@@ -1,4 +1,4 @@
-"""Where texels go: the gradient statistic, the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
+"""Where texels go: the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
 
 The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select` choose who gets them, and calls
 `reallocate`. All but the statistic runs on the host, on whole arrays.
@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from a2tg_jax.checks import check_floats, check_shape
+from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
+from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
-from a2tg_jax.numerics import safe_divide, safe_norm
+from a2tg_jax.numerics import safe_norm
 from a2tg_jax.optim import AdamState
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
 
@@ -28,40 +28,13 @@ PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 that would leave the statistic no time to settle."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class GradientStatistics:
-    """Sums for the average, over views, of the norm of Σ_pixels |∂L/∂mean| (A²TG, gradient-driven selection)."""
-
-    total: Array
-    """[N] sum of the norms since the last event."""
-    views: Array
-    """[N] int32, views so far in which the Gaussian was composited at one pixel at least."""
-
-    @staticmethod
-    def init(num: int, dtype=jnp.float32) -> "GradientStatistics":
-        """Empty sums for `num` Gaussians."""
-        return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
-
-    def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
-        """Adds one view: `norms` [N] counts where `is_visible` [N]."""
-        check_floats("norms", norms, self.total.shape)
-        check_shape("is_visible", is_visible, self.total.shape)
-        total = self.total + jnp.where(is_visible, norms, 0.0)
-        return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
-
-    def average(self) -> Array:
-        """[N] average norm over the views that saw the Gaussian; 0 where none did."""
-        return safe_divide(self.total, self.views.astype(self.total.dtype))
-
-
 class ReallocateResult(NamedTuple):
     """What `reallocate` returns."""
 
     textures: Textures
     layout: AtlasLayout
     moments: Any
-    """As given, carried along with the texels."""
+    """As given, its textures rebuilt as the texels were."""
 
 
 _compiled_shapes: set[Shape] = set()
@@ -132,13 +105,10 @@ class Upscale(HostEvent):
         mask = select(np.asarray(state.average()), layout.sizes, proposed, **how)
         mask &= np.arange(layout.num) < num
         new_sizes = np.where(mask[:, None], proposed, layout.sizes)
-        (mu_gaussians, mu), (nu_gaussians, nu) = moments.mu, moments.nu
-        rebuilt = reallocate(model.params, layout, new_sizes, (mu, nu), tuple(_compiled_shapes))
-        mu, nu = rebuilt.moments
+        rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes))
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
-        moments = dataclasses.replace(moments, mu=(mu_gaussians, mu), nu=(nu_gaussians, nu))
         model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
-        return Change(model, moments, self.init(model))
+        return Change(model, rebuilt.moments, self.init(model))
 
     def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
         """The keyword that tells `select` how to choose."""
@@ -265,7 +235,7 @@ def reallocate(
       textures: the present texels.
       layout: their layout, of N Gaussians.
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
-      moments: any pytree of `Textures`, such as (mu, nu) of Adam.
+      moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay as they are.
       known: shapes of buckets to prefer (`texture.plan_layout`).
 
     Raises:
@@ -281,9 +251,11 @@ def reallocate(
         old = [np.asarray(bucket) for bucket in tree.buckets]
         return _move_texels(old, new_layout.resolutions, capacities, moves, padding)
 
-    def rebuild_moments(tree: Textures) -> Textures:
-        check_textures(tree, layout, layout.num, "moments")
-        return rebuild(tree, (0.0, 0.0, 0.0, 0.0))
+    def rebuild_moments(leaf):
+        if not isinstance(leaf, Textures):
+            return leaf
+        check_textures(leaf, layout, layout.num, "moments")
+        return rebuild(leaf, (0.0, 0.0, 0.0, 0.0))
 
     moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
     return ReallocateResult(rebuild(textures, NEUTRAL_TEXEL), new_layout, moments)

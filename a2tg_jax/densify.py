@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.adapt import GradientStatistics
 from a2tg_jax.events import (
     Change,
     EventInfo,
@@ -28,6 +27,7 @@ from a2tg_jax.events import (
     static,
 )
 from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.optim import AdamState
@@ -77,6 +77,10 @@ class CloneSplitPrune(StepEvent):
 
     def times(self, num_iterations: int) -> Times:
         return Times(num_iterations // 60 + 1, num_iterations // 2 - 1, max(10, round(num_iterations / 300)))
+
+    @property
+    def most_gaussians(self) -> int:
+        return self.cap
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         return max(num, self.cap)

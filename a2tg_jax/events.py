@@ -95,6 +95,11 @@ class Event:
         """The state after the views of an iteration; traced, and called while the event is still ahead."""
         return state
 
+    @property
+    def most_gaussians(self) -> int | None:
+        """How many Gaussians training may start from at most; None where the event does not mind."""
+        return None
+
     def num_rows(self, num: int, num_iterations: int) -> int:
         """How many Gaussians the event can reach from `num`: so many rows are allocated (host)."""
         return num

@@ -114,11 +114,13 @@ def init_from_points(
       float32 Gaussians, min(num, P) of them.
 
     Raises:
-      ValueError: if the shapes disagree or there are fewer than two points.
+      ValueError: if the shapes disagree, there are fewer than two points, or a number is not finite.
     """
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
+    if not (np.isfinite(points).all() and np.isfinite(colors).all()):
+        raise ValueError("points and colors must be finite; some are NaN or infinite")
     if num is not None and num < 2:
         raise ValueError(f"num must be at least 2; got {num}")
     rng = np.random.default_rng(seed)

@@ -26,8 +26,8 @@ class ViewGradients(NamedTuple):
     params: Any
     """Its gradient in what they show."""
     norms: Array
-    """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection), or of
-    another statistic."""
+    """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection); of another
+    statistic, which is by the position on the screen, in units of half an image."""
     is_visible: Array
     """[N] whether the Gaussian was composited at one pixel at least."""
     output: RenderOutput
@@ -84,5 +84,7 @@ def view_gradients(
     probe = jnp.zeros((model.gaussians.num, 4), dtype)
     differentiate = jax.value_and_grad(of_parameters, argnums=(0, 1, 2), has_aux=True)
     (value, (output, num_pairs)), (gaussians, params, found) = differentiate(model.gaussians, model.params, probe)
-    norms, is_visible = safe_norm(found[:, :3]), found[:, 3] > 0
-    return ViewGradients(value, gaussians, params, norms, is_visible, output, num_pairs)
+    statistics, is_visible = found[:, :3], found[:, 3] > 0
+    if statistic != "position":
+        statistics = statistics * jnp.asarray([[camera.width / 2, camera.height / 2, 1.0]], dtype)
+    return ViewGradients(value, gaussians, params, safe_norm(statistics), is_visible, output, num_pairs)

@@ -273,6 +273,10 @@ class Mcmc(StepEvent):
     def times(self, num_iterations: int) -> Times:
         return densify_times(num_iterations)
 
+    @property
+    def most_gaussians(self) -> int:
+        return self.cap
+
     def num_rows(self, num: int, num_iterations: int) -> int:
         """Growth from `num` by the end of the stage, rounded up so that few shapes occur; at most the cap."""
         times = self.times(num_iterations)

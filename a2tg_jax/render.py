@@ -305,7 +305,7 @@ def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
-        cutoff = jnp.where(jnp.arange(gaussians.num) < num_live, cutoff, -1.0)
+        cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
     bounds = screen_bounds(M, cutoff, near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
 

@@ -40,8 +40,8 @@ def sh_basis(directions: Array) -> Array:
 
 def degree_mask(degree) -> Array:
     """[16] booleans: the bases up to `degree`, which may be traced."""
-    degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3])
-    return degrees <= degree
+    degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
+    return degrees <= jnp.asarray(degree, jnp.int32)
 
 
 def sh_colors(sh: Array, means: Array, center: Array, degree) -> Array:

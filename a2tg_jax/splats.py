@@ -88,7 +88,7 @@ def project_gaussians(
     # Not >=: a depth that is no number is not behind the camera.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
-        is_drawn &= jnp.arange(gaussians.num) < num_live
+        is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
     is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.adapt import GradientStatistics, event_budget, next_sizes, reallocate, select
+from a2tg_jax.adapt import event_budget, next_sizes, reallocate, select
+from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)

@@ -13,6 +13,8 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 
 import a2tg_jax as a2tg
 from a2tg_jax import Model, RenderSettings, Textured, view_gradients
+from a2tg_jax.events import Seen
+from a2tg_jax.render import render_traced
 
 
 @pytest.mark.usefixtures("x64")
@@ -50,6 +52,28 @@ def test_an_eager_call_finds_its_capacity():
     assert not found.output.overflow and found.num_pairs > 0
 
 
+@pytest.mark.parametrize("event", [a2tg.CloneSplitPrune(), a2tg.Upscale(gradient="screen"), a2tg.Upscale()])
+def test_norms_are_those_that_events_average(event):
+    """Also where the statistic is by the position on the screen, whose thresholds are in units of half an image."""
+    scene = draw_scene(4)
+    model, camera = Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
+    settings = RenderSettings(capacity=CAPACITY)
+    loss = lambda model, output: jnp.sum(output.color**2)  # noqa: E731
+    found = view_gradients(loss, model, camera, settings=settings, statistic=event.statistic)
+
+    def of_probe(probe):
+        output, _ = render_traced(
+            model.gaussians, camera, model.rule, jnp.zeros(3), settings, probe=probe, statistic=event.statistic
+        )
+        return loss(model, output)
+
+    gradients = jax.grad(of_probe)(jnp.zeros((50, 4)))
+    seen = Seen(camera, gradients[None, :, :3], gradients[None, :, 3] > 0)
+    average = event.observe(event.init(model), model, seen).average()
+    assert average.max() > 0
+    np.testing.assert_allclose(jnp.where(found.is_visible, found.norms, 0.0), average, rtol=1e-5, atol=1e-6)
+
+
 def test_a_loop_by_hand_learns_and_upscales():
     """Adam on two views, then the textures of the Gaussians with the largest statistic double, and Adam again."""
     scene = draw_scene(4)
@@ -84,10 +108,9 @@ def test_a_loop_by_hand_learns_and_upscales():
     proposed = a2tg.next_sizes(model.layout.sizes, model.gaussians.scales, k_a=4.0, k_s=0.01, cap=4)
     chosen = a2tg.select(statistics.average(), model.layout.sizes, proposed, fraction=0.25)
     sizes = np.where(chosen[:, None], proposed, model.layout.sizes)
-    grown = a2tg.reallocate(model.params, model.layout, sizes, (moments.mu[1], moments.nu[1]))
-    mu, nu = grown.moments
-    moments = dataclasses.replace(moments, mu=(moments.mu[0], mu), nu=(moments.nu[0], nu))
-    model = dataclasses.replace(model, params=grown.textures, layout=grown.layout)
+    grown = a2tg.reallocate(model.params, model.layout, sizes, moments)
+    assert grown.moments.mu[0].means is moments.mu[0].means and grown.moments.count is moments.count
+    moments, model = grown.moments, dataclasses.replace(model, params=grown.textures, layout=grown.layout)
     assert model.num_bytes == 232 * 50 + 16 * sizes.prod(axis=1).sum() and chosen.sum() == 13
 
     model, moments, statistics, after = train(model, moments)

@@ -1,4 +1,7 @@
-"""A system of one's own in one file: a splat rule, an event and a loss term, and the stage that composes them."""
+"""A system of one's own in one file: what a splat shows, an event, a loss term, and the stage that composes them.
+
+In the folder of this file, `a2tg train synthetic --system toy_system:Toy --out runs/toy` trains it.
+"""
 
 import dataclasses
 
@@ -11,9 +14,10 @@ import a2tg_jax as a2tg
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RingsRule(a2tg.PlainRule):
-    """Rings around the centre of each splat, in a colour and at a width of its own, [N, 4]."""
+    """What the renderer is given: rings around the centre of each splat, beside its own colour."""
 
     rings: jax.Array
+    """[N, 4] red, green, blue, and how narrow the rings are."""
 
     def numbers(self, gaussians, camera):
         return self.rings
@@ -26,47 +30,42 @@ class RingsRule(a2tg.PlainRule):
 
 @dataclasses.dataclass(frozen=True)
 class Rings(a2tg.Appearance):
-    """Splats with rings."""
-
-    frequency: float = 2.0
+    """What a model has: it makes the parameters, colourless at first, and the rule that shows them."""
 
     def allocate(self, key, gaussians):
-        return jnp.zeros((gaussians.num, 4)).at[:, 3].set(self.frequency), ()
+        return jnp.zeros((gaussians.num, 4)).at[:, 3].set(2.0), ()
 
-    def rule(self, params, layout) -> a2tg.AppearanceRule:
+    def rule(self, params, layout):
         return RingsRule(rings=params)
 
 
 @a2tg.event
 class Shrink(a2tg.StepEvent):
-    """Every so many iterations the largest splats become a little smaller."""
+    """After every fifth iteration, scales above the average become smaller."""
 
     factor: float = 0.9
 
-    num_keys = 0
-
     def times(self, num_iterations):
-        return a2tg.Times(5, num_iterations, 5)
+        return a2tg.Times(first=5, last=num_iterations, every=5)
 
     def apply(self, now, model, moments, state):
-        gaussians = model.gaussians
-        largest = jnp.mean(gaussians.log_scales)
-        smaller = jnp.where(gaussians.log_scales > largest, jnp.log(self.factor), 0.0)
-        gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + smaller)
+        log_scales = model.gaussians.log_scales
+        is_large = log_scales > jnp.mean(log_scales)
+        log_scales = log_scales + jnp.where(is_large, jnp.log(self.factor), 0.0)
+        gaussians = dataclasses.replace(model.gaussians, log_scales=log_scales)
         return a2tg.Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
-def ring_contrast(model, target, output):
-    """Mean squared contrast of the rings: rings are to earn their keep."""
+def contrast(model, target, output):
+    """A loss term: rings are to earn their keep."""
     return jnp.mean(model.params[:, :3] ** 2)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Toy(a2tg.System):
-    """Rings that shrink."""
+    """One stage of all that; the fields are the options, and flags of the command line."""
 
-    iterations: int = 20
-    frequency: float = 2.0
+    stage1_iterations: int = 20
     factor: float = 0.9
     contrast_weight: float = 0.1
     rings_rate: float = 1e-2
@@ -74,6 +73,6 @@ class Toy(a2tg.System):
     name = "toy"
 
     def stages(self):
-        losses = (*self.loss.terms(), a2tg.Term(ring_contrast, self.contrast_weight))
-        rings, events = Rings(self.frequency), (Shrink(self.factor),)
-        return (a2tg.Stage("rings", rings, events, losses, self.rates, self.iterations, self.rings_rate),)
+        losses = (*self.loss.terms(), a2tg.Term(contrast, self.contrast_weight))
+        rings, events = Rings(), (Shrink(self.factor),)
+        return (a2tg.Stage("rings", rings, events, losses, self.rates, self.stage1_iterations, self.rings_rate),)

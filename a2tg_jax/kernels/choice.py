@@ -8,6 +8,10 @@ from typing import Literal
 
 import jax
 
+# It registers configuration that belongs to every trace's key: imported during the first trace (by `lanes`, on use), it
+# would have JAX trace and compile all of it a second time.
+import jax.extend.core
+
 from a2tg_jax.splats import Compositor
 
 MAX_TILE_SIZE = 64

@@ -92,11 +92,18 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
 
 def _is_same(known: PlannedStage, wanted: PlannedStage) -> bool:
     """Whether training both would give the same model, bit for bit."""
-    return (
-        (known.index, known.start) == (wanted.index, wanted.start)
-        and _common_options(known.system) == _common_options(wanted.system)
-        and _is_equal(known.stage, wanted.stage)
-    )
+    same_place = (known.index, known.start) == (wanted.index, wanted.start)
+    return same_place and _trains_alike(known.system, wanted.system, wanted.index)
+
+
+def is_same_so_far(made: System, wanted: System, index: int) -> bool:
+    """Whether two systems train their stages up to `index` alike, however they go on."""
+    return all(_trains_alike(made, wanted, at) for at in range(index + 1))
+
+
+def _trains_alike(a: System, b: System, index: int) -> bool:
+    """Whether a stage of two systems makes the same of the same start, bit for bit."""
+    return _common_options(a) == _common_options(b) and _is_equal(a.stages()[index], b.stages()[index])
 
 
 def _common_options(system: System) -> list:

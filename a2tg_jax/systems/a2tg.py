@@ -65,6 +65,8 @@ class TextureConfig:
         """
         if not 1 <= self.cap <= 16:
             raise ValueError(f"texture.cap must lie in 1..16; got {self.cap}")
+        if not 0 <= self.fraction <= 1:
+            raise ValueError(f"texture.fraction must lie in 0..1; got {self.fraction}")
         if self.select == "budget" and self.budget_mb is None:
             raise ValueError("texture.select is 'budget', so texture.budget_mb must say how many MB (10^6 bytes)")
         if self.select == "threshold" and self.threshold is None:

@@ -3,17 +3,7 @@
 import dataclasses
 from typing import ClassVar, Self
 
-from a2tg_jax.appearance import Plain
-from a2tg_jax.systems.stage1 import (
-    QUICK_CAP,
-    QUICK_OPACITY,
-    QUICK_RATES,
-    SMOKE,
-    SMOKE_CAP,
-    McmcConfig,
-    growing_stage,
-    later_stage,
-)
+from a2tg_jax.systems.stage1 import QUICK, QUICK_CAP, SMOKE, SMOKE_CAP, McmcConfig, continued, growing_stage
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -31,20 +21,12 @@ class Gaussians2dMcmc(System):
 
     def stages(self) -> tuple[Stage, ...]:
         first = growing_stage(self, self.stage1_iterations, self.densify.events())
-        if not self.stage2_iterations:
-            return (first,)
-        return first, later_stage(self, "continued", Plain(), (), self.stage2_iterations)
+        return continued(self, first, self.stage2_iterations)
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
         return {
             "paper": cls(),
-            "quick": cls(
-                stage1_iterations=2_000,
-                stage2_iterations=1_000,
-                initial_opacity=QUICK_OPACITY,
-                rates=QUICK_RATES,
-                densify=McmcConfig(cap=QUICK_CAP),
-            ),
+            "quick": cls(**QUICK, densify=McmcConfig(cap=QUICK_CAP)),
             "smoke": cls(**SMOKE, densify=McmcConfig(cap=SMOKE_CAP)),
-        }  # fmt: skip
+        }

@@ -15,6 +15,9 @@ QUICK_OPACITY = 0.5
 QUICK_RATES = LearningRates(means=3 * 1.6e-4, sh_degree0=2 * 2.5e-3)
 QUICK_TEXELS = 1e-2
 """What short runs want (docs/quality.md): Gaussians that begin half opaque, and faster rates."""
+QUICK: dict[str, Any] = {
+    "stage1_iterations": 2_000, "stage2_iterations": 1_000, "initial_opacity": QUICK_OPACITY, "rates": QUICK_RATES,
+}  # fmt: skip
 SMOKE: dict[str, Any] = {
     "stage1_iterations": 200, "initial_gaussians": 800, "initial_opacity": QUICK_OPACITY, "rates": QUICK_RATES,
 }  # fmt: skip
@@ -54,6 +57,8 @@ class DensityConfig:
         """Clone, split and prune; reset opacities."""
         if self.cap < 2:
             raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
+        if not 0 < self.reset_opacity < 1:
+            raise ValueError(f"densify.reset_opacity must lie between 0 and 1; got {self.reset_opacity}")
         density = CloneSplitPrune(self.cap, threshold=self.threshold, least_opacity=self.least_opacity)
         return (density, OpacityReset(self.reset_opacity))
 
@@ -82,3 +87,10 @@ def later_stage(
 ) -> Stage:
     """A second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
     return Stage(name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate)
+
+
+def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:
+    """A first stage, and one that goes on from its result without events, unless that has no iterations."""
+    if not iterations:
+        return (first,)
+    return first, later_stage(system, "continued", first.appearance, (), iterations, first.params_rate)

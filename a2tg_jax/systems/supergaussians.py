@@ -5,7 +5,16 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.appearance import MovableKernels
 from a2tg_jax.appearance.movable_kernels import MovableKernelParams
-from a2tg_jax.systems.stage1 import QUICK_CAP, QUICK_RATES, SMOKE, SMOKE_CAP, DensityConfig, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import (
+    QUICK,
+    QUICK_CAP,
+    QUICK_RATES,
+    SMOKE,
+    SMOKE_CAP,
+    DensityConfig,
+    continued,
+    growing_stage,
+)
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import LearningRates, Stage
 
@@ -43,18 +52,13 @@ class SuperGaussians(System):
     def stages(self) -> tuple[Stage, ...]:
         kernels, rates = MovableKernels(), self.kernels.rates()
         first = growing_stage(self, self.stage1_iterations, self.densify.events(), kernels, rates, name="kernels")
-        if not self.stage2_iterations:
-            return (first,)
-        return first, later_stage(self, "continued", kernels, (), self.stage2_iterations, rates)
+        return continued(self, first, self.stage2_iterations)
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
         quick = dataclasses.replace(QUICK_RATES, log_scales=AUTHORS_LOG_SCALES)
         return {
             "paper": cls(),
-            "quick": cls(
-                stage1_iterations=2_000, stage2_iterations=1_000, initial_opacity=0.5, rates=quick,
-                densify=DensityConfig(cap=QUICK_CAP),
-            ),
+            "quick": cls(**(QUICK | {"rates": quick}), densify=DensityConfig(cap=QUICK_CAP)),
             "smoke": cls(**(SMOKE | {"rates": quick}), densify=DensityConfig(cap=SMOKE_CAP)),
-        }  # fmt: skip
+        }

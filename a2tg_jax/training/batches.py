@@ -82,6 +82,21 @@ class PhotoStore:
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
 
+def check_views(views: tuple[View, ...]) -> None:
+    """Raises ValueError, naming the view, unless there are photographs, [H, W, 3] uint8, of their cameras' sizes."""
+    if not views:
+        raise ValueError("scene.train must hold at least one view; got none")
+    for view in views:
+        size = view.camera.height, view.camera.width
+        named = {"image": (view.image, (*size, 3)), "alpha": (view.alpha, size)}
+        for name, (array, wanted) in named.items():
+            if array is not None and (array.shape, array.dtype) != (wanted, np.uint8):
+                raise ValueError(
+                    f"{name} of view {view.name} must be uint8 {list(wanted)}, as large as its camera says; "
+                    f"got {array.dtype} {list(array.shape)}"
+                )
+
+
 def device_room() -> float:
     """Bytes of the default device that photographs may take."""
     stats = jax.local_devices()[0].memory_stats()

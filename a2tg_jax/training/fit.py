@@ -5,8 +5,9 @@ import dataclasses
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.model import Model
 from a2tg_jax.origin import BLACK, WHITE, Color, Origin
+from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
-from a2tg_jax.training.loop import OnCheckpoint, StageRun
+from a2tg_jax.training.loop import OnCheckpoint, StageRun, check_resume
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
@@ -85,6 +86,8 @@ def fit(
       ValueError: if the options contradict each other or the checkpoint, or the loss stops being finite.
     """
     system.check()
+    if resume is not None:
+        check_resume(resume, system, resume.stage)
     first = 0 if resume is None else resume.stage
     results: list[StageResult] = []
     for index in range(first, len(system.stages())):
@@ -122,6 +125,11 @@ def fit_stage(
       title: of the progress bar; None: the stage's name.
     """
     system.check()
+    if not 0 <= index < len(system.stages()):
+        raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
+    if checkpoint_every is not None and checkpoint_every < 1:
+        raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
+    check_views(scene.train)
     if start is None and resume is None:
         start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume)

@@ -66,7 +66,7 @@ class StageRun:
         self.clock = self.stage.clock()
         self.history, self.earlier_seconds = History.empty(), 0.0
         if resume is not None:
-            _check_resume(resume, system, index)
+            check_resume(resume, system, index)
             self.state: TrainState = jax.tree.map(jnp.array, resume.state)
             self.history, self.earlier_seconds = resume.history, resume.history.last_seconds
         elif start is not None:
@@ -237,7 +237,8 @@ def _shared_capacity(size: tuple[int, int], needed: int) -> int:
     return capacity
 
 
-def _check_resume(resume: Checkpoint, system: System, index: int) -> None:
+def check_resume(resume: Checkpoint, system: System, index: int) -> None:
+    """Raises ValueError unless the checkpoint is of that stage of that system."""
     if resume.stage != index:
         raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
     if resume.system != system:

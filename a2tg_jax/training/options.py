@@ -1,8 +1,12 @@
 """Options that every system has: views, initial Gaussians, loss, learning rates, the seed."""
 
 import dataclasses
+import math
+import typing
 from typing import Any, ClassVar, Literal, Self
 
+from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.stage import LearningRates, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
@@ -92,19 +96,43 @@ class System:
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
-        if self.batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1; got {self.batch_size}")
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree must lie in 0..3; got {self.sh_degree}")
-        if not 0 < self.initial_opacity < 1:
-            raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
-        if self.initial_gaussians is not None and self.initial_gaussians < 2:
-            raise ValueError(f"initial_gaussians must be at least 2; got {self.initial_gaussians}")
+        self._check_numbers()
         stages = self.stages()
         if not stages:
             raise ValueError(f"{type(self).__name__} has no stages")
+        names = [stage.name for stage in stages]
+        if len(set(names)) < len(names):
+            raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in stages:
             stage.check()
+
+    def _check_numbers(self) -> None:
+        """Refuses numbers out of the range of the options that every system has, and whatever is not finite."""
+        numbers = flatten_config(self)
+        for name, value in numbers.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"{name} must be a finite number; got {value}")
+            if name.startswith(("rates.", "loss.")) and value < 0:
+                raise ValueError(f"{name} must be at least 0; got {value}")
+        for name, (least, most) in RANGES.items():
+            if numbers[name] is not None and not least <= numbers[name] <= most:
+                wanted = f"be at least {least}" if most == math.inf else f"lie in {least}..{most}"
+                raise ValueError(f"{name} must {wanted}; got {numbers[name]}")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
+        if self.rates.means_final_factor == 0:
+            raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
+
+
+RANGES = {
+    "batch_size": (1, math.inf),
+    "initial_gaussians": (2, math.inf),
+    "sh_degree": (0, 3),
+    "seed": (0, 2**31 - 1),
+    "tile_size": (1, MAX_TILE_SIZE),
+    "loss.ssim_weight": (0, 1),
+}
+"""Smallest and largest value of options that every system has, both included."""
 
 
 def like(kind: type[System] | System, other: System) -> System:
@@ -118,11 +146,12 @@ def like(kind: type[System] | System, other: System) -> System:
 
 
 def _like(value: Any, other: Any) -> Any:
-    names = {field.name for field in dataclasses.fields(other)}
+    hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
     changes = {}
     for field in dataclasses.fields(value):
-        if field.name not in names:
-            continue
-        own, others = getattr(value, field.name), getattr(other, field.name)
-        changes[field.name] = _like(own, others) if dataclasses.is_dataclass(own) else others
+        own, others = getattr(value, field.name), getattr(other, field.name, None)
+        if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
+            changes[field.name] = _like(own, others)
+        elif hints[field.name] == other_hints.get(field.name):
+            changes[field.name] = others
     return dataclasses.replace(value, **changes)

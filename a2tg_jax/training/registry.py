@@ -33,13 +33,25 @@ def find_system(reference: str) -> System:
         )
     try:
         found = getattr(importlib.import_module(path), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"the system {reference!r} cannot be imported: {error}") from error
+    except Exception as error:  # A module of one's own may fail in any way.
+        raise ValueError(f"the system {reference!r} cannot be imported: {_told(error)}") from error
     if isinstance(found, type) and issubclass(found, System):
-        return found()
+        return _with_defaults(found, reference)
     if not isinstance(found, System):
         raise ValueError(f"{reference!r} is no system: it must be a subclass or an instance of a2tg_jax.System")
     return found
+
+
+def _told(error: Exception) -> str:
+    """An error in a few words; those about a name that is missing say all."""
+    return str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
+
+
+def _with_defaults(kind: type[System], reference: str) -> System:
+    try:
+        return kind()
+    except TypeError as error:
+        raise ValueError(f"every option of the system {reference!r} must have a default: {error}") from error
 
 
 def reference_of(system: System) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -91,8 +92,14 @@ class Stage:
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
-        if self.iterations < 1:
-            raise ValueError(f"a stage must have at least 1 iteration; {self.name!r} has {self.iterations}")
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", self.name):
+            raise ValueError(
+                f"a stage's name must be letters, digits, - and _, for files are called so; got {self.name!r}"
+            )
+        if not 1 <= self.iterations < 2**31:
+            raise ValueError(
+                f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
+            )
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must want one statistic; those of {self.name!r} want {kinds}")

@@ -19,7 +19,7 @@ KEY_OF_PARAMETERS = 0x7E8E1
 def initial_model(scene: Scene, system: System) -> Model:
     """Gaussians at the scene's points, as many as the first stage has room for."""
     num = system.initial_gaussians or len(scene.points)
-    caps = [cap for event in system.stages()[0].events if (cap := getattr(event, "cap", None)) is not None]
+    caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     num = min(num, *caps) if caps else num
     return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity))
 
@@ -52,11 +52,12 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
     num = room - gaussians.num
     if num == 0:
         return gaussians
+    dtype = gaussians.means.dtype
     empty = Gaussians(
-        means=jnp.zeros((num, 3)),
-        quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]]), (num, 1)),
-        log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE),
-        logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE),
-        sh=jnp.zeros((num, 16, 3)),
+        means=jnp.zeros((num, 3), dtype),
+        quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),
+        log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE, dtype),
+        logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE, dtype),
+        sh=jnp.zeros((num, 16, 3), dtype),
     )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)

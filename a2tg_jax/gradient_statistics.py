@@ -1,0 +1,41 @@
+"""The average gradient of each Gaussian over the views that saw it, by which events choose where detail is added.
+
+A²TG averages ‖Σ_pixels |∂L/∂mean|‖ to choose what gets texels; adaptive density control averages the norm of the
+gradient of the projected mean to choose what is cloned or split.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.checks import check_floats, check_shape
+from a2tg_jax.numerics import safe_divide
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class GradientStatistics:
+    """Sums for the average, over views, of the norm of a gradient of each Gaussian."""
+
+    total: Array
+    """[N] sum of the norms since the last event."""
+    views: Array
+    """[N] int32, views so far in which the Gaussian was composited at one pixel at least."""
+
+    @staticmethod
+    def init(num: int, dtype=jnp.float32) -> "GradientStatistics":
+        """Empty sums for `num` Gaussians."""
+        return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
+
+    def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
+        """Adds one view: `norms` [N] counts where `is_visible` [N]."""
+        check_floats("norms", norms, self.total.shape)
+        check_shape("is_visible", is_visible, self.total.shape)
+        total = self.total + jnp.where(is_visible, norms, 0.0)
+        return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
+
+    def average(self) -> Array:
+        """[N] average norm over the views that saw the Gaussian; 0 where none did."""
+        return safe_divide(self.total, self.views.astype(self.total.dtype))

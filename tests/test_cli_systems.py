@@ -1,0 +1,100 @@
+"""The command line on a system of one's own, which lies as one file in the folder where the commands are given."""
+
+import json
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from a2tg_jax import cli
+from a2tg_jax.results import train_run as train_run_module
+from a2tg_jax.results.folder import RunFolder
+
+TOY = Path(__file__).with_name("toy_system.py")
+MINE = ["--system", "my_toy:Toy"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a system in my_toy.py, and a run that was interrupted at its first checkpoint and resumed."""
+    folder = tmp_path_factory.mktemp("mine")
+    shutil.copy(TOY, folder / "my_toy.py")
+    save = train_run_module.save_checkpoint
+
+    def save_and_interrupt(path, checkpoint):
+        save(path, checkpoint)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", list(sys.path))
+        patch.setattr(cli, "configure_cpu", lambda: None)
+        with pytest.MonkeyPatch.context() as interrupting:
+            interrupting.setattr(train_run_module, "save_checkpoint", save_and_interrupt)
+            sizes = ["--downscale", "6", "--initial-gaussians", "60", "--iterations", "10", "--contrast-weight", "0.2"]
+            codes = [cli.main(["train", "synthetic", *MINE, "--out", "run", *sizes])]
+        left = [path.name for path in RunFolder(Path("run")).checkpoints("Toy-rings")]
+        codes.append(cli.main(["train", "--out", "run", "--resume"]))
+        yield folder, codes, left
+    sys.modules.pop("my_toy", None)
+
+
+@pytest.fixture
+def inside(folder, monkeypatch):
+    """The run, seen from the folder with the system."""
+    monkeypatch.chdir(folder[0])
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    return RunFolder(Path("run"))
+
+
+def test_interrupted_and_resumed(folder, inside):
+    _, codes, left = folder
+    assert codes == [130, 0]
+    assert left == ["Toy-rings-000001.npz"]
+    record = tomllib.loads(inside.record.read_text())
+    assert (record["system"], record["options"]["contrast_weight"]) == ("my_toy:Toy", 0.2)
+    measured = json.loads(inside.metrics.read_text())["models"]["Toy-rings"]
+    assert measured["num_bytes"] == 4 * (58 + 4) * measured["num_gaussians"]
+    assert inside.report.is_file()
+
+
+def test_eval_measures_the_same_again(inside, capsys):
+    before = json.loads(inside.metrics.read_text())["models"]["Toy-rings"]["test"]
+    assert cli.main(["eval", "run"]) == 0
+    assert "Toy-rings" in capsys.readouterr().out
+    assert json.loads(inside.metrics.read_text())["models"]["Toy-rings"]["test"] == before
+
+
+def test_render_draws_frames(inside, tmp_path):
+    assert cli.main(["render", "run", "--frames", "2", "--out", str(tmp_path)]) == 0
+    frames = sorted(tmp_path.glob("*.png"))
+    assert [path.name for path in frames] == ["frame_0000.png", "frame_0001.png"]
+    assert all(np.asarray(Image.open(path)).std() > 1 for path in frames)
+
+
+def test_info_tells_system_and_model(inside, capsys):
+    assert cli.main(["info", "run"]) == 0
+    text = capsys.readouterr().out
+    assert "my_toy:Toy" in text and "Toy-rings" in text and "60 Gaussians" in text
+
+
+def test_help_lists_its_options(inside, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", *MINE, "--help"])
+    text = capsys.readouterr().out
+    assert "--contrast-weight" in text and "--rings-rate" in text and "--texture.cap" not in text
+
+
+def test_numbers_edited_between_two_attempts_are_refused(inside, tmp_path, capsys):
+    """A model, or a checkpoint, made with other numbers is not passed off as one of the record's."""
+    copy = RunFolder(shutil.copytree(inside.path, tmp_path / "copy"))
+    copy.record.write_text(copy.record.read_text().replace("contrast_weight = 0.2", "contrast_weight = 0.3"))
+    assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2
+    assert "Toy-rings.npz was made with another contrast_weight than run.toml says" in capsys.readouterr().err
+    copy.model("Toy-rings").unlink()
+    assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2
+    assert "Toy-rings-000010.npz was made with another contrast_weight than" in capsys.readouterr().err
