@@ -154,7 +154,9 @@ class StageRun:
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
         step = jitted_step()
         num_compiled = step._cache_size()
-        self.state, info = step(how, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key)
+        self.state, info = step(
+            settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
+        )
         if step._cache_size() > num_compiled:
             return_free_memory()
         return info
