@@ -53,7 +53,7 @@ class Lookup(NamedTuple):
     """What was read of a splat's texture, and where."""
 
     region: TextureRegion
-    """The texture."""
+    """Where the texture lies."""
     sample: Sample
     """What it shows."""
     corners: tuple[Corner, ...] = ()

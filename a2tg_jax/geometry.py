@@ -50,7 +50,7 @@ class Outline(NamedTuple):
     """Centre of the circle: the projected mean."""
     mean_y: Array
     radius: Array
-    """Of the circle."""
+    """Radius of the circle, in pixels."""
     is_clipped: Array
     """The disc reaches behind the near plane: this is no outline, only the box holds."""
 

@@ -20,7 +20,7 @@ class ViewGradients(NamedTuple):
     """What `view_gradients` returns, of N Gaussians."""
 
     value: Array
-    """The loss."""
+    """The loss, a scalar."""
     gaussians: Gaussians
     """Its gradient in the Gaussians."""
     params: Any

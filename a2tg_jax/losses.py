@@ -32,16 +32,16 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
       ssim_weight: w in [0, 1].
 
     Raises:
-      ValueError: if the shapes differ, or as `ssim` does.
+      ValueError: if the shapes differ, or as `mean_ssim` does.
     """
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
     if isinstance(ssim_weight, (int, float)) and ssim_weight == 0:
         return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(image, target))
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - mean_ssim(image, target))
 
 
-def ssim(image: Array, target: Array) -> Array:
+def mean_ssim(image: Array, target: Array) -> Array:
     """Structural similarity, averaged over the windows that lie wholly inside the image (Wang et al., 2004).
 
     The window is a Gaussian of σ 1.5 and 11 taps; the data range is 1. It equals scikit-image's

@@ -41,7 +41,7 @@ def psnr(image: Array, target: Array) -> Array:
 
 
 def ssim(image: Array, target: Array) -> Array:
-    """Structural similarity in [-1, 1] (see `losses.ssim`) of the images clipped to [0, 1].
+    """Structural similarity in [-1, 1] (see `losses.mean_ssim`) of the images clipped to [0, 1].
 
     Args:
       image: [H, W, 3], sides of at least 11 pixels.
@@ -50,7 +50,7 @@ def ssim(image: Array, target: Array) -> Array:
     Raises:
       ValueError: if the shapes differ or a side is shorter than 11 pixels.
     """
-    return losses.ssim(*_clip_pair(image, target))
+    return losses.mean_ssim(*_clip_pair(image, target))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from a2tg_jax.geometry import homographies, screen_bounds
 from a2tg_jax.kernels import native
 from a2tg_jax.kernels.choice import choose, instead_of_native
 from a2tg_jax.pixel import Statistic
-from a2tg_jax.sh import sh_colors
-from a2tg_jax.splats import CompositingSettings, Splats
+from a2tg_jax.splats import CompositingSettings, Compositor, project_gaussians
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
 
@@ -170,23 +169,14 @@ def render_traced(
       probe: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
       statistic: which (`pixel.positional_gradient`); not used without a probe.
     """
-    grid = TileGrid(camera.width, camera.height, settings.tile_size)
     compositor = choose(settings.compositor, settings.tile_size)
-    compositing = CompositingSettings(
-        grid=grid,
-        near_plane=settings.near_plane,
-        has_geometry=has_geometry,
-        statistic=None if probe is None else statistic,
-        compositor=compositor,
-        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
+    compositing = _compositing_settings(
+        camera, settings, compositor, has_geometry, None if probe is None else statistic
     )
     if gaussians.num == 0:
-        dtype = background.dtype
-        channels = jnp.zeros((compositing.num_channels, grid.height, grid.width), dtype)
-        transmittance = jnp.ones((grid.height, grid.width), dtype)
-        return _output(compositing, channels, transmittance, background, jnp.asarray(False)), jnp.zeros((), jnp.float32)
+        return _empty_view(compositing, background), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
-    splats, cutoff = project_gaussians(gaussians, camera, rule, settings, degree, num_live)
+    splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
     if compositor == "native" and (reason := native.refusal(compositing, rule, splats)):
         settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
         return render_traced(
@@ -195,13 +185,35 @@ def render_traced(
         )  # fmt: skip
     list_tiles = native.tile_lists if compositor == "native" else tile_lists
     M = jax.lax.stop_gradient(splats.M)
-    lists = list_tiles(M, cutoff, settings.near_plane, grid, settings.capacity or 0)
+    lists = list_tiles(M, cutoff, settings.near_plane, compositing.grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     probe = jnp.zeros((gaussians.num, 4), splats.M.dtype) if probe is None else probe
     channels, transmittance = composite(compositing, splats, rule, cutoff, lists, jacobian, probe)
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
     channels, transmittance = channels + taint, transmittance + taint
     return _output(compositing, channels, transmittance, background, lists.overflow), lists.num_pairs
+
+
+def _compositing_settings(
+    camera: Camera, settings: RenderSettings, compositor: Compositor, has_geometry: bool, statistic: Statistic | None
+) -> CompositingSettings:
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    return CompositingSettings(
+        grid=grid,
+        near_plane=settings.near_plane,
+        has_geometry=has_geometry,
+        statistic=statistic,
+        compositor=compositor,
+        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
+    )
+
+
+def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOutput:
+    """What a view without Gaussians shows."""
+    grid = compositing.grid
+    channels = jnp.zeros((compositing.num_channels, grid.height, grid.width), background.dtype)
+    transmittance = jnp.ones((grid.height, grid.width), background.dtype)
+    return _output(compositing, channels, transmittance, background, jnp.asarray(False))
 
 
 def _output(compositing: CompositingSettings, channels, transmittance, background, overflow) -> RenderOutput:
@@ -335,36 +347,3 @@ def _tile_batch(settings: RenderSettings) -> int:
     if settings.tile_batch is None:
         return 1 if jax.default_backend() == "cpu" else BATCH_ON_ACCELERATOR
     return settings.tile_batch
-
-
-def project_gaussians(gaussians, camera, rule, settings, sh_degree, num_live) -> tuple[Splats, Array]:
-    """The N splats, and [N] the squared distance within which each shows: not positive where it shows nowhere, NaN
-    where it would show, but a number of it is not finite."""
-    M, normals = homographies(gaussians, camera)
-    opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
-    if opacities.shape != (gaussians.num,) or numbers.shape[:-1] != (gaussians.num,):
-        raise ValueError(
-            f"a rule gives opacities [N] and numbers [N, K] of N = {gaussians.num} gaussians; {type(rule).__name__} "
-            f"gave {opacities.shape} and {numbers.shape}"
-        )
-    if not 0 < rule.max_alpha < 1:
-        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
-    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
-    # Not >=: a depth that is no number is not behind the camera.
-    is_drawn = ~(M[:, 2, 2] < settings.near_plane)
-    if num_live is not None:
-        is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
-    cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
-    is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
-    cutoff = jnp.where(is_broken, jnp.nan, cutoff)
-    is_shown = (cutoff > 0)[:, None]
-    # Rows that show nowhere may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
-    M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
-    colors, normals, numbers = (jnp.where(is_shown, x, 0.0) for x in (colors, normals, numbers))
-    return Splats(M, colors, opacities, normals, numbers), cutoff
-
-
-def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:
-    """[N] whether all numbers of a splat are."""
-    columns = [*(M[:, i, k] for i in range(3) for k in range(3)), *colors.T, *numbers.T]
-    return functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))

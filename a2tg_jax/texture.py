@@ -1,4 +1,6 @@
-"""Textures of mixed resolutions: padded buckets, the layout beside them, and the lookup at (u, v).
+"""Textures of mixed resolutions as they are stored and trained: padded buckets, and the layout beside them.
+
+What a texture makes visible, and where (u, v) lies in it, is in `appearance.textured`; interpolation in `bilinear`.
 
 N Gaussians; texture i is [Tv, Tu, 4] = signed RGB residual and alpha factor; u indexes columns (Tu), v rows (Tv).
 Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past the used ones are padding.

@@ -9,8 +9,8 @@ import a2tg_jax
 from a2tg_jax.compositor import composite
 from a2tg_jax.kernels import native
 from a2tg_jax.optim import adam_init, adam_update
-from a2tg_jax.render import appearance_of, project_gaussians
-from a2tg_jax.splats import CompositingSettings
+from a2tg_jax.render import appearance_of
+from a2tg_jax.splats import CompositingSettings, project_gaussians
 from a2tg_jax.tiles import TileGrid
 from benchmarks import timing
 from benchmarks.workload import random_scene, random_textures
@@ -26,7 +26,7 @@ def measure_stages(case: dict) -> dict:
     settings = a2tg_jax.plan_render(gaussians, camera, textures, layout)
     capacity = settings.capacity or 0
     rule, grid = appearance_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
-    project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, rule, settings, 3, None))
+    project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, rule, settings.near_plane, 3))
     splats, cutoff = project(gaussians)
     find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)

@@ -35,8 +35,8 @@ def folder(tmp_path_factory):
         patch.setattr(cli, "configure_cpu", lambda: None)
         with pytest.MonkeyPatch.context() as interrupting:
             interrupting.setattr(train_run_module, "save_checkpoint", save_and_interrupt)
-            sizes = ["--downscale", "6", "--initial-gaussians", "60", "--iterations", "10", "--contrast-weight", "0.2"]
-            codes = [cli.main(["train", "synthetic", *MINE, "--out", "run", *sizes])]
+            sizes = ["--downscale", "6", "--initial-gaussians", "60", "--stage1-iterations", "10"]
+            codes = [cli.main(["train", "synthetic", *MINE, "--out", "run", *sizes, "--contrast-weight", "0.2"])]
         left = [path.name for path in RunFolder(Path("run")).checkpoints("Toy-rings")]
         codes.append(cli.main(["train", "--out", "run", "--resume"]))
         yield folder, codes, left

@@ -61,13 +61,13 @@ def test_norms_are_those_that_events_average(event):
     loss = lambda model, output: jnp.sum(output.color**2)  # noqa: E731
     found = view_gradients(loss, model, camera, settings=settings, statistic=event.statistic)
 
-    def of_tap(tap):
+    def of_probe(probe):
         output, _ = render_traced(
-            model.gaussians, camera, model.rule, jnp.zeros(3), settings, probe=tap, statistic=event.statistic
+            model.gaussians, camera, model.rule, jnp.zeros(3), settings, probe=probe, statistic=event.statistic
         )
         return loss(model, output)
 
-    gradients = jax.grad(of_tap)(jnp.zeros((50, 4)))
+    gradients = jax.grad(of_probe)(jnp.zeros((50, 4)))
     seen = Seen(camera, gradients[None, :, :3], gradients[None, :, 3] > 0)
     average = event.observe(event.init(model), model, seen).average()
     assert average.max() > 0

@@ -16,9 +16,9 @@ from a2tg_jax.losses import (
     depth_normals,
     mean_opacity,
     mean_scale,
+    mean_ssim,
     normal_consistency,
     photometric_loss,
-    ssim,
 )
 
 
@@ -38,7 +38,7 @@ def reference_ssim(image, target):
 
 @pytest.mark.parametrize("shape", [(11, 11), (11, 30), (37, 24)])
 def test_ssim_equals_scikit_image(x64, shape):
-    jitted = jax.jit(ssim)
+    jitted = jax.jit(mean_ssim)
     for noise in (0.0, 0.02, 0.5):
         image, target = random_pair(*shape, noise)
         np.testing.assert_allclose(jitted(image, target), reference_ssim(image, target), atol=1e-12)
@@ -46,7 +46,7 @@ def test_ssim_equals_scikit_image(x64, shape):
 
 def test_ssim_in_float32():
     image, target = random_pair(60, 50, 0.1, np.float32)
-    value = jax.jit(ssim)(image, target)
+    value = jax.jit(mean_ssim)(image, target)
     assert value.dtype == jnp.float32
     np.testing.assert_allclose(value, reference_ssim(image.astype(np.float64), target.astype(np.float64)), atol=2e-5)
 
@@ -74,8 +74,8 @@ def test_gradient_equals_central_differences_at_every_pixel(x64, weight):
 def test_ssim_of_a_batch_under_vmap_and_jit():
     pairs = [random_pair(14, 31, 0.1, np.float32, seed) for seed in range(3)]
     images, targets = (jnp.stack([jnp.asarray(x) for x in side]) for side in zip(*pairs, strict=True))
-    batched = jax.jit(jax.vmap(jax.value_and_grad(ssim)))(images, targets)
-    single = jax.jit(jax.value_and_grad(ssim))
+    batched = jax.jit(jax.vmap(jax.value_and_grad(mean_ssim)))(images, targets)
+    single = jax.jit(jax.value_and_grad(mean_ssim))
     for index in range(3):
         value, gradient = single(images[index], targets[index])
         np.testing.assert_allclose(batched[0][index], value, rtol=1e-5)
@@ -90,7 +90,7 @@ def test_flat_images_have_a_finite_gradient():
 def test_bad_images_are_named():
     image = jnp.zeros((12, 12, 3))
     with pytest.raises(ValueError, match="at least 11 by 11"):
-        ssim(image[:10], image[:10])
+        mean_ssim(image[:10], image[:10])
     with pytest.raises(ValueError, match="must both be"):
         photometric_loss(image, image[:11])
     with pytest.raises(ValueError, match="must be floats"):
@@ -168,9 +168,9 @@ def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x
     monkeypatch.setattr(kernel, "LEAST_PIXELS", 500)
     monkeypatch.setattr(threads, "num_threads", lambda: 2)
     image, target = map(jnp.asarray, random_pair(*shape, 0.1, dtype))
-    value, gradients = jax.value_and_grad(ssim, argnums=(0, 1))(image, target)
+    value, gradients = jax.value_and_grad(mean_ssim, argnums=(0, 1))(image, target)
     monkeypatch.setattr(losses, "has_native", lambda: False)
-    exact, wanted = jax.value_and_grad(ssim, argnums=(0, 1))(image.astype(np.float64), target.astype(np.float64))
+    exact, wanted = jax.value_and_grad(mean_ssim, argnums=(0, 1))(image.astype(np.float64), target.astype(np.float64))
     np.testing.assert_allclose(value, exact, rtol=rtol / 100)
     for a, b in zip(gradients, wanted, strict=True):
         assert a.dtype == dtype
@@ -188,4 +188,4 @@ def test_another_score_of_the_same_name_is_another():
 
 def test_ssim_in_half_precision():
     image, target = random_pair(20, 40, 0.1, np.float16)
-    assert jax.jit(ssim)(image, target).dtype == jnp.float16
+    assert jax.jit(mean_ssim)(image, target).dtype == jnp.float16

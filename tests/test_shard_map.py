@@ -35,11 +35,11 @@ for check_vma in (True, False):
     gradient = jax.jit(jax.grad(loss), static_argnums=2)(gaussians, viewmats, check_vma)
     np.testing.assert_allclose(gradient.means, wanted.means, rtol=1e-3, atol=1e-4)
 
-from a2tg_jax.losses import ssim
+from a2tg_jax.losses import mean_ssim
 
 photo = jnp.linspace(0, 1, 32 * 32 * 3).reshape(32, 32, 3)
 photos = jnp.stack([photo**2, photo**3])
-means = lambda photo, photos: jax.vmap(ssim, in_axes=(None, 0))(photo, photos)
+means = lambda photo, photos: jax.vmap(mean_ssim, in_axes=(None, 0))(photo, photos)
 both = jax.shard_map(means, mesh=mesh, in_specs=(P(), P("views")), out_specs=P("views"))
 wanted, found = (jax.grad(lambda x, f=f: jnp.sum(f(x, photos)))(photo) for f in (means, both))
 np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)

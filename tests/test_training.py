@@ -1,6 +1,7 @@
 """Training end to end on a tiny scene: traces, resumption, reproduction, overflow, budgets, refusals."""
 
 import dataclasses
+import resource
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.texture import Shape
-from a2tg_jax.training import LearningRates, Stage, fit_stage, like
+from a2tg_jax.training import LearningRates, LossConfig, Stage, fit_stage, like, loop
+from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
@@ -186,6 +188,93 @@ def test_memory_budget_holds(scene, trained):
 def test_impossible_configurations_are_refused(scene, trained, change, message):
     with pytest.raises(ValueError, match=message):
         fit_stage(scene, dataclasses.replace(CONFIG, **change), 1, trained[0].stages[0].model, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": -1}, "seed must lie in 0..2147483647; got -1"),
+        ({"tile_size": 0}, "tile_size must lie in 1..64; got 0"),
+        ({"rates": LearningRates(means=float("nan"))}, "rates.means must be a finite number; got nan"),
+        ({"rates": LearningRates(quats=-1.0)}, "rates.quats must be at least 0; got -1.0"),
+        ({"rates": LearningRates(means_final_factor=0.0)}, "means_final_factor must be larger than 0"),
+        ({"loss": LossConfig(ssim_weight=2.0)}, "loss.ssim_weight must lie in 0..1; got 2.0"),
+        ({"texture": TextureConfig(fraction=2.0)}, "texture.fraction must lie in 0..1; got 2.0"),
+        ({"stage1_iterations": 2**31}, r"fewer than 2\^31; 'gaussians' has 2147483648"),
+    ],
+)
+def test_numbers_out_of_range_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONFIG, **changes).check()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"train": lambda views: ()}, "at least one view"),
+        ({"train": lambda views: (dataclasses.replace(views[0], image=views[0].image / 255),)}, r"uint8 .*got float64"),
+        (
+            {"train": lambda views: (dataclasses.replace(views[0], image=views[0].image[1:]),)},
+            r"uint8 \[29, 40, 3\]",
+        ),
+        ({"points": lambda points: points * np.nan}, "must be finite"),
+        ({"colors": lambda colors: colors * np.nan}, "must be finite"),
+    ],
+)
+def test_damaged_scenes_are_refused(scene, change, message):
+    changed = {name: function(getattr(scene, name)) for name, function in change.items()}
+    with pytest.raises(ValueError, match=message):
+        fit(dataclasses.replace(scene, **changed), CONFIG, progress=False)
+
+
+def test_wrong_arguments_of_fit_are_refused(scene, trained):
+    checkpoint = trained[1][-1]
+    with pytest.raises(ValueError, match="another configuration"):
+        fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint, progress=False)
+    with pytest.raises(ValueError, match="checkpoint_every must be at least 1; got 0"):
+        fit(scene, CONFIG, checkpoint_every=0, progress=False)
+    with pytest.raises(ValueError, match="index must be that of one of the 2 stages"):
+        fit_stage(scene, CONFIG, 2, progress=False)
+
+
+def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch):
+    """More views a batch than there are of a size, and a cap below the Gaussians asked for."""
+    larger = synthetic_scene(num_views=8, width=48, height=30, num_points=150).train
+    mixed = dataclasses.replace(scene, train=(scene.train[0], larger[1], scene.train[2]))
+    config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=McmcConfig(cap=40))
+    resident = fit(mixed, config, progress=False)
+    assert resident.model.num == 40
+    monkeypatch.setattr(loop, "PhotoStore", lambda views: PhotoStore(views, room=0))
+    assert_same(fit(mixed, config, progress=False), resident)
+
+
+def test_float64_is_not_forced_on_a_model(scene, trained):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        model = fit(scene, dataclasses.replace(CONFIG, stage1_iterations=3, stage2_iterations=4), progress=False).model
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves((model.gaussians, model.params))} == {"float32"}
+
+
+def test_a_cap_of_texels_is_no_cap_of_gaussians(scene):
+    """Any event may stand in a first stage, whatever its fields are called."""
+    stages = CONFIG.stages()
+    kind = dataclasses.make_dataclass("FromTheStart", [], bases=(A2tg,), frozen=True)
+    kind.stages = lambda self: (dataclasses.replace(stages[1], name="textures"),)
+    assert initial_model(scene, kind(initial_gaussians=100)).num == 100
+
+
+def test_a_full_disk_leaves_the_older_checkpoint(trained, tmp_path):
+    """The size that the operating system lets a file have is used up in the middle of writing."""
+    path, (older, newer) = tmp_path / "checkpoint.npz", trained[1][:2]
+    save_checkpoint(path, older)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(OSError):
+            save_checkpoint(path, newer)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint.npz"]
+    assert load_checkpoint(path).iteration == older.iteration
 
 
 def test_batches_of_several_views(scene, trained):

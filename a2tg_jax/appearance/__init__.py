@@ -1,4 +1,7 @@
-"""What a splat shows: `AppearanceRule` is what the renderer is given, `Appearance` the value that makes one."""
+"""What a splat shows: `AppearanceRule` is what the renderer is given, `Appearance` the value that makes one.
+
+`rule` and `base` are these two interfaces; `plain`, `textured`, `movable_kernels` and `billboards` implement both.
+"""
 
 from a2tg_jax.appearance.base import Appearance as Appearance
 from a2tg_jax.appearance.billboards import BillboardRule as BillboardRule

@@ -1,4 +1,7 @@
-"""What appearances have in common whose parameters are `Textures`: moving rows, and arrays for files."""
+"""What appearances have in common whose parameters are `Textures`: moving rows, and arrays for files.
+
+`Textured` and `Billboards` derive from it; the buckets themselves are `texture`'s.
+"""
 
 import dataclasses
 

@@ -2,7 +2,8 @@
 
 x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 rot_0..3, little-endian float32: opacities as logits,
 scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all of red,
-then green, then blue. Textures have no place in this format.
+then green, then blue. What splats show besides has no place in this format: textures, movable kernels and billboards,
+and with them the colours and opacities that they carry, are lost; `save_model` keeps all.
 
 Programs made for 3DGS want a third scale, scale_2, of the axis along the normal.
 """

@@ -177,13 +177,7 @@ class _ScoreRows(_Rows):
         padded = b.add(self.down, LONG(2 * self.margin))
         with self.loop_over_rows() as (index, _):
             channel, y = b.sdiv(index, self.down), b.srem(index, self.down)
-            first = b.add(b.mul(channel, self.height), y)
-            with self.vectors(self.width) as (start, _):
-                xs, ys = (self.along(self.row(name, first, self.width), start, self.width) for name in "xy")
-                squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
-                products = list(map(self.product, xs, ys))
-                for mean, numbers in zip(means, (xs, ys, squares, products), strict=True):
-                    self.store(self.weighed(numbers, self.score.taps), self.at(mean, start, self.real), 0)
+            self.store_columns(means, b.add(b.mul(channel, self.height), y))
             b.store(zero, total)
             with self.vectors(self.across) as (start, num_done):
                 windows = [self.weighed(self.along(mean, start, LONG(1)), self.score.taps) for mean in means]
@@ -197,6 +191,15 @@ class _ScoreRows(_Rows):
                     self.store(slope, self.at(self.row("d_means", row, self.across), start, self.real), 0)
             self.store(self.lanes.sum(b.load(total, typ=self.reals)), self.arguments["sums"], index)
         b.ret_void()
+
+    def store_columns(self, means: Sequence[ir.Value], first: ir.Value) -> None:
+        """Of every column, the weighed sums of x, y, x² + y² and x·y over the rows of a window, from row `first` on."""
+        with self.vectors(self.width) as (start, _):
+            xs, ys = (self.along(self.row(name, first, self.width), start, self.width) for name in "xy")
+            squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
+            products = list(map(self.product, xs, ys))
+            for mean, numbers in zip(means, (xs, ys, squares, products), strict=True):
+                self.store(self.weighed(numbers, self.score.taps), self.at(mean, start, self.real), 0)
 
 
 class _PullBackRows(_Rows):

@@ -53,14 +53,17 @@ class KernelSpec:
 
 
 class Functions:
-    """The jaxprs of one spec, all of scalars."""
+    """The jaxprs of one spec, all of scalars.
+
+    `prepare` and `prepare_vjp` are run once per splat and tile; `reach`, `forward` and `backward` at every pixel.
+    """
 
     def __init__(self, spec: KernelSpec):
-        rule = spec.rule.rule
+        self._spec, self._rule = spec, spec.rule.rule
         number: Any = jax.ShapeDtypeStruct((), spec.dtype)
         integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
         flag = jax.ShapeDtypeStruct((), jnp.bool_)
-        triple, near_plane = (number,) * 3, spec.near_plane
+        triple = (number,) * 3
         normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
         splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
         values = (number,) * spec.num_columns
@@ -68,36 +71,38 @@ class Functions:
         lookup = Lookup(region, Sample(values, values, values)) if region else None
 
         self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
-        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
         self.num_planes = structure.num_leaves
+        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
+        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, number, number, planes)
+        self.reach, _ = trace(self._reach, planes, region, number, number)
+        at_pixel, channels = (number, number, number, flag), (number,) * spec.num_channels
+        self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
+        of_backward = number, channels, (number, number), (triple,) * 3
+        self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
 
-        def prepare_vjp(M, x, y, d_planes):
-            return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+    def _reach(self, planes, region, x, y):
+        """Squared distance ρ of the pixel, and where the splat's texture is looked up."""
+        hit = pixel.intersect(planes, x, y, self._spec.near_plane, self._rule.has_low_pass)
+        return hit.rho, () if region is None else self._rule.texel_position(region, hit.u, hit.v)
 
-        self.prepare_vjp, _ = trace(prepare_vjp, splat.M, number, number, planes)
+    def _forward(self, planes, splat, values, x, y, transmittance, is_live, channels):
+        """Transmittance and liveness behind the splat, and the channels with it."""
+        at_pixel = planes, splat, values, x, y, transmittance, is_live
+        added, transmittance, is_live = pixel.blend(self._rule, self._spec.near_plane, *at_pixel)
+        return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
 
-        def reach(planes, region, x, y):
-            hit = pixel.intersect(planes, x, y, near_plane, rule.has_low_pass)
-            return hit.rho, () if region is None else rule.texel_position(region, hit.u, hit.v)
+    def _backward(self, planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g, center, jacobian):
+        """The state behind the splat, whether it contributes, and the cotangents: of texture values, and all others."""
+        spec, rule = self._spec, self._rule
+        at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
+        state, weight, d = pixel.blend_vjp(rule, spec.near_plane, *at_pixel, spec.statistic is not None)
+        added = ()
+        if spec.statistic:
+            moved = splat.M, x, y, *center, d.rho, jacobian
+            added = pixel.positional_gradient(spec.statistic, *moved, spec.near_plane, rule.has_low_pass)
+        return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
-        self.reach, _ = trace(reach, planes, region, number, number)
 
-        def forward(planes, splat, values, x, y, transmittance, is_live, channels):
-            at_pixel = planes, splat, values, x, y, transmittance, is_live
-            added, transmittance, is_live = pixel.blend(rule, near_plane, *at_pixel)
-            return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
-
-        def backward(planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g, center, jacobian):
-            at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
-            state, weight, d = pixel.blend_vjp(rule, near_plane, *at_pixel, spec.statistic is not None)
-            added = ()
-            if spec.statistic:
-                moved = splat.M, x, y, *center, d.rho, jacobian
-                added = pixel.positional_gradient(spec.statistic, *moved, near_plane, rule.has_low_pass)
-            return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
-
-        at_pixel = number, number, number, flag
-        channels = (number,) * spec.num_channels
-        self.forward, _ = trace(forward, planes, splat, values, *at_pixel, channels)
-        last = number, channels, (number, number), (triple,) * 3
-        self.backward, _ = trace(backward, planes, splat, lookup, *at_pixel, *last)
+def _planes_vjp(M, x, y, d_planes):
+    """The cotangent of M, given that of its planes."""
+    return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]

@@ -43,7 +43,7 @@ def is_float(type_: ir.Type) -> bool:
 
 
 def num_bits(type_: ir.Type) -> int:
-    """Of one lane."""
+    """Width of one lane's type."""
     scalar = scalar_of(type_)
     return {ir.FloatType: 32, ir.DoubleType: 64}.get(type(scalar)) or scalar.width
 

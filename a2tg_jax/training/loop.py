@@ -151,10 +151,12 @@ class StageRun:
     def _launch(self, iteration: int) -> StepInfo:
         indices = self.order.indices(iteration)
         photographs, views = self.photographs.batch(indices)
-        how = StepSettings(self._settings(self._size(iteration)), self.system.background)
+        settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
         step = jitted_step()
         num_compiled = step._cache_size()
-        self.state, info = step(how, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key)
+        self.state, info = step(
+            settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
+        )
         if step._cache_size() > num_compiled:
             return_free_memory()
         return info

@@ -84,13 +84,13 @@ def jitted_step():
 
 
 def train_step(
-    how: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
+    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
     scene_scale: Array, key: Array,
 ) -> tuple[TrainState, StepInfo]:  # fmt: skip
     """One iteration.
 
     Args:
-      how: static.
+      settings: static.
       stage: its numbers are traced.
       clock: `stage.clock()`.
       state: donated.
@@ -103,8 +103,8 @@ def train_step(
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
     batch = jax.tree.map(lambda x: x[views], photographs)
-    backgrounds = _backgrounds(keys[0], how.background, views.shape[0])
-    found = _gradients(how, stage, clock, state, batch, backgrounds, iteration)
+    backgrounds = _backgrounds(keys[0], settings.background, views.shape[0])
+    found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads)
 
     progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
@@ -137,10 +137,10 @@ class _ViewGradients(NamedTuple):
     """[V, N, 4]."""
 
 
-def _gradients(how: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration):
+def _gradients(settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration):
     """Loss and gradients of every view, one after the other."""
     height, width = batch.images.shape[1:3]
-    model, highest = state.model, how.render.sh_degree
+    model, highest = state.model, settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
     probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if is_gathering else None
@@ -153,7 +153,7 @@ def _gradients(how: StepSettings, stage: Stage, clock: Clock, state: TrainState,
         def loss(gaussians, params, probe):
             shown = dataclasses.replace(model, gaussians=gaussians, params=params)
             output, num_pairs = render_traced(
-                gaussians, target.camera, shown.rule, background, how.render,
+                gaussians, target.camera, shown.rule, background, settings.render,
                 has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, probe=probe,
                 statistic=stage.statistic,
             )  # fmt: skip
