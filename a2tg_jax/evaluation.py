@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Plain, Textured
 from a2tg_jax.cameras import Camera
 from a2tg_jax.data import View, view_image
 from a2tg_jax.gaussians import Gaussians
@@ -122,7 +122,7 @@ def _model_of(gaussians: Gaussians | Model, textures, layout, settings: RenderSe
         return gaussians
     appearance_of(gaussians, textures, layout, settings)
     if textures is None:
-        return Model(gaussians)
+        return Model(gaussians, appearance=Plain(settings.texture.max_alpha))
     return Model(gaussians, textures, layout, appearance=Textured(options=settings.texture))
 
 

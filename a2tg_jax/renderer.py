@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.appearance import AppearanceRule, Plain
 from a2tg_jax.cameras import Camera, check_camera, resize_camera
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.model import Model
@@ -68,7 +68,7 @@ class Renderer:
         """
         if isinstance(model, Model) and rule is not None:
             raise ValueError("rule: a model says itself what its splats show; give Gaussians with a rule")
-        model = model if isinstance(model, Model) else Model(model)
+        model = model if isinstance(model, Model) else Model(model, appearance=Plain(settings.texture.max_alpha))
         background = model.background if background is None else background
         check_background(background)
         check_gaussians(model.gaussians)

@@ -7,8 +7,20 @@ import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
-from a2tg_jax import Model, Origin, PlainRule, Renderer, Textured, plan_render, render_image, textures_from_arrays
+from a2tg_jax import (
+    Model,
+    Origin,
+    PlainRule,
+    Renderer,
+    RenderSettings,
+    Textured,
+    evaluate,
+    plan_render,
+    render_image,
+    textures_from_arrays,
+)
 from a2tg_jax.cameras import Camera, resize_camera
+from a2tg_jax.data import View
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.renderer import _jitted_draw
 
@@ -88,6 +100,21 @@ def test_what_a_renderer_refuses():
         Renderer(cloud(), background=(0, 0, 0, 1))
     with pytest.raises(ValueError, match=r"camera\.K must be \[3, 3\]; got \[4, 4\]"):
         Renderer(cloud())(dataclasses.replace(flight(1)[0], K=jnp.eye(4)))
+
+
+def test_gaussians_alone_are_as_opaque_as_the_settings_let_them_be():
+    """As `render_image` has it: 0.999 in the authors' conventions, else 0.99."""
+    camera, settings = flight(9)[1], RenderSettings.official()
+    gaussians = dataclasses.replace(cloud(), logit_opacities=jnp.full(300, 9.0))
+    expected = render_image(gaussians, camera, settings=settings)
+    assert 1 - expected.alpha.max() < 2e-3
+    np.testing.assert_array_equal(Renderer(gaussians, settings=settings)(camera).alpha, expected.alpha)
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    found = evaluate([View("view", camera, image)], gaussians, settings=settings, num_renders=1)
+    wanted = np.rint(255 * np.clip(np.asarray(expected.color), 0, 1))
+    assert np.abs(found.renders[0].astype(int) - wanted).max() <= 1
+    opaque = render_image(gaussians, camera).color
+    assert np.abs(np.rint(255 * np.clip(np.asarray(opaque), 0, 1)) - wanted).max() > 1
 
 
 def test_plan_with_a_rule_and_head_room():
