@@ -132,7 +132,7 @@ def test_overwrite_deletes_only_what_runs_write(tmp_path):
         path.parent.mkdir(exist_ok=True)
         path.touch()
     with open(run.marker, "a", encoding="utf-8") as file:
-        file.write("../outside.txt\n")
+        file.write("../outside.txt\n\nmodels\n")
     create_run(run.path, overwrite=True)
     left = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert sorted(left) == sorted([*foreign, run.marker])

@@ -193,7 +193,8 @@ def _clear(run: RunFolder) -> None:
     for name in run.written():
         path = run.path / name
         is_inside = path.resolve().is_relative_to(run.path.resolve())
-        if is_inside and path != run.marker:
+        # A line that a crash has cut off may name a folder.
+        if is_inside and path != run.marker and not path.is_dir():
             path.unlink(missing_ok=True)
             if path.parent != run.path and path.parent.is_dir() and not any(path.parent.iterdir()):
                 path.parent.rmdir()
