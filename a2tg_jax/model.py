@@ -12,7 +12,7 @@ from a2tg_jax.appearance.base import BYTES_PER_FLOAT
 from a2tg_jax.cameras import Camera
 from a2tg_jax.checks import short_repr
 from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
 from a2tg_jax.origin import BLACK, Origin
 from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
 from a2tg_jax.transform import transform_gaussians
@@ -70,7 +70,7 @@ class Model:
     def num_padding_bytes(self) -> int:
         """Bytes that exist in the buffers only (host)."""
         allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.params))
-        return int(allocated) + BYTES_PER_FLOAT * 58 * self.num - self.num_bytes
+        return int(allocated) + BYTES_PER_FLOAT * FLOATS_PER_GAUSSIAN * self.num - self.num_bytes
 
     @property
     def background(self) -> tuple[float, float, float]:

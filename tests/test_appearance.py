@@ -73,6 +73,14 @@ def test_rows_move_and_are_cleared(name):
         )
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("name", APPEARANCES)
+def test_parameters_are_of_the_gaussians_dtype(name):
+    gaussians = as_gaussians(draw_scene(2, num=4), "float64")
+    params, _ = APPEARANCES[name].allocate(KEY, gaussians)
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} <= {gaussians.means.dtype}
+
+
 def test_floats_of_a_splat():
     floats = {name: appearance.num_floats(allocated(appearance)[2], 10) for name, appearance in APPEARANCES.items()}
     assert floats == {"plain": 580, "textured": 820, "movable kernels": 850, "billboards": 1570}

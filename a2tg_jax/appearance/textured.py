@@ -153,7 +153,7 @@ class Textured(Bucketed):
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Textures, AtlasLayout]:
         sizes = np.broadcast_to(np.asarray(self.start, np.int64), (gaussians.num, 2))
-        return allocate_textures(sizes, rgb=self.options.initial_rgb)
+        return allocate_textures(sizes, rgb=self.options.initial_rgb, dtype=gaussians.means.dtype)
 
     def rule(self, params: Textures, layout: AtlasLayout) -> AppearanceRule:
         return textured_rule(params, layout, self.options)
@@ -162,8 +162,7 @@ class Textured(Bucketed):
         return project_texels(params, self.options)
 
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
-        texels = int(np.prod(layout.sizes[:num], axis=1).sum())
-        return FLOATS_PER_GAUSSIAN * num + 4 * texels
+        return FLOATS_PER_GAUSSIAN * num + 4 * layout.count_texels(num)
 
 
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:
