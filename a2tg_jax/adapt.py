@@ -82,7 +82,8 @@ class Upscale(HostEvent):
             fractions = tuple(interval * (index + 1) for index in range(rounds))
         if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
             raise ValueError(f"texture.upscale_at must be ascending fractions between 0 and 1; got {fractions}")
-        return tuple(max(1, round(fraction * num_iterations)) for fraction in fractions)
+        # In a short stage two of them may fall together: there textures grow once.
+        return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
     def init(self, model: Model) -> GradientStatistics:
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)

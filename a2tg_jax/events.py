@@ -88,7 +88,10 @@ class Event:
         return None
 
     def init(self, model: Model) -> Any:
-        """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered."""
+        """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered.
+
+        It does not follow rows that another event moves: what gathers per row wants a stage in which none does.
+        """
         return ()
 
     def observe(self, state: Any, model: Model, seen: Seen) -> Any:

@@ -206,6 +206,11 @@ def test_padding_is_neutral_and_has_no_moments():
         np.testing.assert_array_equal(moment, 0)
 
 
+def test_upscalings_that_fall_together_are_one():
+    assert Upscale(at=(0.1, 0.2, 0.9)).iterations(3) == (1, 3)
+    assert Upscale(at=(0.1, 0.2, 0.9)).iterations(100) == (10, 20, 90)
+
+
 @pytest.mark.parametrize("select, number", [("fraction", 0.5), ("budget", (2 * 248 + 48) / 1e6)])
 def test_rows_that_do_not_exist_take_no_share(select, number):
     """Two Gaussians in ten rows: half of two grow, and a budget is theirs alone."""

@@ -9,7 +9,7 @@ import pytest
 
 from a2tg_jax.cameras import Camera
 from a2tg_jax.densify import CloneSplitPrune, Edit, OpacityReset, apply_edit, reset_interval
-from a2tg_jax.events import Now, Seen
+from a2tg_jax.events import Change, EventInfo, Now, Seen
 from a2tg_jax.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.model import Model
 from a2tg_jax.optim import adam_init
@@ -132,9 +132,19 @@ def test_average_is_of_the_views_that_saw_the_gaussian_in_half_images():
         np.testing.assert_allclose(state.average()[row], np.mean(seen) if seen else 0, rtol=1e-5)
 
 
-def test_opacity_reset_and_what_adam_forgets():
+@pytest.mark.parametrize("is_traced", [False, True])
+def test_opacity_reset_and_what_adam_forgets(is_traced):
+    """In the step, where leaves that stay as they are must be told by identity, it is a branch of a condition."""
     model = random_model(2)
-    change = OpacityReset(0.05).apply(now(3_000, num_keys=0), model, ones(model), ())
+
+    def apply(model, moments):
+        return OpacityReset(0.05).apply(now(3_000, num_keys=0), model, moments, ())
+
+    def happen(model, moments):
+        unchanged = Change(model, moments, (), EventInfo())
+        return jax.lax.cond(jnp.any(model.gaussians.means > 0), apply, lambda *_: unchanged, model, moments)
+
+    change = (jax.jit(happen) if is_traced else apply)(model, ones(model))
     expected = np.minimum(np.asarray(model.gaussians.opacities), 0.05)
     np.testing.assert_allclose(change.model.gaussians.opacities, expected, rtol=1e-5)
     gaussians, _ = change.moments.mu
