@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import A2tg, adapt, fit, load_checkpoint, save_checkpoint, synthetic_scene
+from a2tg_jax import A2tg, Change, Checkpoint, StepEvent, adapt, event, fit, load_checkpoint, save_checkpoint, synthetic_scene
 from a2tg_jax.appearance import Textured
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.a2tg import TextureConfig
@@ -100,6 +100,33 @@ def test_shapes_of_earlier_runs_change_nothing(scene, trained, tmp_path, monkeyp
     assert_same(fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, progress=False), trained[0])
     assert rooms == [capacities]
     assert_same(fit(scene, CONFIG, resume=load_checkpoint(path), progress=False), trained[0])
+
+
+@event
+class Places(StepEvent):
+    """Gathers a number of every row, made of Gaussians and layout."""
+
+    def init(self, model):
+        return jnp.stack([model.layout.row, jnp.arange(model.gaussians.num, dtype=jnp.int32)])
+
+    def apply(self, now, model, moments, state):
+        return Change(model, moments, state)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WithPlaces(A2tg):
+    def stages(self):
+        first, second = super().stages()
+        return first, dataclasses.replace(second, events=(Places(), *second.events))
+
+
+def test_events_of_ones_own_find_all_rows_when_read_again(scene, trained, tmp_path):
+    system = like(WithPlaces, CONFIG)
+    run = StageRun(scene, system, 1, trained[0].stages[0].model)
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(system, 1, run.state, run.history))
+    again = load_checkpoint(tmp_path / "checkpoint.npz", WithPlaces)
+    assert again.system == system
+    jax.tree.map(np.testing.assert_array_equal, again.state, run.state)
 
 
 def test_rows_that_do_not_exist_are_not_trained(scene, trained):

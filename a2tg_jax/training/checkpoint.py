@@ -110,10 +110,9 @@ def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None)
         stage = options.stages()[header["stage"]]
         shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
         params, layout = stage.appearance.from_arrays(shown)
-        template = _template(stage, params, layout, header["is_ahead"])
-        names = _named_arrays(template, only_names=True)
-        leaves = [arrays[name] for name in names]
-        gaussians, ((moments, *rest), history) = jax.tree.unflatten(jax.tree.structure(template), leaves)
+        (gaussians,) = _filled((Gaussians(*range(5)),), arrays)  # type: ignore[arg-type]
+        template = _template(stage, gaussians, params, layout, header["is_ahead"])
+        gaussians, ((moments, *rest), history) = _filled(template, arrays)
     except (KeyError, IndexError) as error:
         raise ValueError(f"{path}: the checkpoint lacks {error}; it is damaged or of another version") from error
     gaussians, moments, (num_live, *rest) = jax.tree.map(jnp.asarray, (gaussians, moments, rest))
@@ -146,10 +145,15 @@ def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:
     return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
 
 
-def _template(stage: Stage, params, layout, is_ahead: list[bool]):
+def _filled(template, arrays: dict[str, np.ndarray]):
+    """A tree of the template's structure, each leaf being the array of its name."""
+    leaves = [arrays[name] for name in _named_arrays(template, only_names=True)]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+def _template(stage: Stage, gaussians: Gaussians, params, layout, is_ahead: list[bool]):
     """A tree of the structure that was saved; its values mean nothing."""
-    row = lambda *shape: jnp.zeros((1, *shape))  # noqa: E731
-    gaussians = Gaussians(row(3), row(4), row(2), row(), row(16, 3))
+    gaussians = jax.tree.map(jnp.asarray, gaussians)
     model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
     state = jax.eval_shape(lambda: initial_state(stage, model))
     events = tuple(event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
