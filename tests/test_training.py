@@ -8,7 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import A2tg, Change, Checkpoint, StepEvent, adapt, event, fit, load_checkpoint, save_checkpoint, synthetic_scene
+from a2tg_jax import (
+    A2tg,
+    Change,
+    Checkpoint,
+    StepEvent,
+    adapt,
+    event,
+    fit,
+    load_checkpoint,
+    save_checkpoint,
+    synthetic_scene,
+)
 from a2tg_jax.appearance import Textured
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.a2tg import TextureConfig
