@@ -11,7 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_values import assert_same, some_gaussians, some_world
 
+from a2tg_jax.appearance import Billboards, MovableKernels
 from a2tg_jax.cameras import Camera
+from a2tg_jax.gaussians import init_from_points
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.model import save_model
@@ -302,3 +304,13 @@ def test_bad_config_names_the_field(spoil, message):
 def test_flat_names_are_those_of_the_command_line():
     leaves = flatten_config(Options(Cake(7)))
     assert leaves["cake.layers"] == 7 and leaves["seed"] == 0
+
+
+@pytest.mark.parametrize("appearance", [MovableKernels(), Billboards(4)], ids=["kernels", "billboards"])
+def test_ply_of_splats_with_opacities_of_their_own(tmp_path, appearance):
+    gaussians = init_from_points(np.eye(3), np.eye(3), opacity=0.2)
+    params, layout = appearance.allocate(jax.random.key(0), gaussians)
+    faint = dataclasses.replace(gaussians, logit_opacities=gaussians.logit_opacities - 3)
+    save_ply(tmp_path / "a.ply", Model(faint, params, layout, appearance=appearance))
+    opacities = appearance.opacities(faint, params, layout)
+    np.testing.assert_allclose(load_ply(tmp_path / "a.ply").opacities, opacities, rtol=1e-4)

@@ -8,6 +8,7 @@ and with them the colours and opacities that they carry, are lost; `save_model` 
 Programs made for 3DGS want a third scale, scale_2, of the axis along the normal.
 """
 
+import dataclasses
 import os
 import warnings
 from pathlib import Path
@@ -16,10 +17,12 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians, check_gaussians, rotation_matrices
+from a2tg_jax.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.model import Model
+from a2tg_jax.sharing import LARGEST_OPACITY
 from a2tg_jax.transform import transform_gaussians
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -30,6 +33,7 @@ REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
 THIRD_SCALE = "scale_2"
 THICKNESS = 1e-3
 """Third scale of a flat Gaussian in a file, as a share of its shorter one."""
+LEAST_OPACITY = 1e-6
 AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
 """Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
 NUMPY_TYPES = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")
@@ -49,7 +53,9 @@ def save_ply(
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
-      gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show.
+      gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show;
+        they are as opaque as `Appearance.opacities` takes them to be (movable kernels and billboards have opacities of
+        their own).
       transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
         model back to the original world of its origin, where it has one.
@@ -60,7 +66,7 @@ def save_ply(
     """
     if isinstance(gaussians, Model):
         model = gaussians.live
-        gaussians = model.gaussians
+        gaussians = _as_plain(model)
         transform = model.origin.transform if transform is None and model.origin is not None else transform
     check_gaussians(gaussians)
     if transform is not None:
@@ -85,6 +91,15 @@ def save_ply(
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
         file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+
+
+def _as_plain(model: Model) -> Gaussians:
+    """The Gaussians of a model, opaque by themselves."""
+    if type(model.appearance).opacities is Appearance.opacities:
+        return model.gaussians
+    opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+    opacities = jnp.clip(opacities, LEAST_OPACITY, LARGEST_OPACITY)
+    return dataclasses.replace(model.gaussians, logit_opacities=logit(opacities))
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
