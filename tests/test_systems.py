@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import sys
 
 import jax
@@ -13,7 +14,9 @@ from toy_system import Toy
 import a2tg_jax as a2tg
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore
+from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict, with_changes
+from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 
 TINY = {"stage1_iterations": 24, "initial_gaussians": 60, "densify": {"cap": 80}}
@@ -87,6 +90,23 @@ def test_every_system_trains_resumes_saves_and_renders(scene, tmp_path, name):
     view = scene.test[0]
     np.testing.assert_array_equal(loaded.render(view.camera).color, result.model.render(view.camera).color)
     assert result.history.megabytes[-1] == pytest.approx(result.model.num_bytes / 1e6)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("name", ["a2tg", "gaussians-2d", "supergaussians", "bbsplat"])
+def test_training_goes_on_in_the_dtype_of_its_model(scene, tmp_path, name):
+    """Also from a checkpoint; nothing falls back to float32, or to float64 where the model is float32."""
+    system = tiny(name)
+    first = initial_model(scene, system)
+    for dtype in (jnp.float64, jnp.float32):
+        index = len(system.stages()) - 1
+        run = StageRun(scene, system, index, jax.tree.map(lambda x: x.astype(dtype), first))  # noqa: B023
+        assert len(run.steps(1, 1)) == 1
+        floats = [leaf.dtype for leaf in jax.tree.leaves(run.state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        assert set(floats) == {jnp.dtype(dtype)}
+        a2tg.save_checkpoint(tmp_path / "checkpoint.npz", a2tg.Checkpoint(system, index, run.state, run.history))
+        again = a2tg.load_checkpoint(tmp_path / "checkpoint.npz").state
+        jax.tree.map(functools.partial(np.testing.assert_array_equal, strict=True), again, run.state)
 
 
 def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):

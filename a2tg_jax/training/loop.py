@@ -74,7 +74,7 @@ class StageRun:
             self.state = initial_state(self.stage, padded(jax.tree.map(jnp.array, start.live), self.stage, system))
         else:
             raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
-        self.scene_scale = jnp.asarray(scene.scale, jnp.float32)
+        self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1)
         self.photographs = PhotoStore(self.views)
@@ -217,9 +217,10 @@ class StageRun:
         settings = RenderSettings(tile_size=self.system.tile_size, sh_degree=self.system.sh_degree)
         if size not in self.capacities:
             views = [view for view in self.views if view.image.shape[:2] == size]
-            live = self.model
+            live, dtype = self.model, self.scene_scale.dtype
             sample = views[:: -(-len(views) // PLANNED_VIEWS)]
-            pairs = max(pairs_of_view(live.gaussians, view.camera, live.rule, settings) for view in sample)
+            cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
+            pairs = max(pairs_of_view(live.gaussians, camera, live.rule, settings) for camera in cameras)
             growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
             self.capacities[size] = _shared_capacity(size, capacity_for(int(pairs * GROWTH_ROOM * growth)))
         return dataclasses.replace(settings, capacity=self.capacities[size])

@@ -102,8 +102,10 @@ def train_step(
     iteration = state.iteration + 1
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
+    dtype = state.model.gaussians.means.dtype
     batch = jax.tree.map(lambda x: x[views], photographs)
-    backgrounds = _backgrounds(keys[0], settings.background, views.shape[0])
+    batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
+    backgrounds = _backgrounds(keys[0], settings.background, views.shape[0], dtype)
     found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads)
 
@@ -177,10 +179,10 @@ def _over(image: Array, alpha: Array | None, background: Array) -> Array:
     return weight * color + (1 - weight) * background[None, None, :]
 
 
-def _backgrounds(key: Array, kind: Background, num: int) -> Array:
+def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
     if kind == "random":
-        return jax.random.uniform(key, (num, 3))
-    return jnp.full((num, 3), 1.0 if kind == "white" else 0.0)
+        return jax.random.uniform(key, (num, 3), dtype)
+    return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
 
 
 def _seen(batch: Photographs, found: _ViewGradients) -> Seen | None:
