@@ -17,6 +17,14 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
+@pytest.fixture(autouse=True, scope="module")
+def fresh_caches():
+    """Compiled programs go with the module that needed them: a process may only have so many pieces of memory, and XLA
+    waits for ever where it gets none (vm.max_map_count)."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def x64():
     """Runs the test with 64-bit floats."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from a2tg_jax.appearance.base import BYTES_PER_FLOAT
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import HostEvent, StepEvent
-from a2tg_jax.memory import return_free_memory
+from a2tg_jax.memory import keep_room_for_programs, return_free_memory
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -159,6 +159,7 @@ class StageRun:
         )
         if step._cache_size() > num_compiled:
             return_free_memory()
+            keep_room_for_programs()
         return info
 
     def _size(self, iteration: int) -> tuple[int, int]:
