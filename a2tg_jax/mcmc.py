@@ -278,12 +278,12 @@ class Mcmc(StepEvent):
         return self.cap
 
     def num_rows(self, num: int, num_iterations: int) -> int:
-        """Growth from `num` by the end of the stage, rounded up so that few shapes occur; at most the cap."""
+        """The cap, or, where growth from `num` does not reach half of it, what it reaches, rounded up to few shapes."""
         times = self.times(num_iterations)
         for iteration in range(times.every, times.last + 1, times.every):
             if num < self.cap and iteration >= times.first:
                 num = min(self.cap, max(num + 1, num + num // 20))
-        return max(num, min(self.cap, bucket_capacity(num)))
+        return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))

@@ -7,7 +7,7 @@ it idle (`step.TrainState.status`), so they are launched again once its cause is
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 import jax
 import jax.numpy as jnp
@@ -172,7 +172,7 @@ class StageRun:
         if info.status == OVERFLOW:
             self.num_regrown += 1
             size = self._size(iteration)
-            self.capacities[size] = _shared_capacity(size, capacity_for(int(float(info.num_pairs) * GROWTH_ROOM)))
+            self.capacities[size] = self._shared_capacity(size, capacity_for(int(float(info.num_pairs) * GROWTH_ROOM)))
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status == NOT_FINITE:
@@ -223,22 +223,23 @@ class StageRun:
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
             pairs = max(pairs_of_view(live.gaussians, camera, live.rule, settings) for camera in cameras)
             growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
-            self.capacities[size] = _shared_capacity(size, capacity_for(int(pairs * GROWTH_ROOM * growth)))
+            self.capacities[size] = self._shared_capacity(size, capacity_for(int(pairs * GROWTH_ROOM * growth)))
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
+    def _shared_capacity(self, size: tuple[int, int], needed: int) -> int:
+        """The largest capacity that is compiled already and at most twice what is needed; else a new one."""
+        stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
+        known = _compiled_capacities.setdefault((*stage, *size), set())
+        power = 2 ** (needed.bit_length() - 1)
+        rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
+        # The largest: lists that overflowed in an earlier run will do so again.
+        capacity = max((room for room in known if needed <= room <= 2 * needed), default=rounded)
+        known.add(capacity)
+        return capacity
 
-_compiled_capacities: dict[tuple[int, int], set[int]] = {}
-"""Capacities that steps of this process have been compiled for, by image size; no result depends on them."""
 
-
-def _shared_capacity(size: tuple[int, int], needed: int) -> int:
-    """The least capacity that suffices and is compiled already, where it is not twice as large; else a new one."""
-    known = _compiled_capacities.setdefault(size, set())
-    power = 2 ** (needed.bit_length() - 1)
-    rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
-    capacity = min((room for room in known if needed <= room <= 2 * needed), default=rounded)
-    known.add(capacity)
-    return capacity
+_compiled_capacities: dict[Hashable, set[int]] = {}
+"""Capacities that steps of this process have been compiled for, by stage and image size; no result depends on them."""
 
 
 def check_resume(resume: Checkpoint, system: System, index: int) -> None:
