@@ -15,6 +15,9 @@ import os, signal, sys, threading, time
 import jax, jax.numpy as jnp
 from a2tg_jax.kernels import ffi, threads
 
+# A program that a shell runs in the background ignores Ctrl-C, and so do those that it starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 def part(first, last, index):
     {part}
 

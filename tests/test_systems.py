@@ -12,6 +12,7 @@ import pytest
 from toy_system import Toy
 
 import a2tg_jax as a2tg
+from a2tg_jax import adapt
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
@@ -181,7 +182,11 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name, thresholds", [("gaussians-2d", "densify"), ("a2tg", "texture")])
 @pytest.mark.parametrize("sweep", [*SWEEPS, "thresholds"])
-def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds):
+def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds, monkeypatch):
+    """In a process that has compiled nothing yet."""
+    monkeypatch.setattr(loop, "_compiled_capacities", {})
+    monkeypatch.setattr(adapt, "_compiled_shapes", set())
+    jitted_step().clear_cache()
     if sweep == "thresholds":
         numbers = (2e-4, 3e-4, 4e-4) if thresholds == "densify" else (1e-6, 2e-6, 4e-6)
         select = {"select": "threshold"} if thresholds == "texture" else {}
