@@ -18,7 +18,7 @@ from jax import Array
 from a2tg_jax import losses
 from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
 from a2tg_jax.numerics import safe_norm
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.texture import AtlasLayout
 
 BYTES_PER_FLOAT = 4
 BYTES_PER_TEXEL = 16
@@ -107,12 +107,6 @@ def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> 
     """
     texels = 0 if layout is None else layout.num_texels
     return BYTES_PER_FLOAT * FLOATS_PER_GAUSSIAN * gaussians.num + BYTES_PER_TEXEL * texels
-
-
-def padding_bytes(textures: Textures, layout: AtlasLayout) -> int:
-    """Bytes of texels that exist only in the buffers: the rows of each bucket that no Gaussian uses."""
-    allocated = sum(bucket.shape[0] * bucket.shape[1] * bucket.shape[2] for bucket in textures.buckets)
-    return BYTES_PER_TEXEL * (allocated - layout.num_texels)
 
 
 def _clip_pair(image: Array, target: Array) -> tuple[Array, Array]:

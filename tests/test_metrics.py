@@ -7,8 +7,10 @@ import pytest
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from a2tg_jax.appearance import Textured
 from a2tg_jax.gaussians import init_from_points
-from a2tg_jax.metrics import load_lpips, lpips, padding_bytes, parameter_bytes, psnr, ssim
+from a2tg_jax.metrics import load_lpips, lpips, parameter_bytes, psnr, ssim
+from a2tg_jax.model import Model
 from a2tg_jax.texture import allocate_textures
 
 
@@ -126,4 +128,5 @@ def test_bytes_are_counted_without_padding():
     assert parameter_bytes(gaussians) == 23_200
     assert parameter_bytes(gaussians, layout) == 23_200 + 16 * (67 + 33 * 8)
     allocated = sum(bucket.nbytes for bucket in textures.buckets)
-    assert padding_bytes(textures, layout) == allocated - 16 * (67 + 33 * 8)
+    model = Model(gaussians, textures, layout, appearance=Textured())
+    assert model.num_padding_bytes == allocated - 16 * (67 + 33 * 8)
