@@ -17,6 +17,7 @@ from jax import Array
 from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
 from a2tg_jax.cameras import Camera, check_camera
 from a2tg_jax.checks import check_shape
+from a2tg_jax.classes import jit
 from a2tg_jax.compositor import composite
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.geometry import homographies, screen_bounds
@@ -142,7 +143,7 @@ def check_background(background: Any) -> None:
 
 @functools.cache
 def _jitted_render():
-    return jax.jit(render_traced, static_argnums=(4,))
+    return jit(render_traced, static_argnums=(4,))
 
 
 def render_traced(
@@ -298,7 +299,7 @@ def pairs_of_view(
 
 @functools.cache
 def _jitted_count():
-    return jax.jit(_count_pairs, static_argnums=(3, 4))
+    return jit(_count_pairs, static_argnums=(3, 4))
 
 
 def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):

@@ -2,14 +2,14 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from a2tg_jax.appearance import AppearanceRule, Plain
 from a2tg_jax.cameras import Camera, check_camera, resize_camera
+from a2tg_jax.classes import jit
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.render import (
@@ -114,7 +114,7 @@ class Renderer:
 
 
 @functools.cache
-def _jitted_draw() -> Callable[..., Any]:
+def _jitted_draw() -> jit:
     """Draws on the device; its cache counts the compilations."""
 
     def draw(gaussians, num_live, camera, rule, background, settings, has_geometry):
@@ -122,4 +122,4 @@ def _jitted_draw() -> Callable[..., Any]:
             gaussians, camera, rule, background, settings, has_geometry=has_geometry, num_live=num_live
         )
 
-    return jax.jit(draw, static_argnames=("settings", "has_geometry"))
+    return jit(draw, static_argnums=(5, 6))

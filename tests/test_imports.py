@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"cores", "memory"},
+    {"classes", "cores", "memory"},
     {"numerics", "startup", "bilinear", "checks"},
     {"gaussians", "cameras", "sh"},
     {"geometry", "sharing", "gradient_statistics"},

@@ -40,7 +40,7 @@ def flight(num: int, size: tuple[int, int] = (48, 32)) -> list[Camera]:
 
 
 def num_compiled() -> int:
-    return _jitted_draw()._cache_size()
+    return _jitted_draw().num_compiled()
 
 
 def test_a_flight_of_200_views_compiles_three_times_at_most():

@@ -195,13 +195,13 @@ def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds, monkeyp
         variants = SWEEPS[sweep]
     counts = []
     for changes in variants:
-        before, rooms = jitted_step()._cache_size(), copy.deepcopy(loop._compiled_capacities)
+        before, rooms = jitted_step().num_compiled(), copy.deepcopy(loop._compiled_capacities)
         merged = dict(changes)
         if name == "a2tg":
             merged["texture"] = {"upscale_at": [0.5], **changes.get("texture", {})}
         result = a2tg.fit(scene, tiny(name, **merged), progress=False)
         # Lists that grow in the middle of a run are compiled anew; a run tells how often that was.
-        count = max(0, jitted_step()._cache_size() - before - result.num_regrown)
+        count = max(0, jitted_step().num_compiled() - before - result.num_regrown)
         counts.append((count, loop._compiled_capacities == rooms))
     # So are lists that must be longer from the start, as where a seed puts more splats on the screen.
     again = [count for count, had_room in counts[1:] if had_room]

@@ -57,9 +57,9 @@ def trained(scene):
         # The loop donates the state's buffers to the next step.
         checkpoints.append(dataclasses.replace(checkpoint, state=jax.tree.map(np.array, checkpoint.state)))
 
-    before = jitted_step()._cache_size()
+    before = jitted_step().num_compiled()
     result = fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, progress=False)
-    return result, checkpoints, jitted_step()._cache_size() - before
+    return result, checkpoints, jitted_step().num_compiled() - before
 
 
 def assert_same(a, b):

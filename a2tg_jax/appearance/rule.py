@@ -21,6 +21,7 @@ from jax import Array
 
 from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.cameras import Camera
+from a2tg_jax.classes import classes_of
 from a2tg_jax.gaussians import Gaussians
 
 Residual = tuple[Array, Array, Array] | None
@@ -98,19 +99,19 @@ class StaticRule:
 
     structure: Any
     """Its tree structure, with the static fields."""
-    rule_class: type
-    """Its class, which equality of tree structures disregards."""
+    classes: tuple[type, ...]
+    """Its class, and of all within, which equality of tree structures disregards (`classes`)."""
 
     @staticmethod
     def of(rule: AppearanceRule) -> "StaticRule":
-        return StaticRule(jax.tree.structure(rule), type(rule))
+        return StaticRule(jax.tree.structure(rule), classes_of(rule))
 
     @property
     def rule(self) -> Any:
         """The rule as its element-wise functions see it: an array field refuses to be used."""
         numbered = jax.tree.unflatten(self.structure, range(self.structure.num_leaves))
         paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
-        name = self.rule_class.__name__
+        name = self.classes[0].__name__
         return jax.tree.unflatten(self.structure, [_LeftOut(name + jax.tree_util.keystr(path)) for path, _ in paths])
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
+from a2tg_jax.classes import classes_of
 from a2tg_jax.training import Stage, System
 
 STAGE_OPTIONS = ("loss", "rates")
@@ -112,8 +113,19 @@ def _common_options(system: System) -> list:
 
 
 def _is_equal(a: Stage, b: Stage) -> bool:
-    """Whether two stages are equal in everything, arrays included."""
+    """Whether two stages are equal in everything, arrays and classes included."""
     (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
-    if structure != other:  # type: ignore[operator]
+    if structure != other or classes_of(a) != classes_of(b):  # type: ignore[operator]
         return False
     return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))
+
+
+def fingerprint(system: System, index: int) -> str:
+    """A text that two systems share where they make the same of a stage's start, in this process or another.
+
+    It tells classes apart by module and name, and is another one for another version's options.
+    """
+    leaves, structure = jax.tree.flatten(system.stages()[index])
+    classes = [f"{kind.__module__}.{kind.__qualname__}" for kind in classes_of(system.stages()[index])]
+    numbers = [np.asarray(leaf).tolist() for leaf in leaves]
+    return repr((_common_options(system), classes, str(structure), numbers))

@@ -153,11 +153,11 @@ class StageRun:
         photographs, views = self.photographs.batch(indices)
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
         step = jitted_step()
-        num_compiled = step._cache_size()
+        num_compiled = step.num_compiled()
         self.state, info = step(
             settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
         )
-        if step._cache_size() > num_compiled:
+        if step.num_compiled() > num_compiled:
             return_free_memory()
             keep_room_for_programs()
         return info

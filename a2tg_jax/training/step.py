@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.cameras import Camera
+from a2tg_jax.classes import jit
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.model import Model
@@ -80,7 +81,7 @@ def initial_state(stage: Stage, model: Model) -> TrainState:
 @functools.cache
 def jitted_step():
     """`train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
-    return jax.jit(train_step, static_argnums=0, donate_argnums=3)
+    return jit(train_step, static_argnums=(0,), donate_argnums=(3,))
 
 
 def train_step(

@@ -1,0 +1,124 @@
+"""The command line of every experiment: what to run, where, and what is written in the end."""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from a2tg_jax.results.folder import read_json, write_json
+from lab.grid import Grid, read_grid
+from lab.jobs import Folders, Job, Record
+from lab.queue import Failure, LocalPool, Pool, SubmititPool, run_all
+
+EXPERIMENTS = Path(__file__).resolve().parents[1]
+MEMORY_SHARE = 0.8
+"""Of the machine's, unless --memory-gb says otherwise."""
+
+
+class Lab:
+    """Folders, pool and records of one call."""
+
+    def __init__(self, args: argparse.Namespace):
+        self.args = args
+        self.scale: str = args.scale
+        self.out: Path = args.out or EXPERIMENTS / "results" / args.scale
+        self.work: Path = args.work or Path("runs") / "experiments" / args.scale
+        self.folders = Folders(args.scenes, self.work, args.lpips_weights)
+        self._file = self.out / "records.json"
+        self.records: dict[str, Record] = self._all_records()
+
+    def grid(self, name: str) -> Grid:
+        """An experiment, with the scenes that are wanted."""
+        return read_grid(name, self.scale, scenes=self.args.only, held_out=not self.args.without_held_out)
+
+    def run(self, grids: Sequence[Grid]) -> list[Failure]:
+        """Runs what is not finished of the grids, unless only tables are wanted."""
+        if self.args.tables_only:
+            return []
+        jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
+        return run_all(jobs, self.folders, self._pool(), self.records, self._keep)
+
+    def _keep(self, job: Job, record: Record) -> None:
+        kept = {**self._kept(), job.key: record}
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_json(self._file, dict(sorted(kept.items())))
+        print(
+            f"{len(kept):4d}  {job.key}: {record['num']} splats, {record['mb']:.2f} MB, {record['psnr']:.2f} dB; "
+            f"{record['seconds']:.0f} s, {record['ms_per_step']:.0f} ms a step, {record['peak_mb']:.0f} MB of memory",
+            flush=True,
+        )
+
+    def _kept(self) -> dict[str, Record]:
+        return read_json(self._file) if self._file.is_file() else {}
+
+    def _all_records(self) -> dict[str, Record]:
+        """Those of the results, and those of jobs that nobody was there to collect."""
+        own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
+        return {**own, **self._kept()}
+
+    def _pool(self) -> Pool:
+        args = self.args
+        if args.cluster:
+            parameters = dict(_parameter(text) for text in args.cluster_parameter)
+            return SubmititPool(args.cluster, self.work / "submitit", args.jobs or 1_000, **parameters)
+        memory = args.memory_gb * 1e9 if args.memory_gb else MEMORY_SHARE * _machine_bytes()
+        return LocalPool(args.jobs or _default_jobs(), memory)
+
+
+def main(grids: Sequence[str], description: str, present: Callable[[Lab, list[Grid]], None]) -> None:
+    """Runs the grids and presents them.
+
+    Args:
+      grids: names of the files in `grids/`.
+      description: of the script.
+      present: called with what was run, also where some runs are missing.
+    """
+    lab = Lab(parse_arguments(description))
+    try:
+        wanted = [lab.grid(name) for name in grids]
+        failures = lab.run(wanted)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
+    present(lab, wanted)
+    if failures:
+        told = "\n".join(f"  {failure.job.key}: {failure.reason}" for failure in failures)
+        sys.exit(f"error: {len(failures)} jobs failed, and what needs them was not run; call again to retry:\n{told}")
+
+
+def parse_arguments(description: str, arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options that all experiments have."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--scenes", type=Path, default=Path("scenes"), help="folder of scenes; what lies in it: grids/scales.toml")
+    add("--scale", choices=("full", "small", "smoke"), default="small", help="full is the paper's, for a GPU")
+    add("--only", nargs="+", metavar="SCENE", help="these scenes of the scale")
+    add("--without-held-out", action="store_true", help="leave out the scenes on which nothing may be chosen")
+    add("--out", type=Path, help="results: records, tables, plots; finished runs in it are never run again")
+    add("--work", type=Path, help="models and checkpoints; default: runs/experiments/SCALE")
+    add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet), which is left out otherwise")
+    add("--jobs", type=int, help="at a time; default: one a GPU, else one a core")
+    add("--memory-gb", type=float, help="that jobs on this machine may take together; default: 80%% of it")
+    add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
+    add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="as submitit has them: mem_gb=32 …")
+    add("--tables-only", action="store_true", help="run nothing; write tables and plots from what is there")
+    return parser.parse_args(arguments)
+
+
+def _parameter(text: str) -> tuple[str, Any]:
+    name, _, value = text.partition("=")
+    return name, int(value) if value.lstrip("-").isdigit() else value
+
+
+def _machine_bytes() -> float:
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+
+
+def _default_jobs() -> int:
+    """One a GPU, where jobs would share its memory; else one a core."""
+    import jax
+
+    if jax.default_backend() == "gpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,175 @@
+"""Grids: which methods are trained on which scenes, at how many Gaussians, read from files in `grids/`.
+
+A cell is a scene with a number of Gaussians, a seed, and lengths of the stages; in it, every method of the experiment
+is one run. A method has as many splats as the cell says, or, `at_equal_bytes`, as many as fit into the bytes that the
+cell's reference ends with, which is known once that is trained.
+"""
+
+import dataclasses
+import itertools
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import a2tg_jax as a2tg
+from a2tg_jax.training.registry import with_changes
+from lab.jobs import Job, Record
+
+GRIDS = Path(__file__).resolve().parents[1] / "grids"
+BYTES_PER_FLOAT = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A system with a name for tables."""
+
+    label: str
+    system: str
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+    floats: int | None = None
+    """Of a splat; needed for a given number of bytes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneAt:
+    """A scene at a size."""
+
+    label: str
+    """DATASET/NAME, or a name."""
+    path: str
+    downscale: int
+    held_out: bool = False
+    """Not looked at while anything is chosen."""
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+    """Of every system, such as its background."""
+
+    @property
+    def dataset(self) -> str:
+        return self.label.rpartition("/")[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """Where methods are compared."""
+
+    scene: SceneAt
+    gaussians: int
+    seed: int
+    iterations: tuple[int, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One method in one cell."""
+
+    method: Method
+    cell: Cell
+    is_at_equal_bytes: bool
+    job: Job
+    """Its last stage."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """All the runs of an experiment at a scale."""
+
+    name: str
+    title: str
+    scale: str
+    preset: str
+    cells: tuple[Cell, ...]
+    reference: Method
+    methods: tuple[Method, ...]
+    """At the cell's number of Gaussians."""
+    at_equal_bytes: tuple[Method, ...]
+    """At the bytes of the reference."""
+
+    def runs(self, records: Mapping[str, Record]) -> Iterator[Run]:
+        """Every run that can be named already, in the order of the cells."""
+        for cell in self.cells:
+            for method in dict.fromkeys((self.reference, *self.methods)):
+                yield Run(method, cell, False, self._job(method, cell, cell.gaussians))
+            reference = records.get(self._job(self.reference, cell, cell.gaussians).key)
+            for method in self.at_equal_bytes if reference else ():
+                num = splats_in(reference["mb"], method)
+                yield Run(method, cell, True, self._job(method, cell, num))
+
+    def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
+        """The last job of every run."""
+        return (run.job for run in self.runs(records))
+
+    def _job(self, method: Method, cell: Cell, num: int) -> Job:
+        first, second = cell.iterations
+        system = type(a2tg.find_system(method.system)).preset(self.preset)
+        basis = {
+            "seed": cell.seed, "densify": {"cap": num}, "stage1_iterations": first, "stage2_iterations": second,
+        }  # fmt: skip
+        for changes in (basis, cell.scene.options, method.options):
+            system = with_changes(system, changes, f"{self.name}: {method.label}")
+        return Job(cell.scene.path, cell.scene.downscale, system, len(system.stages()) - 1)
+
+
+def splats_in(mb: float, method: Method) -> int:
+    """How many splats of a method fit into so many MB (10^6 bytes).
+
+    Raises:
+      ValueError: if the floats of its splats are not known.
+    """
+    if method.floats is None:
+        raise ValueError(f"{method.label}: its splats differ in size: a number of bytes does not say how many they are")
+    return int(round(1e6 * mb) // (BYTES_PER_FLOAT * method.floats))
+
+
+def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, held_out: bool = True) -> Grid:
+    """An experiment at a scale, from `grids/NAME.toml`.
+
+    Args:
+      scenes: labels of those that are wanted; None: all that the file, or else the scale, names.
+      held_out: with the scenes on which nothing was chosen.
+
+    Raises:
+      ValueError: if the file lacks the scale, or a scene or method is unknown.
+    """
+    file, everywhere = _read(name), _read("scales")
+    if scale not in file:
+        raise ValueError(f"grids/{name}.toml has no table [{scale}]")
+    settings = {**everywhere[scale], **file[scale]}
+    known = {**_read("methods"), **file.get("variants", {})}
+    methods = {label: Method(label, **values) for label, values in known.items()}
+
+    def method(label: str) -> Method:
+        if label not in methods:
+            raise ValueError(f"grids/{name}.toml: there is no method {label!r}; there are {', '.join(methods)}")
+        return methods[label]
+
+    variants = [method(label) for label in file.get("variants", {})]
+    blocks = [{**settings, **block} for block in settings.get("blocks", [{}])]
+    cells = [cell for block in blocks for cell in _cells(block, scenes, held_out, name)]
+    return Grid(
+        name, file["title"], scale, settings["preset"], tuple(dict.fromkeys(cells)), method(file["reference"]),
+        (*map(method, file.get("methods", [])), *variants), tuple(map(method, file.get("at_equal_bytes", []))),
+    )  # fmt: skip
+
+
+def _cells(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[Cell]:
+    """Every number of Gaussians, seed and length of a block, on every scene."""
+    first, second = block["iterations"]
+    pairs = itertools.product(block["gaussians"], block["seeds"], _scenes(block, wanted, held_out, name))
+    return [Cell(scene, num, seed, (first, second)) for num, seed, scene in pairs]
+
+
+def _read(name: str) -> dict[str, Any]:
+    return tomllib.loads((GRIDS / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+def _scenes(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[SceneAt]:
+    """The scenes of a block, unless others are wanted, at the block's downscale where it has one."""
+    table = block["scenes"]
+    for label in wanted or ():
+        if label not in table:
+            raise ValueError(f"{name}: there is no scene {label!r} at this scale; there are {', '.join(table)}")
+    labels = [label for label in block.get("only", table) if wanted is None or label in wanted]
+    found = [SceneAt(label, **table[label]) for label in labels]
+    found = [dataclasses.replace(scene, downscale=block.get("downscale", scene.downscale)) for scene in found]
+    return [scene for scene in found if held_out or not scene.held_out]

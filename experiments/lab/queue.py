@@ -1,0 +1,197 @@
+"""A queue of jobs that depend on each other's results: each is run once, several at a time, within the memory there is.
+
+What is wanted is asked again after every finished job, since how many splats fit into another run's bytes is known only
+then. Jobs run in processes of this machine, or wherever submitit sends them.
+"""
+
+import collections
+import concurrent.futures
+import dataclasses
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from lab.jobs import Folders, Job, Record, run_job
+
+POLL_SECONDS = 0.5
+MOST_DEATHS = 2
+"""A job whose process died is tried once more."""
+BASE_BYTES = 1.0e9
+"""Of a process that trains: libraries, compiled programs, a small scene."""
+COPIES = 12
+"""A trained number is kept so many times: itself, gradients, Adam's moments, sums of threads."""
+
+Records = Mapping[str, Record]
+Ask = Callable[[Records], Iterable[Job]]
+"""The jobs that are wanted, given the records of those that are finished."""
+
+
+class Handle(Protocol):
+    """A job under way, as `concurrent.futures` and submitit have it."""
+
+    def done(self) -> bool: ...
+
+    def result(self) -> Any: ...
+
+
+class Pool(Protocol):
+    """What runs jobs."""
+
+    slots: int
+    """So many at a time."""
+    memory: float
+    """Bytes they may take together."""
+
+    def submit(self, job: Job, folders: Folders) -> Handle: ...
+
+
+class LocalPool:
+    """Processes of this machine, each with its share of the cores, which stay for one job after another: what one has
+    compiled, the next may use."""
+
+    def __init__(self, slots: int, memory: float):
+        self.slots, self.memory = slots, memory
+        self._executor = self._new_executor()
+
+    def _new_executor(self) -> concurrent.futures.ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        shares = context.Queue()
+        for index in range(self.slots):
+            shares.put(cores[index :: self.slots] or cores)
+        return concurrent.futures.ProcessPoolExecutor(self.slots, context, _begin_worker, (shares,))
+
+    def submit(self, job: Job, folders: Folders) -> Handle:
+        try:
+            return self._executor.submit(run_job, job, folders)
+        except concurrent.futures.BrokenExecutor:
+            self._executor = self._new_executor()
+            return self._executor.submit(run_job, job, folders)
+
+
+def _begin_worker(shares: Any) -> None:
+    """What a process does before its first job."""
+    import a2tg_jax
+
+    cores = shares.get()
+    if cores:
+        os.sched_setaffinity(0, cores)
+    a2tg_jax.configure_cpu()
+
+
+class SubmititPool:
+    """Other machines, or processes of this one, by way of submitit."""
+
+    def __init__(self, cluster: str, folder: Path, slots: int, **parameters: Any):
+        """Args:
+        cluster: "slurm", "local", or what else submitit knows.
+        folder: for its logs.
+        slots: jobs at a time.
+        parameters: of `submitit.AutoExecutor.update_parameters`, such as slurm_partition, gpus_per_node, mem_gb.
+
+        Raises:
+          ValueError: if submitit is not installed.
+        """
+        try:
+            import submitit
+        except ImportError as error:
+            raise ValueError("--cluster needs submitit: pip install 'a2tg-jax[experiments]'") from error
+        self.slots, self.memory = slots, float("inf")
+        self._executor = submitit.AutoExecutor(folder, cluster=cluster)
+        self._executor.update_parameters(**parameters)
+
+    def submit(self, job: Job, folders: Folders) -> Handle:
+        return self._executor.submit(_run_elsewhere, job, folders)
+
+
+def _run_elsewhere(job: Job, folders: Folders) -> Record:
+    import a2tg_jax
+
+    a2tg_jax.configure_cpu()
+    return run_job(job, folders)
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A job that could not be run."""
+
+    job: Job
+    reason: str
+
+
+def run_all(
+    ask: Ask, folders: Folders, pool: Pool, records: dict[str, Record], on_record: Callable[[Job, Record], None]
+) -> list[Failure]:
+    """Runs all that is wanted and not finished, and adds its records.
+
+    Args:
+      ask: asked again after every finished job.
+      folders: where jobs read and write.
+      pool: what runs them.
+      records: of finished jobs, by key; added to.
+      on_record: called with each job that was run.
+
+    Returns:
+      The jobs that failed. Those that need their results are not run.
+    """
+    running: dict[str, tuple[Job, Handle]] = {}
+    failures: dict[str, Failure] = {}
+    deaths: collections.Counter[str] = collections.Counter()
+    wanted = list(ask(records))
+    while True:
+        for job in _ready(wanted, folders, records):
+            others = [other for other, _ in running.values()]
+            if job.key not in running and job.key not in failures and _fits(job, others, pool):
+                running[job.key] = job, pool.submit(job, folders)
+        if not running:
+            return list(failures.values())
+        ended = [key for key, (_, handle) in running.items() if handle.done()]
+        for key in ended:
+            job, handle = running.pop(key)
+            try:
+                record = handle.result()
+            except concurrent.futures.BrokenExecutor as error:  # A process died, with all that ran beside it.
+                deaths[key] += 1
+                if deaths[key] == MOST_DEATHS:
+                    failures[key] = Failure(job, f"its process died {MOST_DEATHS} times, of memory? {error}")
+            except Exception as error:
+                failures[key] = Failure(job, f"{type(error).__name__}: {error}")
+            else:
+                records[key] = record
+                on_record(job, record)
+        if ended:
+            wanted = list(ask(records))
+        else:
+            time.sleep(POLL_SECONDS)
+
+
+def _fits(job: Job, others: list[Job], pool: Pool) -> bool:
+    """Whether a job may run beside others; one alone always may."""
+    is_room = sum(map(estimated_bytes, [*others, job])) <= pool.memory
+    return not others or (len(others) < pool.slots and is_room)
+
+
+def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]:
+    """Of every chain that is not finished, the first job that is not."""
+    found = (_first_open(job, folders, records) for job in jobs)
+    return list({job.key: job for job in found if job is not None}.values())
+
+
+def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool = False) -> Job | None:
+    """The job, or the one before it that has to be run for it; None where it is finished."""
+    if job.key in records and (not is_start or folders.model(job).is_file()):
+        return None
+    before = None if job.start is None else _first_open(job.start, folders, records, is_start=True)
+    return before or job
+
+
+def estimated_bytes(job: Job) -> float:
+    """About what a job takes, so that no more are run at once than fit."""
+    densify = getattr(job.system, "densify", None)
+    texture = getattr(job.system, "texture", None)
+    side = getattr(texture, "side", None) or getattr(texture, "cap", None) or 1
+    floats = 58 + 4 * side * side
+    return BASE_BYTES + 4 * COPIES * floats * getattr(densify, "cap", 100_000)

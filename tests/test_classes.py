@@ -1,0 +1,44 @@
+"""Programs are told apart by the classes of what they are given, where JAX may mistake one for another."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from a2tg_jax.classes import classes_of, jit
+
+
+def numbered(index: int) -> type:
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass(frozen=True)
+    class Numbered:
+        scale: float
+
+        def value(self, x):
+            return x * self.scale + index
+
+    return Numbered
+
+
+def test_no_class_runs_the_program_of_another():
+    """With `jax.jit`, about one in ten of so many does."""
+    function = jit(lambda rule, x: rule.value(x))
+    rules = [numbered(index)(2.0) for index in range(60)]
+    assert [float(function(rule, jnp.float32(0))) for rule in rules] == list(range(60))
+    assert function.num_compiled() == 60
+    assert [float(function(rule, jnp.float32(1))) for rule in rules] == [2 + index for index in range(60)]
+    assert function.num_compiled() == 60
+    function.clear_cache()
+    assert function.num_compiled() == 0
+
+
+def test_classes_are_those_of_all_nodes():
+    inner, outer = numbered(0), numbered(1)
+    assert classes_of((outer(inner(1.0)), [None])) == (tuple, list, type(None), outer, inner)
+
+
+def test_static_and_donated_arguments_are_counted_as_the_function_has_them():
+    function = jit(lambda name, x, y: x + y if name == "add" else x - y, static_argnums=(0,), donate_argnums=(2,))
+    gone = jnp.ones(3)
+    assert float(function("add", jnp.ones(3), gone)[0]) == 2 and gone.is_deleted()
+    assert float(function("subtract", jnp.ones(3), jnp.ones(3))[0]) == 0
