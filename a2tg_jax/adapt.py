@@ -69,6 +69,8 @@ class Upscale(HostEvent):
     gradient: Statistic = static(default="position")
     """The gradient that is averaged: by position in the world, as the paper has it, or "screen": by the position on
     the screen, in units of half an image, and only where the low-pass filter decides, as in the authors' program."""
+    moments: Literal["copied", "zero"] = static(default="copied")
+    """What Adam remembers of a texture that has grown: its old texels' moments, copied as they are, or nothing."""
 
     @property
     def statistic(self) -> Statistic:
@@ -108,7 +110,8 @@ class Upscale(HostEvent):
         how = self._how_to_select(model.num_bytes, index, count)
         mask = select(averages[:num], sizes, proposed, **how)
         new_sizes[:num] = np.where(mask[:, None], proposed, sizes)
-        rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes))
+        kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
+        rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
         model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
         return Change(model, rebuilt.moments, self.init(model))
@@ -227,7 +230,7 @@ def event_budget(total_bytes: float, current_bytes: float, event_index: int, num
 
 
 def reallocate(
-    textures: Textures, layout: AtlasLayout, new_sizes, moments=None, known: Sequence[Shape] = ()
+    textures: Textures, layout: AtlasLayout, new_sizes, moments=None, known: Sequence[Shape] = (), kept=None
 ) -> ReallocateResult:
     """Rebuilds the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
@@ -240,6 +243,7 @@ def reallocate(
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
       moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay as they are.
       known: shapes of buckets to prefer (`texture.plan_layout`).
+      kept: [N] bool, whose moments are kept, the others' being 0; None: all.
 
     Raises:
       ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
@@ -258,10 +262,23 @@ def reallocate(
         if not isinstance(leaf, Textures):
             return leaf
         check_textures(leaf, layout, layout.num, "moments")
-        return rebuild(leaf, (0.0, 0.0, 0.0, 0.0))
+        return rebuild(leaf if kept is None else _kept_rows(leaf, layout, kept), (0.0, 0.0, 0.0, 0.0))
 
     moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
     return ReallocateResult(rebuild(textures, NEUTRAL_TEXEL), new_layout, moments)
+
+
+def _kept_rows(moments: Textures, layout: AtlasLayout, kept) -> Textures:
+    """The moments with 0 in all rows but those of the textures that are kept."""
+    check_shape("kept", kept, (layout.num,))
+    bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
+    buckets = []
+    for index, old in enumerate(moments.buckets):
+        rows = row[(bucket == index) & np.asarray(kept)]
+        new = np.zeros_like(old)
+        new[rows] = np.asarray(old)[rows]
+        buckets.append(jnp.asarray(new))
+    return Textures(tuple(buckets))
 
 
 class _Move(NamedTuple):

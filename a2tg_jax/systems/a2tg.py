@@ -43,6 +43,8 @@ class TextureConfig:
     """Thin Gaussians double along their long axis, or along the short one as in the authors' program."""
     gradient: Statistic = "position"
     """The gradient that chooses: by position in the world, or "screen" as in the authors' program."""
+    moments: Literal["copied", "zero"] = "copied"
+    """Adam's moments of a texture that has grown: copied from its old texels, or zero."""
     k_a: float = 4.0
     """Aspect ratio above which a Gaussian counts as elongated."""
     k_s: float = 0.01
@@ -73,7 +75,7 @@ class TextureConfig:
             raise ValueError("texture.select is 'threshold', so texture.threshold must say which average gradient")
         return Upscale(
             self.select, self.fraction, self.threshold, self.budget_mb, self.anisotropic, self.axes, self.k_a, self.k_s,
-            self.cap, self.upscale_at, self.gradient,
+            self.cap, self.upscale_at, self.gradient, self.moments,
         )  # fmt: skip
 
     @staticmethod
