@@ -184,6 +184,29 @@ def test_reallocate_copies_the_nearest_texel(seed):
             np.testing.assert_array_equal(got, nearest_copy(change(old), size))
 
 
+def test_moments_of_what_is_not_kept_are_zero():
+    arrays, sizes = random_textures(6)
+    textures, layout = textures_from_arrays(arrays)
+    kept = np.arange(len(arrays)) % 3 == 0
+    rebuilt = reallocate(textures, layout, 2 * sizes, textures, kept=kept)
+    for got, old, is_kept in zip(texture_arrays(rebuilt.moments, rebuilt.layout), arrays, kept, strict=True):
+        np.testing.assert_array_equal(got, np.repeat(np.repeat(old, 2, 0), 2, 1) * is_kept)
+
+
+@pytest.mark.parametrize("moments", ["copied", "zero"])
+def test_what_adam_remembers_of_a_texture_that_grows(moments):
+    """The half with the larger statistic grows; all moments were 1."""
+    gaussians = init_from_points(np.eye(3)[np.arange(12) % 3], np.full((12, 3), 0.5))
+    params, layout = Textured().allocate(jax.random.key(0), gaussians)
+    model = Model(gaussians, params, layout, appearance=Textured())
+    ones = jax.tree.map(jnp.ones_like, adam_init((gaussians, params)))
+    state = GradientStatistics.init(12, jnp.float32).observe(jnp.arange(12, dtype=jnp.float32), jnp.ones(12, bool))
+    change = Upscale(fraction=0.5, moments=moments).apply(1, 1, model, ones, state)
+    found = texture_arrays(change.moments.mu[1], change.model.layout)
+    assert [array.shape[0] for array in found] == [1] * 6 + [2] * 6
+    assert [float(array.min()) for array in found] == [1] * 6 + [float(moments == "copied")] * 6
+
+
 def test_doubling_repeats_texels_and_a_round_trip_is_the_identity():
     arrays, sizes = random_textures(5)
     textures, layout = textures_from_arrays(arrays)
