@@ -1,5 +1,18 @@
-"""x"""
-import sys
+"""Every table and figure of the paper, and what was asked beyond it, in one go. The paper's claim comes first.
+
+    python experiments/all.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+
+Stopped and called again, it goes on where it was. `--plan` tells what is left to do, and about how long it takes.
+"""
+
+import importlib
+
 from lab.cli import main
+
+NAMES = (
+    "claim", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution", "fixed_number",
+    "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
+)  # fmt: skip
+
 if __name__ == "__main__":
-    main(["claim","ablation","where_textures_pay","fixed_memory","fixed_number"], "x", lambda lab, grids: None)
+    main([importlib.import_module(name).EXPERIMENT for name in NAMES], __doc__)

@@ -1,16 +1,21 @@
-"""The command line of every experiment: what to run, where, and what is written in the end."""
+"""What an experiment is, and the command line of all of them: what to run, where, and what is written in the end."""
 
 import argparse
+import dataclasses
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import a2tg_jax as a2tg
+from a2tg_jax.io.atomic import replacing
 from a2tg_jax.results.folder import read_json, write_json
 from lab.grid import Grid, read_grid
 from lab.jobs import Folders, Job, Record
+from lab.plan import plan_of
 from lab.queue import Failure, LocalPool, Pool, SubmititPool, run_all
+from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 MEMORY_SHARE = 0.8
@@ -40,6 +45,21 @@ class Lab:
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
         return run_all(jobs, self.folders, self._pool(), self.records, self._keep)
 
+    def model(self, result: Result) -> a2tg.Model | None:
+        """What a run left; None, and a line that says so, where it is gone."""
+        path = self.folders.model(result.run.job)
+        if path.is_file():
+            return a2tg.load_model(path)
+        print(f"{result.label} on {result.run.cell.scene.label}: no picture, for its model is not in {path.parent}")
+        return None
+
+    def write(self, name: str, text: str) -> None:
+        """Prints a page and keeps it among the results."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        with replacing(self.out / f"{name}.md") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        print(f"\n{text}\n{self.out / name}.md", flush=True)
+
     def _keep(self, job: Job, record: Record) -> None:
         kept = {**self._kept(), job.key: record}
         self.out.mkdir(parents=True, exist_ok=True)
@@ -67,21 +87,31 @@ class Lab:
         return LocalPool(args.jobs or _default_jobs(), memory)
 
 
-def main(grids: Sequence[str], description: str, present: Callable[[Lab, list[Grid]], None]) -> None:
-    """Runs the grids and presents them.
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A table or figure: the grids that it needs, and what it makes of their results."""
 
-    Args:
-      grids: names of the files in `grids/`.
-      description: of the script.
-      present: called with what was run, also where some runs are missing.
-    """
+    name: str
+    grids: tuple[str, ...]
+    """Names of files in `grids/`."""
+    present: Callable[[Lab, Sequence[Grid]], None]
+    """Called when the grids were run, also where runs are missing."""
+
+
+def main(experiments: Sequence[Experiment], description: str) -> None:
+    """Runs all that some experiments need, in one queue, and presents each."""
     lab = Lab(parse_arguments(description))
+    names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
     try:
-        wanted = [lab.grid(name) for name in grids]
-        failures = lab.run(wanted)
+        grids = {name: lab.grid(name) for name in names}
+        if lab.args.plan:
+            print(plan_of(list(grids.values()), lab.records))
+            return
+        failures = lab.run(list(grids.values()))
+        for experiment in experiments:
+            experiment.present(lab, [grids[name] for name in experiment.grids])
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
-    present(lab, wanted)
     if failures:
         told = "\n".join(f"  {failure.job.key}: {failure.reason}" for failure in failures)
         sys.exit(f"error: {len(failures)} jobs failed, and what needs them was not run; call again to retry:\n{told}")
@@ -102,6 +132,7 @@ def parse_arguments(description: str, arguments: Sequence[str] | None = None) ->
     add("--memory-gb", type=float, help="that jobs on this machine may take together; default: 80%% of it")
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
     add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="as submitit has them: mem_gb=32 …")
+    add("--plan", action="store_true", help="run nothing; say what is left to run, and about how long it takes")
     add("--tables-only", action="store_true", help="run nothing; write tables and plots from what is there")
     return parser.parse_args(arguments)
 

@@ -90,10 +90,14 @@ class Grid:
         for cell in self.cells:
             for method in dict.fromkeys((self.reference, *self.methods)):
                 yield Run(method, cell, False, self._job(method, cell, cell.gaussians))
-            reference = records.get(self._job(self.reference, cell, cell.gaussians).key)
+            reference = self.reference_record(cell, records)
             for method in self.at_equal_bytes if reference else ():
                 num = splats_in(reference["mb"], method)
                 yield Run(method, cell, True, self._job(method, cell, num))
+
+    def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
+        """What the reference left in a cell, once it is finished."""
+        return records.get(self._job(self.reference, cell, cell.gaussians).key)
 
     def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
         """The last job of every run."""

@@ -43,6 +43,11 @@ class Job:
         return dataclasses.replace(self, stage=self.stage - 1) if self.stage else None
 
     @property
+    def iterations(self) -> int:
+        """Of its stage."""
+        return self.system.stages()[self.stage].iterations
+
+    @property
     def key(self) -> str:
         """Unique; a file name."""
         return _key(self)
@@ -99,7 +104,7 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene) -> a2tg.StageResult:
         start,
         resume=a2tg.load_checkpoint(path, system=type(job.system)) if path.is_file() else None,
         on_checkpoint=lambda checkpoint: a2tg.save_checkpoint(path, checkpoint),
-        checkpoint_every=max(500, job.system.stages()[job.stage].iterations // 10),
+        checkpoint_every=max(500, job.iterations // 10),
         progress=False,
     )
 
@@ -112,7 +117,7 @@ def _record(job: Job, scene: a2tg.Scene, result: a2tg.StageResult, folders: Fold
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
         "system": reference_of(job.system), "options": differences(job.system), "stage": result.name,
-        "iterations": job.system.stages()[job.stage].iterations,
+        "iterations": job.iterations,
         "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "psnr": on_test.psnr, "ssim": on_test.ssim, "lpips": on_test.lpips, "lpips_network": on_test.lpips_network,

@@ -1,0 +1,27 @@
+"""What upscaling and anisotropy bring, and what they cost: Table 3 of the paper.
+
+python experiments/ablation.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+"""
+
+from collections.abc import Sequence
+
+from lab import tables
+from lab.cli import Experiment, Lab, main
+from lab.grid import Grid
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """Ours, then the paper's."""
+    (grid,) = grids
+    results = tables.results_of(grid, lab.records)
+    others = ["w/o anisotropy", "w/o upscaling, 1×1 textures", "2DGS*-MCMC", "Textured Gaussians*"]
+    gains = tables.gains_table(results, grid.reference.label, others)
+    ours = tables.quality_tables(grid, results) + "\n## At the same number of Gaussians\n\n" + gains
+    paper = tables.paper_table("ablation", "gaussians", tables.QUALITY_COLUMNS)
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{ours}\n## In the paper\n\n{paper}")
+
+
+EXPERIMENT = Experiment("ablation", ("ablation",), present)
+
+if __name__ == "__main__":
+    main([EXPERIMENT], __doc__)

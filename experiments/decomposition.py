@@ -1,0 +1,55 @@
+"""What textures learn: the full picture, spherical harmonics only, textures only; and the textures themselves.
+
+python experiments/decomposition.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from lab import pictures, tables
+from lab.cli import Experiment, Lab, main
+from lab.grid import Grid
+from PIL import Image
+
+import a2tg_jax as a2tg
+from a2tg_jax.results.pictures import save_picture, side_by_side, to_uint8
+
+NUM_TEXTURES, ZOOM = 16, 12
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """Two pictures of each scene whose model is there, and how much textures bring to its test views."""
+    (grid,) = grids
+    rows = []
+    for result in tables.results_of(grid, lab.records):
+        model = lab.model(result) if result.label == "A²TG" else None
+        if model is None:
+            continue
+        name = result.run.cell.scene.label
+        lab.out.mkdir(parents=True, exist_ok=True)
+        views = {"full": model, "SH only": pictures.without_textures(model), "texture only": pictures.without_sh(model)}
+        camera = model.origin.cameras[0]
+        shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in views.values()]
+        stem = name.replace("/", "-")
+        save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", side_by_side(shown, list(views)))
+        save_picture(lab.out / f"learned_textures-{stem}.png", _textures_picture(model))
+        test = lab.folders.load_scene(result.run.job).test
+        figures = {label: a2tg.evaluate(test, one).psnr for label, one in views.items()}
+        rows.append([name, *(tables.number(value, 2) for value in figures.values())])
+    text = tables.markdown(["scene", "full: PSNR", "SH only", "texture only"], rows)
+    lab.write(EXPERIMENT.name, f"# What textures carry\n\n{text}")
+
+
+def _textures_picture(model: a2tg.Model) -> Image.Image:
+    """The most varied textures of 4×4 and of 1×4 texels: RGB above, alpha below."""
+    sheets = [pictures.learned_textures(model, size, NUM_TEXTURES) for size in ((4, 4), (1, 4), (4, 1))]
+    sheets = [np.repeat(np.repeat(sheet, ZOOM, 0), ZOOM, 1) for sheet in sheets if sheet.shape[1]]
+    width = max((sheet.shape[1] for sheet in sheets), default=1)
+    padded = [np.pad(sheet, ((0, ZOOM), (0, width - sheet.shape[1]), (0, 0)), constant_values=255) for sheet in sheets]
+    return Image.fromarray(np.concatenate(padded) if padded else np.full((1, 1, 3), 255, np.uint8))
+
+
+EXPERIMENT = Experiment("decomposition", ("pictures",), present)
+
+if __name__ == "__main__":
+    main([EXPERIMENT], __doc__)

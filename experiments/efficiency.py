@@ -1,0 +1,86 @@
+"""Frames per second, time of a frame and of training, and size: Table 4 of the paper.
+
+    python experiments/efficiency.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+
+Times are taken when all runs are finished, one after the other, and kept in efficiency.json: let nothing else run
+beside it. Training time is that of a step with all Gaussians, multiplied by the iterations.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from lab import tables
+from lab.cli import Experiment, Lab, main
+from lab.grid import Grid
+from lab.jobs import Job
+
+import a2tg_jax as a2tg
+from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.training import fit_stage
+
+TIMED_ITERATIONS = 150
+TIMED_ROUNDS = 3
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """Ours, measured once on this machine, then the paper's."""
+    (grid,) = grids
+    path = lab.out / f"{EXPERIMENT.name}.json"
+    times = read_json(path) if path.is_file() else {}
+    rows = []
+    for result in tables.results_of(grid, lab.records):
+        key = result.run.job.key
+        model = None if key in times or lab.args.tables_only else lab.model(result)
+        if model is not None:
+            times[key] = _times(lab, result, model)
+            lab.out.mkdir(parents=True, exist_ok=True)
+            write_json(path, times)
+        if key in times:
+            rows.append(_row(result, times[key]))
+    header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
+    text = tables.markdown([*header, "machine"], rows)
+    columns = (("mb", "MB", 0), ("fps", "frames/s", 0), ("seconds_per_frame", "s a frame", 3))
+    paper = tables.paper_table(EXPERIMENT.name, "gaussians", (*columns, ("training_minutes", "training, min", 1)))
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{text}\n## In the paper, on Deep Blending\n\n{paper}")
+
+
+def _row(result: tables.Result, times: dict) -> list[str]:
+    minutes = sum(steps * pace for steps, pace in zip(times["iterations"], times["ms_per_step"], strict=True)) / 6e4
+    paces = ", ".join(tables.number(pace, 1) for pace in times["ms_per_step"])
+    return [
+        result.run.cell.scene.label, result.label, f"{result.record['num']:,}", tables.number(result["mb"], 2),
+        tables.number(times["fps"], 1), tables.number(1e3 / times["fps"], 1), paces, tables.number(minutes, 1),
+        times["machine"],
+    ]  # fmt: skip
+
+
+def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
+    """Frames per second on the test views, and the time of a step in each stage, compiled and warm."""
+    job = result.run.job
+    scene = lab.folders.load_scene(job)
+    jobs = [dataclasses.replace(job, stage=stage) for stage in range(job.stage + 1)]
+    return {
+        "fps": max(a2tg.evaluate(scene.test, model).frames_per_second for _ in range(TIMED_ROUNDS)),
+        "ms_per_step": [1e3 * _seconds_per_step(lab, one, scene) for one in jobs],
+        "iterations": [one.iterations for one in jobs],
+        "machine": jax.devices()[0].device_kind,
+    }
+
+
+def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
+    """Of steps that start from what the stage left, with all its Gaussians; the best of some rounds' medians."""
+    system = dataclasses.replace(job.system, **{f"stage{stage}_iterations": TIMED_ITERATIONS for stage in (1, 2)})
+    start = a2tg.load_model(lab.folders.model(job if job.stage == 0 else dataclasses.replace(job, stage=0)))
+    paces = []
+    for _ in range(TIMED_ROUNDS):
+        history = fit_stage(scene, system, job.stage, start, progress=False).history
+        paces.append(float(np.median(np.diff(history.seconds) / np.diff(history.iteration))))
+    return min(paces)
+
+
+EXPERIMENT = Experiment("efficiency", ("efficiency",), present)
+
+if __name__ == "__main__":
+    main([EXPERIMENT], __doc__)

@@ -1,0 +1,62 @@
+"""Models changed so that a rendering shows something of them: what textures do, and where they are large."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import a2tg_jax as a2tg
+from a2tg_jax.gaussians import SH_C0
+
+SQUARE, OBLONG = (0.15, 0.35, 0.95), (0.9, 0.12, 0.1)
+"""The paper's colours: blue for textures of 2×2 and 4×4 texels, red for those that are not square."""
+
+
+def without_textures(model: a2tg.Model) -> a2tg.Model:
+    """RGB textures 0, alpha textures 1: what spherical harmonics show."""
+    neutral = jax.tree.map(lambda bucket: jnp.zeros_like(bucket).at[..., 3].set(1.0), model.params)
+    return dataclasses.replace(model, params=neutral)
+
+
+def without_sh(model: a2tg.Model) -> a2tg.Model:
+    """The Gaussians' own colour 0: what textures show."""
+    black = jnp.zeros_like(model.gaussians.sh).at[:, 0].set(-0.5 / SH_C0)
+    return dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=black))
+
+
+def colored_by_shape(model: a2tg.Model) -> a2tg.Model:
+    """Gaussians with larger square textures in blue, with others in red, the rest as they are."""
+    rows, columns = model.layout.sizes.T
+    sh = np.array(model.gaussians.sh)
+    for is_chosen, color in (((rows == columns) & (rows > 1), SQUARE), (rows != columns, OBLONG)):
+        sh[is_chosen] = 0
+        sh[is_chosen, 0] = (np.asarray(color) - 0.5) / SH_C0
+    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(sh))
+    flat = jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), model.params)
+    return dataclasses.replace(model, gaussians=gaussians, params=flat)
+
+
+def learned_textures(model: a2tg.Model, size: tuple[int, int], num: int) -> np.ndarray:
+    """Textures of one size whose RGB varies most, as they colour a splat: on top its colour with the RGB residual, seen
+    from +z, below the alpha texture.
+
+    Args:
+      size: (rows, columns).
+      num: at most so many.
+
+    Returns:
+      uint8 [2·rows + 1, num·(columns + 1) − 1, 3], white between them; without columns where there are none.
+    """
+    chosen = np.flatnonzero((model.layout.sizes == size).all(axis=1))
+    textures = a2tg.texture_arrays(model.params, model.layout)
+    varied = sorted(chosen, key=lambda index: -float(np.std(textures[index][..., :3], axis=(0, 1)).sum()))[:num]
+    rows, columns = size
+    sheet = np.ones((2 * rows + 1, max(0, len(varied) * (columns + 1) - 1), 3))
+    base = np.maximum(0.5 + SH_C0 * np.asarray(model.gaussians.sh[:, 0]), 0)
+    for place, index in enumerate(varied):
+        left = place * (columns + 1)
+        texture = np.asarray(textures[index])
+        sheet[:rows, left : left + columns] = base[index] + texture[..., :3]
+        sheet[rows + 1 :, left : left + columns] = texture[..., 3:]
+    return np.rint(255 * np.clip(sheet, 0, 1)).astype(np.uint8)

@@ -1,0 +1,78 @@
+"""Charts of results, drawn with matplotlib's object interface."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLORS = {
+    "A²TG": "#cc3311", "2DGS*-MCMC": "#4477aa", "Textured Gaussians*": "#228833", "SuperGaussians": "#aa3377",
+    "BBSplat": "#ccaa33", "2DGS*": "#66ccee",
+}  # fmt: skip
+OTHER_COLOR = "#777777"
+Point = tuple[float, float]
+
+
+def color_of(label: str) -> str:
+    """A method's colour; its variants have the same."""
+    return next((color for name, color in COLORS.items() if label.split(",")[0] == name), OTHER_COLOR)
+
+
+def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_label: str, title: str) -> None:
+    """Curves through points, in the order of their x, which is logarithmic."""
+    for label, points in curves.items():
+        if points:
+            x, y = np.array(sorted(points)).T
+            axes.plot(x, y, marker="o", markersize=4, linewidth=1.4, label=label, color=color_of(label))
+    axes.set_xscale("log")
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.set_title(title, fontsize=10)
+    axes.grid(alpha=0.25, which="both")
+
+
+def chart_row(
+    panels: Sequence[tuple[str, Mapping[str, Sequence[Point]], str, str]], *, log_y: Sequence[bool] = ()
+) -> Figure:
+    """Several charts in a row, with one legend.
+
+    Args:
+      panels: title, curves by label, and what the axes say.
+      log_y: which panels have a logarithmic y.
+    """
+    figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
+    row = np.atleast_1d(figure.subplots(1, len(panels)))
+    for index, (axes, (title, curves, x_label, y_label)) in enumerate(zip(row, panels, strict=True)):
+        lines(axes, curves, x_label, y_label, title)
+        if index < len(log_y) and log_y[index]:
+            axes.set_yscale("log")
+    handles = {label: handle for axes in row for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, max(1, len(handles))))
+    return figure
+
+
+def shares_chart(shares: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Bars: which share of the Gaussians has a texture of each size.
+
+    Args:
+      shares: by scene, by "rows×columns".
+    """
+    sizes = sorted({size for own in shares.values() for size in own}, key=_area)
+    figure = Figure(figsize=(1.5 + 0.9 * len(sizes), 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    width = 0.8 / max(1, len(shares))
+    for index, (scene, own) in enumerate(shares.items()):
+        x = np.arange(len(sizes)) + (index - (len(shares) - 1) / 2) * width
+        axes.bar(x, [100 * own.get(size, 0.0) for size in sizes], width, label=scene)
+    axes.set_xticks(range(len(sizes)), [size.replace("x", "×") for size in sizes])
+    axes.set_xlabel("texels along v × along u")
+    axes.set_ylabel("share of the Gaussians, %")
+    axes.grid(alpha=0.25, axis="y")
+    axes.legend(fontsize=8)
+    return figure
+
+
+def _area(size: str) -> tuple[int, int]:
+    rows, columns = map(int, size.split("x"))
+    return rows * columns, rows

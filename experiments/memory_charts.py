@@ -1,0 +1,45 @@
+"""PSNR against memory, and memory against the number of Gaussians: the line charts of the paper.
+
+python experiments/memory_charts.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+"""
+
+from collections.abc import Sequence
+
+from lab import plots, tables
+from lab.cli import Experiment, Lab, main
+from lab.grid import Grid
+
+from a2tg_jax.results.figures import save_figure
+
+METHODS = ("2DGS*-MCMC", "Textured Gaussians*", "A²TG")
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """One chart of quality a column of scenes, and one of memory."""
+    results = list(
+        {id(result.record): result for grid in grids for result in tables.results_of(grid, lab.records)}.values()
+    )
+    panels = []
+    for column in dict.fromkeys(result.column for result in results):
+        own = [result for result in results if result.column == column]
+        panels.append((column, {label: _points(own, label, "mb", "psnr") for label in METHODS}, "MB", "test PSNR, dB"))
+    sizes = {label: _points(results, label, "num", "mb") for label in METHODS}
+    panels.append(("memory of all scenes", sizes, "Gaussians", "MB"))
+    log_y = [False] * (len(panels) - 1) + [True]
+    lab.out.mkdir(parents=True, exist_ok=True)
+    save_figure(lab.out / "memory_charts.png", plots.chart_row(panels, log_y=log_y))
+    print(lab.out / "memory_charts.png")
+
+
+def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> list[plots.Point]:
+    """Of a method, the mean over seeds and scenes for each number of splats."""
+    own = [result for result in results if result.run.method.label == label]
+    counts = sorted({result["num"] for result in own})
+    groups = [[result for result in own if result["num"] == count] for count in counts]
+    return [(tables.mean(group, x), tables.mean(group, y)) for group in groups]
+
+
+EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present)
+
+if __name__ == "__main__":
+    main([EXPERIMENT], __doc__)

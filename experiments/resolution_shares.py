@@ -1,0 +1,62 @@
+"""How many Gaussians have textures of each resolution, and where: square ones blue, others red, as in the paper.
+
+python experiments/resolution_shares.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+"""
+
+from collections.abc import Sequence
+
+from lab import pictures, plots, tables
+from lab.cli import Experiment, Lab, main
+from lab.grid import Grid
+
+import a2tg_jax as a2tg
+from a2tg_jax.results.figures import save_figure
+from a2tg_jax.results.pictures import save_picture, side_by_side, to_uint8
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """A table and a chart of the shares; a picture of each scene whose model is there."""
+    results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
+    results = [result for result in results if result.label == "A²TG" and not result.run.cell.seed]
+    shares = {_place(result): _shares(result) for result in results}
+    sizes = sorted({size for own in shares.values() for size in own}, key=lambda size: tuple(map(int, size.split("x"))))
+    rows = [[place, *(tables.percent(own.get(size, 0.0)) for size in sizes)] for place, own in shares.items()]
+    (paper,) = tables.PAPER["resolution_shares"]
+    text = tables.markdown(["scene", *(size.replace("x", "×") for size in sizes)], rows)
+    told = f"In the paper, on {paper['scene']}, {tables.percent(paper['1x1'])} keep 1×1 texels.\n"
+    lab.write(EXPERIMENT.name, f"# Shares of texture resolutions (rows × columns)\n\n{text}\n{told}")
+    densest = {result.column: result for result in sorted(results, key=lambda result: result["num"])}
+    if densest:
+        charted = {_place(result): shares[_place(result)] for result in densest.values()}
+        save_figure(lab.out / f"{EXPERIMENT.name}.png", plots.shares_chart(charted))
+    for result in tables.results_of(grids[-1], lab.records):
+        if result.label == "A²TG":
+            _picture(lab, result)
+
+
+def _place(result: tables.Result) -> str:
+    cell = result.run.cell
+    return f"{cell.scene.label}, {cell.gaussians:,}"
+
+
+def _shares(result: tables.Result) -> dict[str, float]:
+    """Of the Gaussians, by resolution."""
+    counts = result.record["sizes"]
+    return {size: count / sum(counts.values()) for size, count in counts.items()}
+
+
+def _picture(lab: Lab, result: tables.Result) -> None:
+    """The first of the training's cameras, as it is and by the shape of the textures."""
+    model = lab.model(result)
+    if model is None:
+        return
+    camera = model.origin.cameras[0]
+    shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in (model, pictures.colored_by_shape(model))]
+    sheet = side_by_side(shown, ["full", "blue: square 2×2, 4×4; red: not square"])
+    save_picture(lab.out / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
+
+
+EXPERIMENT = Experiment("resolution_shares", ("ablation", "pictures"), present)
+
+if __name__ == "__main__":
+    main([EXPERIMENT], __doc__)
