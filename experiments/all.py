@@ -11,7 +11,7 @@ from lab.cli import main
 
 NAMES = (
     "claim", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution", "fixed_number",
-    "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
+    "quick_preset", "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
 )  # fmt: skip
 
 if __name__ == "__main__":

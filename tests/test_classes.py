@@ -5,7 +5,11 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+import a2tg_jax as a2tg
 from a2tg_jax.classes import classes_of, jit
+from a2tg_jax.events import Change
+from a2tg_jax.mcmc import Noise
+from a2tg_jax.results.plan import fingerprint, plan_run
 
 
 def numbered(index: int) -> type:
@@ -42,3 +46,21 @@ def test_static_and_donated_arguments_are_counted_as_the_function_has_them():
     gone = jnp.ones(3)
     assert float(function("add", jnp.ones(3), gone)[0]) == 2 and gone.is_deleted()
     assert float(function("subtract", jnp.ones(3), jnp.ones(3))[0]) == 0
+
+
+def test_systems_that_differ_in_a_class_share_no_stage():
+    @a2tg.event
+    class Still(Noise):
+        def apply(self, now, model, moments, state):
+            return Change(model, moments, state)
+
+    class Quiet(a2tg.A2tg):
+        def stages(self):
+            first, second = super().stages()
+            events = tuple(Still() if isinstance(event, Noise) else event for event in first.events)
+            return dataclasses.replace(first, events=events), second
+
+    shared = plan_run({"a": a2tg.A2tg(), "b": a2tg.A2tg()})
+    apart = plan_run({"a": a2tg.A2tg(), "b": Quiet()})
+    assert len(shared.stages) == 2 and len(apart.stages) == 4
+    assert fingerprint(a2tg.A2tg(), 0) != fingerprint(Quiet(), 0)

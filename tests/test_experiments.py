@@ -1,0 +1,326 @@
+"""The experiments: grids name the runs that they should, a queue trains each once, tables say what is so."""
+
+import concurrent.futures
+import dataclasses
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from lab import queue, tables
+from lab.cli import EXPERIMENTS, parse_arguments
+from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, read_grid, splats_in
+from lab.jobs import Folders, Job
+from lab.plan import plan_of, seconds_of_step
+
+import a2tg_jax as a2tg
+from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.results.plan import fingerprint
+
+NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
+SCALES = ("full", "small", "smoke")
+
+
+def record(psnr=25.0, mb=1.0, num=1_000, **others):
+    figures = {"ssim": 0.8, "lpips": 0.2, "pixels": [20, 10], "stage": "gaussians", "downscale": 2, "ms_per_step": 10.0}
+    return {"psnr": psnr, "mb": mb, "num": num, **figures, **others}
+
+
+# Grids
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_grid_names_runs_that_can_be_trained(name, scale):
+    grid = read_grid(name, scale)
+    first = {job.key: job for job in grid.jobs({})}
+    assert grid.cells and first
+    for job in first.values():
+        job.system.check()
+    finished = {key: record(mb=job.system.densify.cap * 290e-6) for key, job in first.items()}
+    runs = list(grid.runs(finished))
+    places = [(run.cell, run.method.label, run.is_at_equal_bytes) for run in runs]
+    assert (
+        len(set(places))
+        == len(places)
+        == len(grid.cells) * len({*grid.methods, grid.reference}) + len(grid.cells) * len(grid.at_equal_bytes)
+    )
+
+
+def test_every_grid_has_a_script_that_all_runs():
+    from all import NAMES as ALL
+
+    grids = {name for script in ALL for name in __import__(script).EXPERIMENT.grids}
+    assert grids == set(NAMES)
+
+
+def test_methods_of_a_cell_differ_in_what_their_names_say_only():
+    grid = read_grid("ablation", "small")
+    cell = next(cell for cell in grid.cells if cell.scene.label == "fox")
+    jobs = {run.method.label: run.job for run in grid.runs({}) if run.cell == cell}
+    own, square = (flatten_config(jobs[label].system) for label in ("A²TG", "w/o anisotropy"))
+    assert {name for name in own if own[name] != square[name]} == {"texture.anisotropic"}
+    starts = {jobs[label].start.key for label in ("A²TG", "Textured Gaussians*", "2DGS*-MCMC", "w/o anisotropy")}
+    assert starts == {jobs["2DGS*-MCMC, first stage"].key}, "the first stage is trained once"
+
+
+@pytest.mark.parametrize("mb", [0.9, 1.504544, 20.0])
+@pytest.mark.parametrize("floats", [58, 85, 122, 1081])
+def test_equal_bytes_are_no_more_and_less_by_a_splat_at_most(mb, floats):
+    num = splats_in(mb, Method("any", "any", floats=floats))
+    assert num * floats * 4 <= mb * 1e6 + 0.5 < (num + 1) * floats * 4 + 1
+
+
+def test_scenes_are_chosen_and_held_out():
+    labels = lambda **wanted: {cell.scene.label for cell in read_grid("claim", "small", **wanted).cells}  # noqa: E731
+    assert labels() == {"fox", "herz_jesus_p25", "lego", "snowmiku"}
+    assert labels(held_out=False) == labels() - {"snowmiku"}
+    assert labels(scenes=["lego"]) == {"lego"}
+    assert "snowmiku" not in {cell.scene.label for cell in read_grid("defaults", "small").cells}
+    with pytest.raises(ValueError, match="no scene 'dog' at this scale; there are"):
+        labels(scenes=["dog"])
+
+
+def test_a_fingerprint_is_of_what_decides_the_result():
+    quick = a2tg.A2tg.preset("quick")
+    other = dataclasses.replace(quick, texture=dataclasses.replace(quick.texture, fraction=0.5))
+    assert fingerprint(quick, 0) == fingerprint(other, 0), "textures come later"
+    assert fingerprint(quick, 1) != fingerprint(other, 1)
+    assert fingerprint(quick, 0) == fingerprint(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), 0)
+    assert fingerprint(quick, 0) != fingerprint(dataclasses.replace(quick, seed=1), 0)
+    code = (
+        "import a2tg_jax as a; from a2tg_jax.results.plan import fingerprint as f; print(f(a.A2tg.preset('quick'), 1))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told.strip() == fingerprint(quick, 1), "another process says the same"
+
+
+# The queue
+
+
+@dataclasses.dataclass(frozen=True)
+class FakeJob:
+    """What the queue asks of a job."""
+
+    key: str
+    start: "FakeJob | None" = None
+
+
+class FakePool:
+    """Runs jobs at once, or fails them; writes down in which order."""
+
+    def __init__(self, folders, slots=2, memory=np.inf, outcomes=None):
+        self.slots, self.memory, self.folders = slots, memory, folders
+        self.outcomes, self.order, self.most = outcomes or {}, [], 0
+        self.running = []
+
+    def submit(self, job, folders):
+        self.order.append(job.key)
+        handle = concurrent.futures.Future()
+        self.running = [other for other in self.running if not other.collected] + [handle]
+        self.most = max(self.most, len(self.running))
+        handle.collected = False
+        result = handle.result
+
+        def collect():
+            handle.collected = True
+            return result()
+
+        handle.result = collect
+        outcome = self.outcomes.get(job.key, [])
+        error = outcome.pop(0) if outcome else None
+        if error is not None:
+            handle.set_exception(error)
+        else:
+            path = folders.model(job)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+            handle.set_result(record())
+        return handle
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    monkeypatch.setattr(queue, "estimated_bytes", lambda job: 1.0)
+    return Folders(tmp_path, tmp_path)
+
+
+FIRST = FakeJob("first")
+CHAIN = [FakeJob("second", FIRST), FakeJob("other", FIRST), FakeJob("alone")]
+
+
+def run_queue(pool, folders, records, jobs=CHAIN):
+    return queue.run_all(lambda records: iter(jobs), folders, pool, records, lambda job, record: None)
+
+
+def test_each_job_runs_once_and_after_its_start(folders):
+    pool, records = FakePool(folders), {}
+    assert run_queue(pool, folders, records) == []
+    assert sorted(pool.order) == ["alone", "first", "other", "second"] and pool.order.index("first") < 2
+    assert set(records) == set(pool.order)
+    again = FakePool(folders)
+    assert run_queue(again, folders, records) == [] and again.order == [], "a finished run is never run again"
+
+
+def test_a_start_whose_model_is_gone_is_made_again_where_it_is_needed(folders):
+    pool = FakePool(folders)
+    run_queue(pool, folders, {"first": record(), "second": record()})
+    assert sorted(pool.order) == ["alone", "first", "other"]
+
+
+def test_what_fails_is_told_and_takes_down_only_what_needs_it(folders):
+    pool, records = FakePool(folders, outcomes={"first": [ValueError("no such scene")]}), {}
+    (failure,) = run_queue(pool, folders, records)
+    assert failure.job.key == "first" and "no such scene" in failure.reason and set(records) == {"alone"}
+
+
+def test_a_process_that_dies_is_tried_once_more(folders):
+    died = concurrent.futures.BrokenExecutor("killed")
+    pool, records = FakePool(folders, outcomes={"alone": [died]}), {}
+    assert run_queue(pool, folders, records) == [] and pool.order.count("alone") == 2 and "alone" in records
+    (failure,) = run_queue(FakePool(folders, outcomes={"alone": [died, died]}), folders, {}, [FakeJob("alone")])
+    assert "died 2 times" in failure.reason
+
+
+@pytest.mark.parametrize("memory, most", [(np.inf, 2), (1.5, 1), (0.1, 1)])
+def test_jobs_run_beside_each_other_within_slots_and_memory(folders, memory, most):
+    pool = FakePool(folders, memory=memory)
+    run_queue(pool, folders, {}, [FakeJob(str(index)) for index in range(5)])
+    assert pool.most == most
+
+
+def test_what_is_wanted_is_asked_again_after_every_job(folders):
+    def ask(records):
+        yield FIRST
+        if "first" in records:
+            yield FakeJob("follows")
+
+    pool, records = FakePool(folders), {}
+    queue.run_all(ask, folders, pool, records, lambda job, record: None)
+    assert pool.order == ["first", "follows"]
+
+
+def test_an_estimate_of_memory_grows_with_splats_and_texels():
+    job = next(read_grid("claim", "full").jobs({}))
+    small = dataclasses.replace(job, system=next(read_grid("claim", "smoke").jobs({})).system)
+    assert 1e9 < queue.estimated_bytes(small) < queue.estimated_bytes(job)
+
+
+# End to end
+
+
+def call(script, *arguments, **options):
+    command = [sys.executable, str(EXPERIMENTS / f"{script}.py"), "--scale", "smoke", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
+
+
+def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
+    """The claim on the built-in scene, at a tiny scale."""
+    out, work = tmp_path / "out", tmp_path / "work"
+    process = call("claim", "--out", out, "--work", work, "--jobs", 2, start_new_session=True)
+    deadline = time.monotonic() + 300
+    while not (out / "records.json").is_file() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    before = json.loads((out / "records.json").read_text())
+    assert 1 <= len(before) < 7
+    done = call("claim", "--out", out, "--work", work, "--jobs", 2)
+    told, _ = done.communicate(timeout=600)
+    assert done.returncode == 0, told
+    after = json.loads((out / "records.json").read_text())
+    assert len(after) == 7 and {key: after[key] for key in before} == before
+    assert not list((work / "checkpoints").glob("*.npz")), "what is finished needs none"
+    (own,) = [row for row in after.values() if row["stage"] == "textures" and row["system"] == "a2tg"]
+    last = [row for row in after.values() if row["stage"] != "gaussians" and row["num"] != 400]
+    assert len(last) == 2 and all(0.99 * own["mb"] < row["mb"] <= own["mb"] for row in last)
+    assert "against 2DGS*-MCMC, equal bytes" in (out / "claim.md").read_text()
+    again = call("claim", "--out", out, "--work", work)
+    told, _ = again.communicate(timeout=120)
+    assert again.returncode == 0 and ".npz" not in told and " dB;" not in told
+
+
+def test_submitit_sends_jobs_out(tmp_path):
+    """By its executor for processes of this machine."""
+    pytest.importorskip("submitit")
+    out, work = tmp_path / "out", tmp_path / "work"
+    process = call(
+        "efficiency", "--out", out, "--work", work, "--cluster", "local", "--cluster-parameter", "timeout_min=10"
+    )
+    told, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, told
+    assert len(json.loads((out / "records.json").read_text())) == 4
+    assert list((work / "submitit").iterdir())
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [(["--only", "dog"], "no scene 'dog'"), (["--scale", "small", "--scenes", "nowhere"], "nowhere")],
+)
+def test_what_cannot_be_run_is_an_error_that_says_what(arguments, words, tmp_path):
+    command = [
+        sys.executable,
+        str(EXPERIMENTS / "efficiency.py"),
+        "--out",
+        str(tmp_path),
+        "--work",
+        str(tmp_path / "w"),
+    ]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and words in done.stderr and "Traceback" not in done.stderr
+
+
+# Tables
+
+
+CELL = Cell(SceneAt("fox", "fox", 2), 100, 0, (10, 10))
+
+
+def result(label, psnr, seed=0, equal=False, **others):
+    job = Job("fox", 2, a2tg.A2tg(), 0)
+    run = Run(Method(label, "a2tg"), dataclasses.replace(CELL, seed=seed), equal, job)
+    return tables.Result(run, record(psnr, **others))
+
+
+def test_gains_have_the_verdict_that_seeds_allow():
+    gains = [(25.3, 25.0), (25.5, 25.1)]
+    results = [result("own", a, seed) for seed, (a, _) in enumerate(gains)]
+    results += [result("other", b, seed, equal=True) for seed, (_, b) in enumerate(gains)]
+    others = ["other" + tables.EQUAL_BYTES]
+    assert tables.seed_spread(results, "own", others) == pytest.approx(0.1)
+    text = tables.gains_table(results, "own", others)
+    assert "+0.35 (above)" in text and "0.50 a pixel" in text and "differ by 0.10 dB" in text
+    assert tables.verdict([0.05, -0.01], 0.1) == "undecided"
+    assert tables.verdict([-0.3], 0.1) == "below"
+
+
+def test_quality_is_averaged_over_seeds_and_what_is_missing_is_a_dash():
+    grid = Grid("x", "X", "small", "quick", (CELL,), Method("own", "a2tg"), (), ())
+    text = tables.quality_tables(grid, [result("own", 20.0), result("own", 22.0, 1), result("other", 30.0, lpips=None)])
+    assert "| own | 1,000 | 21.00 / .800 / .200 · 1.00 | 21.00 |" in text
+    assert "30.00 / .800 / – · 1.00" in text
+
+
+def test_choices_are_compared_with_the_default():
+    text = tables.choices_table([result("own", 20.0), result("variant", 20.25, lpips=0.19)], "own")
+    assert "| variant | +0.25 · -0.010 | +0.25 · -0.010 | 1.00 |" in text
+
+
+def test_the_plan_counts_what_is_left():
+    grid = read_grid("claim", "smoke")
+    everything = plan_of([grid], {})
+    assert everything.startswith("3 stages left") and "140 iterations" in everything
+    first = next(grid.jobs({}))
+    rest = plan_of([grid], {first.key: record(), first.start.key: record()})
+    assert "0.0 hours" in rest and not rest.startswith("3 ")
+    assert seconds_of_step(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
+
+
+def test_arguments_have_defaults():
+    args = parse_arguments("", [])
+    assert args.scale == "small" and args.scenes == pathlib.Path("scenes") and not args.tables_only
