@@ -3,9 +3,7 @@
 import concurrent.futures
 import dataclasses
 import json
-import os
 import pathlib
-import signal
 import subprocess
 import sys
 import time
@@ -219,15 +217,37 @@ def call(script, *arguments, **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
 
 
+def _processes():
+    """(state, parent) of every process, by number."""
+    found = {}
+    for path in pathlib.Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        found[int(path.parent.name)] = state, int(parent)
+    return found
+
+
+def _is_alive(pid):
+    """Whether a process still runs; one that nobody has waited for does not."""
+    return _processes().get(pid, ("Z", 0))[0] != "Z"
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc/self/stat").is_file(), reason="needs /proc to see processes")
 def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
     """The claim on the built-in scene, at a tiny scale."""
     out, work = tmp_path / "out", tmp_path / "work"
-    process = call("claim", "--out", out, "--work", work, "--jobs", 2, start_new_session=True)
+    process = call("claim", "--out", out, "--work", work, "--jobs", 2)
     deadline = time.monotonic() + 300
     while not (out / "records.json").is_file() and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    workers = [pid for pid, (_, parent) in _processes().items() if parent == process.pid]
+    process.kill()
+    process.communicate()
+    while any(map(_is_alive, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert len(workers) >= 2 and not any(map(_is_alive, workers)), "nobody goes on alone"
     before = json.loads((out / "records.json").read_text())
     assert 1 <= len(before) < 7
     done = call("claim", "--out", out, "--work", work, "--jobs", 2)

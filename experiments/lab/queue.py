@@ -9,6 +9,7 @@ import concurrent.futures
 import dataclasses
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -76,10 +77,19 @@ def _begin_worker(shares: Any) -> None:
     """What a process does before its first job."""
     import a2tg_jax
 
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     cores = shares.get()
     if cores:
         os.sched_setaffinity(0, cores)
     a2tg_jax.configure_cpu()
+
+
+def _end_with_parent() -> None:
+    """Where the program that hands out jobs was killed, nobody waits for this one's."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 class SubmititPool:
@@ -100,6 +110,9 @@ class SubmititPool:
         except ImportError as error:
             raise ValueError("--cluster needs submitit: pip install 'a2tg-jax[experiments]'") from error
         self.slots, self.memory = slots, float("inf")
+        # What is sent out names this package, which its processes must find.
+        paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
         self._executor = submitit.AutoExecutor(folder, cluster=cluster)
         self._executor.update_parameters(**parameters)
 
