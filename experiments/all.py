@@ -6,13 +6,20 @@ Stopped and called again, it goes on where it was. `--plan` tells what is left t
 """
 
 import importlib
+from pathlib import Path
 
 from lab.cli import main
+from lab.pages import refresh
 
 NAMES = (
     "claim", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution", "fixed_number",
     "quick_preset", "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
 )  # fmt: skip
 
+PAGE = Path(__file__).parents[1] / "docs" / "results.md"
+"""Shows tables that lie in experiments/results."""
+
 if __name__ == "__main__":
     main([importlib.import_module(name).EXPERIMENT for name in NAMES], __doc__)
+    if PAGE.is_file():
+        refresh(PAGE, Path(__file__).parent)

@@ -27,7 +27,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     panels.append(("memory of all scenes", sizes, "Gaussians", "MB"))
     log_y = [False] * (len(panels) - 1) + [True]
     lab.out.mkdir(parents=True, exist_ok=True)
-    save_figure(lab.out / "memory_charts.png", plots.chart_row(panels, log_y=log_y))
+    save_figure(lab.out / "memory_charts.png", plots.charts(panels, log_y=log_y))
     print(lab.out / "memory_charts.png")
 
 

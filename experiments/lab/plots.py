@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 COLORS = {
     "A²TG": "#cc3311", "2DGS*-MCMC": "#4477aa", "Textured Gaussians*": "#228833", "SuperGaussians": "#aa3377",
@@ -26,27 +27,37 @@ def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_lab
             x, y = np.array(sorted(points)).T
             axes.plot(x, y, marker="o", markersize=4, linewidth=1.4, label=label, color=color_of(label))
     axes.set_xscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.set_title(title, fontsize=10)
     axes.grid(alpha=0.25, which="both")
 
 
-def chart_row(
+COLUMNS = 3
+
+
+def charts(
     panels: Sequence[tuple[str, Mapping[str, Sequence[Point]], str, str]], *, log_y: Sequence[bool] = ()
 ) -> Figure:
-    """Several charts in a row, with one legend.
+    """Several charts, three in a row, with one legend.
 
     Args:
       panels: title, curves by label, and what the axes say.
       log_y: which panels have a logarithmic y.
     """
-    figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
-    row = np.atleast_1d(figure.subplots(1, len(panels)))
+    columns = min(COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.5), layout="constrained")
+    row = [figure.add_subplot(rows, columns, index + 1) for index in range(len(panels))]
     for index, (axes, (title, curves, x_label, y_label)) in enumerate(zip(row, panels, strict=True)):
         lines(axes, curves, x_label, y_label, title)
         if index < len(log_y) and log_y[index]:
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     handles = {label: handle for axes in row for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, max(1, len(handles))))
     return figure
