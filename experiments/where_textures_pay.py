@@ -14,9 +14,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """By how much A²TG is above plain Gaussians in its bytes."""
     results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
     label = grids[0].reference.label
-    text = tables.gains_table(
-        results, label, [*(method.label + tables.EQUAL_BYTES for method in grids[1].at_equal_bytes), "2DGS*-MCMC"]
-    )
+    others = [*(method.label + tables.EQUAL_BYTES for method in grids[1].at_equal_bytes), "2DGS*-MCMC"]
+    text = tables.gains_table(results, label, others)
     lab.write(EXPERIMENT.name, f"# {grids[1].title}\n\n{text}")
 
 

@@ -14,7 +14,7 @@ QUICK_CAP = 10_000
 QUICK_OPACITY = 0.5
 QUICK_RATES = LearningRates(means=3 * 1.6e-4, sh_degree0=2 * 2.5e-3)
 QUICK_TEXELS = 1e-2
-"""What short runs want (docs/quality.md): Gaussians that begin half opaque, and faster rates."""
+"""What short runs want (docs/results.md): Gaussians that begin half opaque, and faster rates."""
 QUICK: dict[str, Any] = {
     "stage1_iterations": 2_000, "stage2_iterations": 1_000, "initial_opacity": QUICK_OPACITY, "rates": QUICK_RATES,
 }  # fmt: skip
