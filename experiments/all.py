@@ -12,7 +12,7 @@ from lab.cli import main
 from lab.pages import refresh
 
 NAMES = (
-    "claim", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution", "fixed_number",
+    "claim", "texel_rate", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution", "fixed_number",
     "quick_preset", "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
 )  # fmt: skip
 
