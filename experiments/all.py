@@ -12,8 +12,9 @@ from lab.cli import main
 from lab.pages import refresh
 
 NAMES = (
-    "claim", "texel_rate", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution", "fixed_number",
-    "quick_preset", "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
+    "claim", "texel_rate", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution",
+    "fixed_number", "quick_preset", "memory_charts", "resolution_shares", "decomposition", "comparison_pictures",
+    "efficiency",
 )  # fmt: skip
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"

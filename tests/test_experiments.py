@@ -4,14 +4,15 @@ import concurrent.futures
 import dataclasses
 import json
 import pathlib
+import shutil
 import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
-from lab import queue, tables
-from lab.cli import EXPERIMENTS, parse_arguments
+from lab import pages, queue, tables
+from lab.cli import EXPERIMENTS, Lab, parse_arguments
 from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, read_grid, splats_in
 from lab.jobs import Folders, Job
 from lab.plan import plan_of, seconds_of_step
@@ -329,6 +330,29 @@ def test_quality_is_averaged_over_seeds_and_what_is_missing_is_a_dash():
 def test_choices_are_compared_with_the_default():
     text = tables.choices_table([result("own", 20.0), result("variant", 20.25, lpips=0.19)], "own")
     assert "| variant | +0.25 · -0.010 | +0.25 · -0.010 | 1.00 |" in text
+
+
+def test_a_page_shows_the_tables_that_it_names(tmp_path):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "x.md").write_text("# Title\n\n## Part\n\n| a |\n")
+    page = tmp_path / "page.md"
+    page.write_text("Before.\n\n<!-- results/x.md -->\nold\n<!-- end -->\n\nAfter.\n")
+    assert pages.refresh(page, tmp_path) == ["results/x.md"]
+    wanted = "Before.\n\n<!-- results/x.md -->\n\n### Part\n\n| a |\n\n<!-- end -->\n\nAfter.\n"
+    assert page.read_text() == wanted == pages.with_tables(wanted, tmp_path)
+
+
+def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
+    """Every table of docs/results.md, made anew from the records."""
+    page = (EXPERIMENTS.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    assert pages.with_tables(page, EXPERIMENTS) == page
+    made_from_models = {"decomposition", "efficiency"}
+    for name in {pathlib.Path(name).stem for name in pages.names(page)} - made_from_models:
+        shutil.copy(EXPERIMENTS / "results" / "small" / "records.json", tmp_path)
+        lab = Lab(parse_arguments("", ["--tables-only", "--out", str(tmp_path), "--work", str(tmp_path / "none")]))
+        experiment = __import__(name).EXPERIMENT
+        experiment.present(lab, [lab.grid(grid) for grid in experiment.grids])
+        assert (tmp_path / f"{name}.md").read_text() == (EXPERIMENTS / "results" / "small" / f"{name}.md").read_text()
 
 
 def test_the_plan_counts_what_is_left():

@@ -1,8 +1,10 @@
 """What an experiment is, and the command line of all of them: what to run, where, and what is written in the end."""
 
 import argparse
+import contextlib
 import dataclasses
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -43,7 +45,8 @@ class Lab:
         if self.args.tables_only:
             return []
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
-        return run_all(jobs, self.folders, self._pool(), self.records, self._keep)
+        with contextlib.closing(self._pool()) as pool:
+            return run_all(jobs, self.folders, pool, self.records, self._keep)
 
     def model(self, result: Result) -> a2tg.Model | None:
         """What a run left; None, and a line that says so, where it is gone."""
@@ -147,9 +150,10 @@ def _machine_bytes() -> float:
 
 
 def _default_jobs() -> int:
-    """One a GPU, where jobs would share its memory; else one a core."""
-    import jax
-
-    if jax.default_backend() == "gpu":
+    """One where there is a GPU, whose memory jobs would share; else one a core."""
+    # Another process asks: this one would take the GPU's memory for itself.
+    script = "import jax; print(jax.default_backend())"
+    asked = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    if asked.stdout.strip() == "gpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -27,8 +27,7 @@ def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_lab
             x, y = np.array(sorted(points)).T
             axes.plot(x, y, marker="o", markersize=4, linewidth=1.4, label=label, color=color_of(label))
     axes.set_xscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     axes.set_xlabel(x_label)
@@ -57,7 +56,9 @@ def charts(
         lines(axes, curves, x_label, y_label, title)
         if index < len(log_y) and log_y[index]:
             axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
     handles = {label: handle for axes in row for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, max(1, len(handles))))
     return figure

@@ -48,6 +48,10 @@ class Pool(Protocol):
 
     def submit(self, job: Job, folders: Folders) -> Handle: ...
 
+    def close(self) -> None:
+        """Gives back what it holds, such as the memory of a GPU."""
+        ...
+
 
 class LocalPool:
     """Processes of this machine, each with its share of the cores, which stay for one job after another: what one has
@@ -71,6 +75,9 @@ class LocalPool:
         except concurrent.futures.BrokenExecutor:
             self._executor = self._new_executor()
             return self._executor.submit(run_job, job, folders)
+
+    def close(self) -> None:
+        self._executor.shutdown()
 
 
 def _begin_worker(shares: Any) -> None:
@@ -118,6 +125,9 @@ class SubmititPool:
 
     def submit(self, job: Job, folders: Folders) -> Handle:
         return self._executor.submit(_run_elsewhere, job, folders)
+
+    def close(self) -> None:
+        pass
 
 
 def _run_elsewhere(job: Job, folders: Folders) -> Record:

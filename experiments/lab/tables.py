@@ -198,19 +198,33 @@ QUALITY_COLUMNS = (("psnr", "PSNR", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 
 
 
 def choices_table(results: Sequence[Result], default: str) -> str:
-    """What each variant gains over the default, in dB and LPIPS, on each scene and on average."""
-    columns = list(dict.fromkeys(result.column for result in results))
-    base = {result.column: result for result in results if result.label == default}
+    """What each variant gains over the default, in dB and LPIPS, in each cell and on average."""
+    counts = {result.run.cell.gaussians for result in results}
+
+    def place(result: Result) -> str:
+        return result.column if len(counts) == 1 else f"{result.column}, {result.run.cell.gaussians:,}"
+
+    columns = list(dict.fromkeys(map(place, results)))
+    base = {place(result): result for result in results if result.label == default}
     rows = []
     for label, own in _grouped(results, lambda result: result.label):
-        found = {result.column: result for result in own}
+        found = {place(result): result for result in own}
         if label == default:
             shown = [quality([found[column]]) if column in found else MISSING for column in columns]
             rows.append([f"*{default}, as it is*", *shown, number(mean(own, "psnr"), 2), number(mean(own, "mb"), 2)])
             continue
-        both = [column for column in columns if column in found and column in base]
-        gains = {c: (found[c]["psnr"] - base[c]["psnr"], found[c]["lpips"] - base[c]["lpips"]) for c in both}
-        shown = ["{:+.2f} · {:+.3f}".format(*gains[c]) if c in gains else MISSING for c in columns]
-        average = "{:+.2f} · {:+.3f}".format(*np.mean(list(gains.values()), axis=0)) if gains else MISSING
+        gains = {column: _gain(found[column], base[column]) for column in columns if column in found and column in base}
+        shown = [_told(gains[column]) if column in gains else MISSING for column in columns]
+        average = _told(np.mean(list(gains.values()), axis=0)) if gains else MISSING
         rows.append([label, *shown, average, number(mean(own, "mb"), 2)])
     return markdown(["choice", *(f"{column}: dB · LPIPS" for column in columns), "mean", "MB"], rows)
+
+
+def _gain(result: Result, base: Result) -> tuple[float, float]:
+    """In PSNR and in LPIPS."""
+    return result["psnr"] - base["psnr"], result["lpips"] - base["lpips"]
+
+
+def _told(gain: Sequence[float]) -> str:
+    decibels, distance = gain
+    return f"{decibels:+.2f} · {distance:+.3f}"
