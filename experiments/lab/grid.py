@@ -29,6 +29,8 @@ class Method:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     floats: int | None = None
     """Of a splat; needed for a given number of bytes."""
+    most: int | None = None
+    """Left out where a cell has more Gaussians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +91,8 @@ class Grid:
         """Every run that can be named already, in the order of the cells."""
         for cell in self.cells:
             for method in dict.fromkeys((self.reference, *self.methods)):
+                if method.most is not None and cell.gaussians > method.most:
+                    continue
                 yield Run(method, cell, False, self._job(method, cell, cell.gaussians))
             reference = self.reference_record(cell, records)
             for method in self.at_equal_bytes if reference else ():
