@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.results.folder import read_json
-from lab.grid import Grid, Run
+from lab.grid import Cell, Grid, Run
 from lab.jobs import Record
 
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
@@ -120,28 +120,42 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
       others: labels of those it is compared with; `EQUAL_BYTES` ends the name of one at equal bytes.
     """
     spread = seed_spread(results, reference, others)
-    rows = []
+    rows: list[list[str]] = []
+    every: dict[str, list[float]] = {other: [] for other in others}
     for place, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         own = [result for result in block if result.label == reference]
         if not own:
             continue
         shown = []
         for other in others:
-            gains = _gains(block, reference, other, "psnr")
-            if not gains:
-                shown.append(MISSING)
-                continue
-            lpips = _gains(block, reference, other, "lpips")
-            shown.append(f"{np.mean(gains):+.2f} ({verdict(gains, spread)}) · {np.mean(lpips):+.3f}")
-        width, height = own[0].record["pixels"]
-        length = "+".join(f"{count:,}" for count in place.iterations)
-        density = place.gaussians / (width * height)
-        where = [place.scene.label, f"{width}×{height}", length, f"{place.gaussians:,} ({density:.2f} a pixel)"]
-        seeds = len({result.run.cell.seed for result in own})
-        rows.append([*where, number(mean(own, "mb"), 2), quality(own), str(seeds), *shown])
+            gains, lpips = (_gains(block, reference, other, figure) for figure in ("psnr", "lpips"))
+            every[other] += [float(np.mean(gains))] if gains else []
+            told = f"{np.mean(gains):+.2f} ({verdict(gains, spread)}) · {np.mean(lpips):+.3f}" if gains else MISSING
+            shown.append(told)
+        rows.append([*_told_place(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
+    rows.append(["*mean ± standard error*", *[""] * 6, *map(_mean_and_error, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
     text = markdown([*header, *(f"against {other}: dB · LPIPS" for other in others)], rows)
     return text + f"\nTwo seeds differ by {spread:.2f} dB in such a difference (root mean square); less is undecided.\n"
+
+
+def _told_place(cell: Cell, result: Result) -> list[str]:
+    """Scene, pixels, iterations and Gaussians of a cell."""
+    width, height = result.record["pixels"]
+    length = "+".join(f"{count:,}" for count in cell.iterations)
+    density = cell.gaussians / (width * height)
+    return [cell.scene.label, f"{width}×{height}", length, f"{cell.gaussians:,} ({density:.2f} a pixel)"]
+
+
+def _seeds(results: Sequence[Result]) -> str:
+    return str(len({result.run.cell.seed for result in results}))
+
+
+def _mean_and_error(gains: Sequence[float]) -> str:
+    """Over the cells; the error is that of independent ones."""
+    if len(gains) < 2:
+        return MISSING
+    return f"{np.mean(gains):+.2f} ± {np.std(gains, ddof=1) / np.sqrt(len(gains)):.2f}"
 
 
 def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float:
