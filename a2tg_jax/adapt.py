@@ -17,7 +17,6 @@ from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
-from a2tg_jax.numerics import safe_norm
 from a2tg_jax.optim import AdamState
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
 
@@ -91,12 +90,7 @@ class Upscale(HostEvent):
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
 
     def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
-        for gradient, is_visible in zip(seen.gradients, seen.is_visible, strict=True):
-            if self.gradient != "position":
-                half = jnp.asarray([seen.cameras.width / 2, seen.cameras.height / 2, 1.0], gradient.dtype)
-                gradient = gradient * half[None]
-            state = state.observe(safe_norm(gradient), is_visible)
-        return state
+        return state.observe_views(seen.gradients, seen.is_visible)
 
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         layout, num = model.layout, model.num

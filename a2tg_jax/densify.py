@@ -29,7 +29,6 @@ from a2tg_jax.events import (
 from a2tg_jax.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
-from a2tg_jax.numerics import safe_norm
 from a2tg_jax.optim import AdamState
 
 SPLIT_SHRINK = 1.6
@@ -89,10 +88,7 @@ class CloneSplitPrune(StepEvent):
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
 
     def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
-        half = jnp.asarray([seen.cameras.width / 2, seen.cameras.height / 2, 1.0], seen.gradients.dtype)
-        for gradient, is_visible in zip(seen.gradients, seen.is_visible, strict=True):
-            state = state.observe(safe_norm(gradient * half[None]), is_visible)
-        return state
+        return state.observe_views(seen.gradients, seen.is_visible)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         edit, num_refused = self.plan(now, model, state.average())

@@ -40,7 +40,8 @@ class Seen(NamedTuple):
     cameras: Camera
     """V cameras, stacked."""
     gradients: Array
-    """[V, N, 3] the statistic that the event asked for (`render.render_traced`), 0 where a Gaussian was not seen."""
+    """[V, N, 3] the statistic that the event asked for (`render.render_traced`), on the screen in units of half an
+    image; 0 where a Gaussian was not seen."""
     is_visible: Array
     """[V, N] whether the Gaussian was composited at one pixel at least."""
 

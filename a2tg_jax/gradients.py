@@ -10,6 +10,7 @@ from jax import Array
 
 from a2tg_jax.cameras import Camera, check_camera
 from a2tg_jax.gaussians import Gaussians, check_gaussians
+from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.pixel import Statistic
@@ -84,7 +85,5 @@ def view_gradients(
     probe = jnp.zeros((model.gaussians.num, 4), dtype)
     differentiate = jax.value_and_grad(of_parameters, argnums=(0, 1, 2), has_aux=True)
     (value, (output, num_pairs)), (gaussians, params, found) = differentiate(model.gaussians, model.params, probe)
-    statistics, is_visible = found[:, :3], found[:, 3] > 0
-    if statistic != "position":
-        statistics = statistics * jnp.asarray([[camera.width / 2, camera.height / 2, 1.0]], dtype)
+    statistics, is_visible = read_probe(found, statistic, camera.width, camera.height)
     return ViewGradients(value, gaussians, params, safe_norm(statistics), is_visible, output, num_pairs)

@@ -11,6 +11,7 @@ from a2tg_jax.cameras import Camera
 from a2tg_jax.densify import CloneSplitPrune, Edit, OpacityReset, apply_edit, reset_interval
 from a2tg_jax.events import Change, EventInfo, Now, Seen
 from a2tg_jax.gaussians import Gaussians, logit, rotation_matrices
+from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.optim import adam_init
 
@@ -124,9 +125,10 @@ def test_average_is_of_the_views_that_saw_the_gaussian_in_half_images():
     rng = np.random.default_rng(0)
     gradients, is_visible = rng.normal(size=(3, NUM, 3)).astype(np.float32), rng.random((3, NUM)) < 0.6
     gradients[..., 2] = 0
+    probe = jnp.concatenate([jnp.asarray(gradients), 5.0 * jnp.asarray(is_visible)[..., None]], axis=-1)
     camera = Camera(jnp.zeros((3, 4, 4)), jnp.zeros((3, 3, 3)), 640, 480)
     event, model = CloneSplitPrune(NUM), random_model(0)
-    state = event.observe(event.init(model), model, Seen(camera, jnp.asarray(gradients), jnp.asarray(is_visible)))
+    state = event.observe(event.init(model), model, Seen(camera, *read_probe(probe, "center", 640, 480)))
     for row in range(NUM):
         seen = [np.hypot(*(gradients[view, row, :2] * (320, 240))) for view in range(3) if is_visible[view, row]]
         np.testing.assert_allclose(state.average()[row], np.mean(seen) if seen else 0, rtol=1e-5)

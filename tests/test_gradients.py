@@ -14,6 +14,7 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 import a2tg_jax as a2tg
 from a2tg_jax import Model, RenderSettings, Textured, view_gradients
 from a2tg_jax.events import Seen
+from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.render import render_traced
 
 
@@ -68,7 +69,7 @@ def test_norms_are_those_that_events_average(event):
         return loss(model, output)
 
     gradients = jax.grad(of_probe)(jnp.zeros((50, 4)))
-    seen = Seen(camera, gradients[None, :, :3], gradients[None, :, 3] > 0)
+    seen = Seen(camera, *read_probe(gradients[None], event.statistic, camera.width, camera.height))
     average = event.observe(event.init(model), model, seen).average()
     assert average.max() > 0
     np.testing.assert_allclose(jnp.where(found.is_visible, found.norms, 0.0), average, rtol=1e-5, atol=1e-6)

@@ -16,6 +16,7 @@ from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
 from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState, adam_init, adam_update
 from a2tg_jax.render import RenderSettings, render_traced
@@ -115,7 +116,7 @@ def train_step(
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
     model, moments = _updated(stage, state, grads, rate)
     now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
-    seen = _seen(batch, found)
+    seen = _seen(stage, batch, found)
     model, moments, events, info = _events(stage, clock, now, seen, model, moments, state.events)
 
     status = _status(found, grads, model, info)
@@ -186,13 +187,13 @@ def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
     return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
 
 
-def _seen(batch: Photographs, found: _ViewGradients) -> Seen | None:
+def _seen(stage: Stage, batch: Photographs, found: _ViewGradients) -> Seen | None:
     """What events observe; None where nothing is gathered."""
     if found.statistic is None:
         return None
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
-    return Seen(cameras, found.statistic[..., :3], found.statistic[..., 3] > 0)
+    return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height))
 
 
 def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
