@@ -125,7 +125,7 @@ def test_average_is_of_the_views_that_saw_the_gaussian_in_half_images():
     rng = np.random.default_rng(0)
     gradients, is_visible = rng.normal(size=(3, NUM, 3)).astype(np.float32), rng.random((3, NUM)) < 0.6
     gradients[..., 2] = 0
-    probe = jnp.concatenate([jnp.asarray(gradients), 5.0 * jnp.asarray(is_visible)[..., None]], axis=-1)
+    probe = jnp.asarray(np.concatenate([gradients, np.float32(5) * is_visible[..., None]], axis=-1))
     camera = Camera(jnp.zeros((3, 4, 4)), jnp.zeros((3, 3, 3)), 640, 480)
     event, model = CloneSplitPrune(NUM), random_model(0)
     state = event.observe(event.init(model), model, Seen(camera, *read_probe(probe, "center", 640, 480)))
