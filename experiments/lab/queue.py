@@ -20,8 +20,9 @@ from lab.jobs import Folders, Job, Record, run_job
 POLL_SECONDS = 0.5
 MOST_DEATHS = 2
 """A job whose process died is tried once more."""
-BASE_BYTES = 1.0e9
-"""Of a process that trains: libraries, compiled programs, a small scene."""
+BASE_BYTES = 4.0e9
+"""Of a process that trains: libraries, a small scene, and the programs of a hundred jobs, which it keeps until they are
+too many."""
 COPIES = 12
 """A trained number is kept so many times: itself, gradients, Adam's moments, sums of threads."""
 
