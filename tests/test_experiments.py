@@ -114,7 +114,10 @@ class FakePool:
     def __init__(self, folders, slots=2, memory=np.inf, outcomes=None):
         self.slots, self.memory, self.folders = slots, memory, folders
         self.outcomes, self.order, self.most = outcomes or {}, [], 0
-        self.running = []
+        self.running, self.failures = [], []
+
+    def is_death(self, error):
+        return isinstance(error, concurrent.futures.BrokenExecutor)
 
     def submit(self, job, folders):
         self.order.append(job.key)
@@ -152,7 +155,9 @@ CHAIN = [FakeJob("second", FIRST), FakeJob("other", FIRST), FakeJob("alone")]
 
 
 def run_queue(pool, folders, records, jobs=CHAIN):
-    return queue.run_all(lambda records: iter(jobs), folders, pool, records, lambda job, record: None)
+    return queue.run_all(
+        lambda records: iter(jobs), folders, pool, records, lambda job, record: None, pool.failures.append
+    )
 
 
 def test_each_job_runs_once_and_after_its_start(folders):
@@ -174,6 +179,7 @@ def test_what_fails_is_told_and_takes_down_only_what_needs_it(folders):
     pool, records = FakePool(folders, outcomes={"first": [ValueError("no such scene")]}), {}
     (failure,) = run_queue(pool, folders, records)
     assert failure.job.key == "first" and "no such scene" in failure.reason and set(records) == {"alone"}
+    assert pool.failures == [failure], "told at once"
 
 
 def test_a_process_that_dies_is_tried_once_more(folders):
@@ -181,7 +187,32 @@ def test_a_process_that_dies_is_tried_once_more(folders):
     pool, records = FakePool(folders, outcomes={"alone": [died]}), {}
     assert run_queue(pool, folders, records) == [] and pool.order.count("alone") == 2 and "alone" in records
     (failure,) = run_queue(FakePool(folders, outcomes={"alone": [died, died]}), folders, {}, [FakeJob("alone")])
-    assert "died 2 times" in failure.reason
+    assert "died twice" in failure.reason
+
+
+def test_a_neighbour_of_one_that_dies_is_not_blamed(folders):
+    """Two that ran together are tried alone."""
+    died = concurrent.futures.BrokenExecutor("killed")
+    jobs = [FakeJob("guilty"), FakeJob("innocent"), FakeJob("third")]
+    pool = FakePool(folders, outcomes={"guilty": [died, died], "innocent": [died]})
+    records = {}
+    (failure,) = run_queue(pool, folders, records, jobs)
+    assert failure.job.key == "guilty" and set(records) == {"innocent", "third"}
+
+
+def test_a_job_that_leaves_no_model_has_failed(folders):
+    pool = FakePool(folders)
+    lost = FakeJob("lost")
+    submit = pool.submit
+
+    def forget(job, folders):
+        handle = submit(job, folders)
+        folders.model(job).unlink()
+        return handle
+
+    pool.submit = forget
+    (failure,) = run_queue(pool, folders, {}, [lost])
+    assert "left no model" in failure.reason
 
 
 @pytest.mark.parametrize("memory, most", [(np.inf, 2), (1.5, 1), (0.1, 1)])
@@ -198,7 +229,7 @@ def test_what_is_wanted_is_asked_again_after_every_job(folders):
             yield FakeJob("follows")
 
     pool, records = FakePool(folders), {}
-    queue.run_all(ask, folders, pool, records, lambda job, record: None)
+    queue.run_all(ask, folders, pool, records, lambda job, record: None, pool.failures.append)
     assert pool.order == ["first", "follows"]
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -123,9 +124,35 @@ def _is_equal(a: Stage, b: Stage) -> bool:
 def fingerprint(system: System, index: int) -> str:
     """A text that two systems share where they make the same of a stage's start, in this process or another.
 
-    It tells classes apart by module and name, and is another one for another version's options.
+    It tells classes and functions apart by module and name, and is another one for another version's options.
+
+    Raises:
+      ValueError: if a stage holds a function without such a name, or a value that nothing is known of.
     """
-    leaves, structure = jax.tree.flatten(system.stages()[index])
-    classes = [f"{kind.__module__}.{kind.__qualname__}" for kind in classes_of(system.stages()[index])]
-    numbers = [np.asarray(leaf).tolist() for leaf in leaves]
-    return repr((_common_options(system), classes, str(structure), numbers))
+    return repr((_common_options(system), _described(system.stages()[index])))
+
+
+def _described(value: Any) -> Any:
+    """A value of a stage as numbers, texts and tuples, the same in every process."""
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
+        return _name_of(type(value)), fields
+    if isinstance(value, tuple | list):
+        return _name_of(type(value)), *map(_described, value)
+    if isinstance(value, Mapping):
+        return tuple((_described(key), _described(value[key])) for key in value)
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return np.asarray(value).tolist()
+    if isinstance(value, type) or callable(value):
+        return _name_of(value)
+    raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
+
+
+def _name_of(value: Any) -> str:
+    """Module and name of a class or function."""
+    name = getattr(value, "__qualname__", "<nameless>")
+    if "<" in name and not isinstance(value, type):
+        raise ValueError(f"a stage holds {value!r}: make it a function of a module, which has a name of its own")
+    return f"{value.__module__}.{name}"

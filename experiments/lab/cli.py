@@ -6,7 +6,7 @@ import dataclasses
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +44,10 @@ class Lab:
         """Runs what is not finished of the grids, unless only tables are wanted."""
         if self.args.tables_only:
             return []
+        self._save()
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
         with contextlib.closing(self._pool()) as pool:
-            return run_all(jobs, self.folders, pool, self.records, self._keep)
+            return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)
 
     def model(self, result: Result) -> a2tg.Model | None:
         """What a run left; None, and a line that says so, where it is gone."""
@@ -64,14 +65,18 @@ class Lab:
         print(f"\n{text}\n{self.out / name}.md", flush=True)
 
     def _keep(self, job: Job, record: Record) -> None:
-        kept = {**self._kept(), job.key: record}
-        self.out.mkdir(parents=True, exist_ok=True)
-        write_json(self._file, dict(sorted(kept.items())))
+        self._save()
         print(
-            f"{len(kept):4d}  {job.key}: {record['num']} splats, {record['mb']:.2f} MB, {record['psnr']:.2f} dB; "
-            f"{record['seconds']:.0f} s, {record['ms_per_step']:.0f} ms a step, {record['peak_mb']:.0f} MB of memory",
+            f"{len(self.records):4d}  {job.key}: {record['num']} splats, {record['mb']:.2f} MB, "
+            f"{record['psnr']:.2f} dB; {record['seconds']:.0f} s, {record['ms_per_step']:.0f} ms a step",
             flush=True,
         )
+
+    def _save(self) -> None:
+        """Adds the records to those in the results, where another program may have added some."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        with _locked(self.out / ".lock"):
+            write_json(self._file, dict(sorted({**self._kept(), **self.records}.items())))
 
     def _kept(self) -> dict[str, Record]:
         return read_json(self._file) if self._file.is_file() else {}
@@ -118,6 +123,23 @@ def main(experiments: Sequence[Experiment], description: str) -> None:
     if failures:
         told = "\n".join(f"  {failure.job.key}: {failure.reason}" for failure in failures)
         sys.exit(f"error: {len(failures)} jobs failed, and what needs them was not run; call again to retry:\n{told}")
+
+
+def _tell_failure(failure: Failure) -> None:
+    print(f"FAILED {failure.job.key}: {failure.reason}", flush=True)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """One program at a time, where the system can see to that."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with open(path, "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def parse_arguments(description: str, arguments: Sequence[str] | None = None) -> argparse.Namespace:

@@ -7,15 +7,15 @@ for the same stage gets the same job, so that a first stage is trained once howe
 import dataclasses
 import functools
 import hashlib
-import resource
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.folder import write_json
-from a2tg_jax.results.plan import fingerprint
+from a2tg_jax.origin import WHITE
+from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.results.plan import fingerprint, is_same_so_far
 from a2tg_jax.results.record import SceneSource
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
@@ -84,12 +84,19 @@ class Folders:
 
 
 def run_job(job: Job, folders: Folders) -> Record:
-    """Trains a job, from its checkpoint where it was stopped, and measures what it made (host)."""
+    """Trains a job, from its checkpoint where it was stopped, and measures what it made (host).
+
+    One that was trained before, but measured without LPIPS or with that of another network, is measured again.
+    """
     scene = folders.load_scene(job)
-    result = _train(job, folders, scene)
-    record = _record(job, scene, result, folders)
-    a2tg.save_model(_ready(folders.model(job)), result.model)
-    write_json(_ready(folders.record(job)), record)
+    path, model = folders.record(job), folders.model(job)
+    if path.is_file() and model.is_file():
+        record = {**read_json(path), **_quality(scene, a2tg.load_model(model), folders)}
+    else:
+        result = _train(job, folders, scene)
+        a2tg.save_model(_ready(model), result.model)
+        record = {**_told_training(job, scene, result), **_quality(scene, result.model, folders)}
+    write_json(_ready(path), record)
     folders.checkpoint(job).unlink(missing_ok=True)
     return record
 
@@ -102,29 +109,48 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene) -> a2tg.StageResult:
         job.system,
         job.stage,
         start,
-        resume=a2tg.load_checkpoint(path, system=type(job.system)) if path.is_file() else None,
+        resume=_load_checkpoint(path, job) if path.is_file() else None,
         on_checkpoint=lambda checkpoint: a2tg.save_checkpoint(path, checkpoint),
         checkpoint_every=max(500, job.iterations // 10),
         progress=False,
     )
 
 
-def _record(job: Job, scene: a2tg.Scene, result: a2tg.StageResult, folders: Folders) -> Record:
-    train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
-    on_test = a2tg.evaluate(scene.test, result.model, lpips_weights=folders.lpips_weights)
-    on_train = a2tg.evaluate(train, result.model)
+def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
+    """A checkpoint of this stage, perhaps of another system that shares it."""
+    checkpoint = a2tg.load_checkpoint(path)
+    if not is_same_so_far(checkpoint.system, job.system, job.stage):
+        raise ValueError(f"{path} was made with other numbers than {job.key} has: delete it")
+    return dataclasses.replace(checkpoint, system=job.system)
+
+
+def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:
+    """What was trained, and what it took."""
     first = scene.test[0].camera
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
         "system": reference_of(job.system), "options": differences(job.system), "stage": result.name,
-        "iterations": job.iterations,
-        "num": result.model.num, "mb": result.model.num_bytes / 1e6,
+        "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
+        "seconds": result.seconds, "ms_per_step": _milliseconds(result.history),
+    }  # fmt: skip
+
+
+def _quality(scene: a2tg.Scene, model: a2tg.Model, folders: Folders) -> Record:
+    """On the test views, and on some of those it was trained on."""
+    train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
+    background = background_of(scene)
+    on_test = a2tg.evaluate(scene.test, model, background=background, lpips_weights=folders.lpips_weights)
+    on_train = a2tg.evaluate(train, model, background=background)
+    return {
         "psnr": on_test.psnr, "ssim": on_test.ssim, "lpips": on_test.lpips, "lpips_network": on_test.lpips_network,
         "train_psnr": on_train.psnr, "fps": on_test.frames_per_second,
-        "seconds": result.seconds, "ms_per_step": _milliseconds(result.history),
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
     }  # fmt: skip
+
+
+def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
+    """White behind transparent photographs, whatever a system was trained on: all are measured alike."""
+    return WHITE if scene.test[0].alpha is not None else None
 
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:

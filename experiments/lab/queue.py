@@ -18,8 +18,6 @@ from typing import Any, Protocol
 from lab.jobs import Folders, Job, Record, run_job
 
 POLL_SECONDS = 0.5
-MOST_DEATHS = 2
-"""A job whose process died is tried once more."""
 BASE_BYTES = 4.0e9
 """Of a process that trains: libraries, a small scene, and the programs of a hundred jobs, which it keeps until they are
 too many."""
@@ -29,6 +27,14 @@ COPIES = 12
 Records = Mapping[str, Record]
 Ask = Callable[[Records], Iterable[Job]]
 """The jobs that are wanted, given the records of those that are finished."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A job that could not be run."""
+
+    job: Job
+    reason: str
 
 
 class Handle(Protocol):
@@ -48,6 +54,10 @@ class Pool(Protocol):
     """Bytes they may take together."""
 
     def submit(self, job: Job, folders: Folders) -> Handle: ...
+
+    def is_death(self, error: Exception) -> bool:
+        """Whether an error says that a job's process died, and nothing of the job itself."""
+        ...
 
     def close(self) -> None:
         """Gives back what it holds, such as the memory of a GPU."""
@@ -77,8 +87,11 @@ class LocalPool:
             self._executor = self._new_executor()
             return self._executor.submit(run_job, job, folders)
 
+    def is_death(self, error: Exception) -> bool:
+        return isinstance(error, concurrent.futures.BrokenExecutor)
+
     def close(self) -> None:
-        self._executor.shutdown()
+        self._executor.shutdown(cancel_futures=True)
 
 
 def _begin_worker(shares: Any) -> None:
@@ -123,12 +136,20 @@ class SubmititPool:
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
         self._executor = submitit.AutoExecutor(folder, cluster=cluster)
         self._executor.update_parameters(**parameters)
+        self._sent: list[Any] = []
 
     def submit(self, job: Job, folders: Folders) -> Handle:
-        return self._executor.submit(_run_elsewhere, job, folders)
+        self._sent.append(self._executor.submit(_run_elsewhere, job, folders))
+        return self._sent[-1]
+
+    def is_death(self, error: Exception) -> bool:
+        """Killed, or out of its time; where it left a checkpoint, it goes on from that."""
+        return type(error).__name__ == "UncompletedJobError"
 
     def close(self) -> None:
-        pass
+        for handle in self._sent:
+            if not handle.done():
+                handle.cancel()
 
 
 def _run_elsewhere(job: Job, folders: Folders) -> Record:
@@ -138,16 +159,13 @@ def _run_elsewhere(job: Job, folders: Folders) -> Record:
     return run_job(job, folders)
 
 
-@dataclasses.dataclass(frozen=True)
-class Failure:
-    """A job that could not be run."""
-
-    job: Job
-    reason: str
-
-
 def run_all(
-    ask: Ask, folders: Folders, pool: Pool, records: dict[str, Record], on_record: Callable[[Job, Record], None]
+    ask: Ask,
+    folders: Folders,
+    pool: Pool,
+    records: dict[str, Record],
+    on_record: Callable[[Job, Record], None],
+    on_failure: Callable[[Failure], None],
 ) -> list[Failure]:
     """Runs all that is wanted and not finished, and adds its records.
 
@@ -157,6 +175,7 @@ def run_all(
       pool: what runs them.
       records: of finished jobs, by key; added to.
       on_record: called with each job that was run.
+      on_failure: called with each job that could not be.
 
     Returns:
       The jobs that failed. Those that need their results are not run.
@@ -164,38 +183,51 @@ def run_all(
     running: dict[str, tuple[Job, Handle]] = {}
     failures: dict[str, Failure] = {}
     deaths: collections.Counter[str] = collections.Counter()
+
+    def fail(job: Job, reason: str) -> None:
+        failures[job.key] = Failure(job, reason)
+        on_failure(failures[job.key])
+
     wanted = list(ask(records))
     while True:
         for job in _ready(wanted, folders, records):
             others = [other for other, _ in running.values()]
-            if job.key not in running and job.key not in failures and _fits(job, others, pool):
+            is_open = job.key not in running and job.key not in failures
+            if is_open and _fits(job, others, pool, deaths):
                 running[job.key] = job, pool.submit(job, folders)
         if not running:
             return list(failures.values())
+        was_alone = len(running) == 1
         ended = [key for key, (_, handle) in running.items() if handle.done()]
         for key in ended:
             job, handle = running.pop(key)
             try:
                 record = handle.result()
-            except concurrent.futures.BrokenExecutor as error:  # A process died, with all that ran beside it.
-                deaths[key] += 1
-                if deaths[key] == MOST_DEATHS:
-                    failures[key] = Failure(job, f"its process died {MOST_DEATHS} times, of memory? {error}")
             except Exception as error:
-                failures[key] = Failure(job, f"{type(error).__name__}: {error}")
+                if not pool.is_death(error):
+                    fail(job, f"{type(error).__name__}: {error}")
+                elif deaths[key] and was_alone:
+                    fail(job, f"its process died twice, the second time with nothing beside it; of memory? {error}")
+                else:
+                    deaths[key] += 1
             else:
-                records[key] = record
-                on_record(job, record)
+                if folders.model(job).is_file():
+                    records[key] = record
+                    on_record(job, record)
+                else:
+                    fail(job, f"it was run, but left no model at {folders.model(job)}")
         if ended:
             wanted = list(ask(records))
         else:
             time.sleep(POLL_SECONDS)
 
 
-def _fits(job: Job, others: list[Job], pool: Pool) -> bool:
-    """Whether a job may run beside others; one alone always may."""
+def _fits(job: Job, others: list[Job], pool: Pool, deaths: Mapping[str, int]) -> bool:
+    """Whether a job may run beside others. One alone always may; one that died, or whose neighbour did, only alone."""
+    if not others:
+        return True
     is_room = sum(map(estimated_bytes, [*others, job])) <= pool.memory
-    return not others or (len(others) < pool.slots and is_room)
+    return len(others) < pool.slots and is_room and not any(deaths.get(one.key) for one in [*others, job])
 
 
 def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]:
