@@ -31,7 +31,6 @@ class jit:
         function: Callable,
         *,
         static_argnums: tuple[int, ...] = (),
-        static_argnames: tuple[str, ...] = (),
         donate_argnums: tuple[int, ...] = (),
     ):
         def of_classes(classes, /, *args, **kwargs):
@@ -41,7 +40,6 @@ class jit:
         self._jitted: Any = jax.jit(
             of_classes,
             static_argnums=(0, *(number + 1 for number in static_argnums)),
-            static_argnames=static_argnames,
             donate_argnums=tuple(number + 1 for number in donate_argnums),
         )
 

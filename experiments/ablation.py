@@ -14,7 +14,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Ours, then the paper's."""
     (grid,) = grids
     results = tables.results_of(grid, lab.records)
-    others = ["w/o anisotropy", "w/o upscaling, 1×1 textures", "2DGS*-MCMC", "Textured Gaussians*"]
+    others = [method.label for method in grid.methods]
     gains = tables.gains_table(results, grid.reference.label, others)
     ours = tables.quality_tables(grid, results) + "\n## At the same number of Gaussians\n\n" + gains
     paper = tables.paper_table("ablation", "gaussians", tables.QUALITY_COLUMNS)

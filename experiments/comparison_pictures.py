@@ -18,27 +18,37 @@ ZOOM = 4
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Of each scene whose models are there, the first test view, and the part in which A²TG gains most."""
+    """Of each scene whose models are there, the test view, and the part of it, in which the reference gains most."""
     (grid,) = grids
     for scene in dict.fromkeys(cell.scene for cell in grid.cells):
         results = [result for result in tables.results_of(grid, lab.records) if result.run.cell.scene == scene]
         models = {result.label: lab.model(result) for result in results}
-        models = {label: model for label, model in models.items() if model is not None}
-        if len(models) > 1:
-            view = lab.folders.load_scene(results[0].run.job).test[0]
-            _save_sheets(lab, scene.label.replace("/", "-"), view, models)
+        if len(models) > 1 and None not in models.values():
+            views = lab.folders.load_scene(results[0].run.job).test
+            _save_sheets(lab, scene.label.replace("/", "-"), views, models)
 
 
-def _save_sheets(lab: Lab, stem: str, view: a2tg.View, models: dict[str, a2tg.Model]) -> None:
+def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[str, a2tg.Model]) -> None:
+    """One of the whole view, one of a part; the first model is the reference, the second what it gains over."""
     lab.out.mkdir(parents=True, exist_ok=True)
-    target = to_uint8(view_image(view, next(iter(models.values())).background))
-    shown = {label: to_uint8(a2tg.Renderer(model)(view.camera).color) for label, model in models.items()}
-    first, *others = shown.values()
-    images, captions = [target, *shown.values()], ["photograph", *shown]
-    save_picture(lab.out / f"comparison-{stem}.png", side_by_side(images, captions))
-    crop = largest_gain(target, others[0], first)
+    background = next(iter(models.values())).background
+    drawn = {label: a2tg.Renderer(model) for label, model in models.items()}
+    rows = []
+    for view in views:
+        images = [to_uint8(draw(view.camera).color) for draw in drawn.values()]
+        rows.append([to_uint8(view_image(view, background)), *images])
+    target, first, second, *others = max(
+        rows, key=lambda row: _squared_error(row[0], row[2]) - _squared_error(*row[:2])
+    )
+    images, captions = [target, first, second, *others], ["photograph", *models]
+    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", side_by_side(images, captions))
+    crop = largest_gain(target, second, first)
     close = [np.repeat(np.repeat(crop.of(image), ZOOM, 0), ZOOM, 1) for image in images]
-    save_picture(lab.out / f"comparison-{stem}-close.png", side_by_side(close, captions))
+    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}-close.png", side_by_side(close, captions))
+
+
+def _squared_error(target: np.ndarray, image: np.ndarray) -> float:
+    return float(np.mean((target.astype(np.float32) - image.astype(np.float32)) ** 2))
 
 
 EXPERIMENT = Experiment("comparison_pictures", ("pictures",), present)

@@ -9,6 +9,7 @@ import numpy as np
 from lab import pictures, tables
 from lab.cli import Experiment, Lab, main
 from lab.grid import Grid
+from lab.jobs import background_of
 from PIL import Image
 
 import a2tg_jax as a2tg
@@ -22,7 +23,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     (grid,) = grids
     rows = []
     for result in tables.results_of(grid, lab.records):
-        model = lab.model(result) if result.label == "A²TG" else None
+        model = lab.model(result) if result.label == grid.reference.label else None
         if model is None:
             continue
         name = result.run.cell.scene.label
@@ -33,15 +34,15 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         stem = name.replace("/", "-")
         save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", side_by_side(shown, list(views)))
         save_picture(lab.out / f"learned_textures-{stem}.png", _textures_picture(model))
-        test = lab.folders.load_scene(result.run.job).test
-        figures = {label: a2tg.evaluate(test, one).psnr for label, one in views.items()}
-        rows.append([name, *(tables.number(value, 2) for value in figures.values())])
+        scene = lab.folders.load_scene(result.run.job)
+        quality = [a2tg.evaluate(scene.test, one, background=background_of(scene)) for one in views.values()]
+        rows.append([name, *(tables.number(found.psnr, 2) for found in quality)])
     text = tables.markdown(["scene", "full: PSNR", "SH only", "texture only"], rows)
     lab.write(EXPERIMENT.name, f"# What textures carry\n\n{text}")
 
 
 def _textures_picture(model: a2tg.Model) -> Image.Image:
-    """The most varied textures of 4×4 and of 1×4 texels: RGB above, alpha below."""
+    """The most varied textures of 4×4, 1×4 and 4×1 texels (rows × columns): RGB above, alpha below."""
     sheets = [pictures.learned_textures(model, size, NUM_TEXTURES) for size in ((4, 4), (1, 4), (4, 1))]
     sheets = [np.repeat(np.repeat(sheet, ZOOM, 0), ZOOM, 1) for sheet in sheets if sheet.shape[1]]
     width = max((sheet.shape[1] for sheet in sheets), default=1)

@@ -3,21 +3,10 @@
 python experiments/defaults.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
 """
 
-from collections.abc import Sequence
+from lab.cli import main
+from lab.standard import choices_experiment
 
-from lab import tables
-from lab.cli import Experiment, Lab, main
-from lab.grid import Grid
-
-
-def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """What each choice gains over the default."""
-    (grid,) = grids
-    results = tables.results_of(grid, lab.records)
-    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{tables.choices_table(results, grid.reference.label)}")
-
-
-EXPERIMENT = Experiment("defaults", ("defaults",), present)
+EXPERIMENT = choices_experiment("defaults")
 
 if __name__ == "__main__":
     main([EXPERIMENT], __doc__)

@@ -16,11 +16,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 ARCHIVES = {
-    "http://storage.googleapis.com/gresearch/refraw360/360_v2.zip": "360_v2",
+    "https://storage.googleapis.com/gresearch/refraw360/360_v2.zip": "360_v2",
     "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip": ".",
 }
 """Where each is unpacked, below SCENES."""
 CHUNK_BYTES = 1 << 20
+TIMEOUT_SECONDS = 60
 
 
 def main() -> None:
@@ -28,7 +29,7 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, help="folder for the scenes")
     try:
         fetch_all(parser.parse_args().scenes, ARCHIVES)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 
 
@@ -49,7 +50,11 @@ def fetch_all(scenes: Path, archives: Mapping[str, str]) -> None:
         if done.is_file():
             continue
         download(url, archive)
-        unpack(archive, scenes / name)
+        try:
+            unpack(archive, scenes / name)
+        except zipfile.BadZipFile as error:
+            archive.unlink()
+            raise ValueError(f"{archive} is damaged, and was deleted: call again to fetch it anew ({error})") from error
         done.touch()
         archive.unlink()
 
@@ -63,16 +68,21 @@ def download(url: str, path: Path) -> None:
     have = partial.stat().st_size if partial.is_file() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
-        with urllib.request.urlopen(request) as response:
+        with urllib.request.urlopen(request, timeout=TIMEOUT_SECONDS) as response:
             is_rest = response.status == 206
             total = int(response.headers.get("Content-Length", 0)) + (have if is_rest else 0)
             print(f"{url}: {total / 1e9:.2f} GB" + (f", from {have / 1e9:.2f} GB on" if is_rest else ""), flush=True)
             with open(partial, "ab" if is_rest else "wb") as file:
                 shutil.copyfileobj(response, file, CHUNK_BYTES)
     except urllib.error.HTTPError as error:
-        if error.code != 416:  # All of it was there.
+        if error.code != 416:
             raise OSError(f"{url}: {error}") from error
-        total = have
+        # No bytes are left to come: the server says how many there are.
+        total = int(error.headers.get("Content-Range", f"*/{have}").rpartition("/")[2])
+        error.close()
+    if total and partial.stat().st_size > total:
+        partial.unlink()
+        raise OSError(f"{url}: more bytes were there than it has; they were deleted, call again")
     if total and partial.stat().st_size != total:
         raise OSError(f"{url}: {partial.stat().st_size} of {total} bytes came; call again to go on")
     partial.replace(path)

@@ -32,11 +32,13 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> list[plots.Point]:
-    """Of a method, the mean over seeds and scenes for each number of splats."""
-    own = [result for result in results if result.run.method.label == label]
-    counts = sorted({result["num"] for result in own})
-    groups = [[result for result in own if result["num"] == count] for count in counts]
-    return [(tables.mean(group, x), tables.mean(group, y)) for group in groups]
+    """Of a method, one for each number of Gaussians of the cells and each way to choose its own: means over scenes and
+    seeds."""
+    groups: dict[tuple[int, bool], list[tables.Result]] = {}
+    for result in results:
+        if result.run.method.label == label:
+            groups.setdefault((result.run.cell.gaussians, result.run.is_at_equal_bytes), []).append(result)
+    return [(tables.mean(group, x), tables.mean(group, y)) for group in groups.values()]
 
 
 EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present)

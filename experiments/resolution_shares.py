@@ -17,7 +17,8 @@ from a2tg_jax.results.pictures import save_picture, side_by_side, to_uint8
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """A table and a chart of the shares; a picture of each scene whose model is there."""
     results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
-    results = [result for result in results if result.label == "A²TG" and not result.run.cell.seed]
+    label = grids[0].reference.label
+    results = [result for result in results if result.label == label and not result.run.cell.seed]
     shares = {_place(result): _shares(result) for result in results}
     sizes = sorted({size for own in shares.values() for size in own}, key=lambda size: tuple(map(int, size.split("x"))))
     rows = [[place, *(tables.percent(own.get(size, 0.0)) for size in sizes)] for place, own in shares.items()]
@@ -25,12 +26,12 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     text = tables.markdown(["scene", *(size.replace("x", "×") for size in sizes)], rows)
     told = f"In the paper, on {paper['scene']}, {tables.percent(paper['1x1'])} keep 1×1 texels.\n"
     lab.write(EXPERIMENT.name, f"# Shares of texture resolutions (rows × columns)\n\n{text}\n{told}")
-    densest = {result.column: result for result in sorted(results, key=lambda result: result["num"])}
+    densest = {result.run.cell.scene.label: result for result in sorted(results, key=lambda result: result["num"])}
     if densest:
         charted = {_place(result): shares[_place(result)] for result in densest.values()}
         save_figure(lab.out / f"{EXPERIMENT.name}.png", plots.shares_chart(charted))
     for result in tables.results_of(grids[-1], lab.records):
-        if result.label == "A²TG":
+        if result.label == label:
             _picture(lab, result)
 
 

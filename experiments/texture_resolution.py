@@ -16,9 +16,9 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Ours, then the paper's; and PSNR and LPIPS against memory."""
     (grid,) = grids
     results = tables.results_of(grid, lab.records)
-    paper = tables.paper_table("texture_resolution", "gaussians", tables.QUALITY_COLUMNS)
+    paper = tables.paper_table(EXPERIMENT.name, "gaussians", tables.QUALITY_COLUMNS, "Deep Blending")
     ours = tables.quality_tables(grid, results)
-    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{ours}\n## In the paper, on Deep Blending\n\n{paper}")
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{ours}\n## In the paper\n\n{paper}")
     panels = []
     for column in dict.fromkeys(result.column for result in results):
         own = [result for result in results if result.column == column]
@@ -29,10 +29,14 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _curves(results: Sequence[tables.Result], figure: str) -> dict[str, list[plots.Point]]:
-    """Of each method and number of Gaussians, the points of its resolutions."""
-    curves: dict[str, list[plots.Point]] = {}
+    """Of each method and number of Gaussians, the points of its resolutions, means over scenes."""
+    points: dict[tuple[str, int, str], list[tables.Result]] = {}
     for result in results:
-        curves.setdefault(result.label.rpartition(", ")[0], []).append((result["mb"], result[figure]))
+        method, _, resolution = result.label.rpartition(", ")
+        points.setdefault((method, result.run.cell.gaussians, resolution), []).append(result)
+    curves: dict[str, list[plots.Point]] = {}
+    for (method, num, _), own in points.items():
+        curves.setdefault(f"{method}, {num:,}", []).append((tables.mean(own, "mb"), tables.mean(own, figure)))
     return curves
 
 

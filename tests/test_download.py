@@ -17,7 +17,9 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         first = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").rstrip("-"))
         self.server.firsts.append(first)
         if first >= len(content):
-            self.send_error(416)
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{len(content)}")
+            self.end_headers()
             return
         self.send_response(206 if first else 200)
         self.send_header("Content-Length", str(len(content) - first))
@@ -60,6 +62,19 @@ def test_archives_are_fetched_once_from_where_they_stopped(server, tmp_path, sha
     download.fetch_all(scenes, {url: "360_v2"})
     assert server.firsts == [have], "what is there is left alone"
     assert [path.name for path in (scenes / "archives").iterdir()] == ["set.unpacked"]
+
+
+def test_what_is_damaged_is_deleted_and_said(server, tmp_path):
+    url, scenes = archive_of(server, {"garden/a.txt": "a"}), tmp_path / "scenes"
+    (scenes / "archives").mkdir(parents=True)
+    (scenes / "archives" / "set.partial").write_bytes(bytes(10_000))
+    with pytest.raises(OSError, match="more bytes"):
+        download.fetch_all(scenes, {url: "set"})
+    (scenes / "archives" / "set.zip").write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="damaged, and was deleted"):
+        download.fetch_all(scenes, {url: "set"})
+    download.fetch_all(scenes, {url: "set"})
+    assert (scenes / "set/garden/a.txt").is_file()
 
 
 def test_nothing_is_written_outside_the_folder(server, tmp_path):

@@ -14,12 +14,14 @@ import pytest
 from lab import pages, queue, tables
 from lab.cli import EXPERIMENTS, Lab, parse_arguments
 from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, read_grid, splats_in
-from lab.jobs import Folders, Job
+from lab.jobs import Folders, Job, _load_checkpoint
 from lab.plan import plan_of, seconds_of_step
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.plan import fingerprint
+from a2tg_jax.training import fit_stage
+from a2tg_jax.training.terms import Term
 
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
 SCALES = ("full", "small", "smoke")
@@ -78,6 +80,7 @@ def test_scenes_are_chosen_and_held_out():
     assert labels() == {"fox", "herz_jesus_p25", "lego", "snowmiku"}
     assert labels(held_out=False) == labels() - {"snowmiku"}
     assert labels(scenes=["lego"]) == {"lego"}
+    assert labels(scenes=["built-in"]) == {"built-in"}, "what is asked for comes before what a grid has"
     assert "snowmiku" not in {cell.scene.label for cell in read_grid("defaults", "small").cells}
     with pytest.raises(ValueError, match="no scene 'dog' at this scale; there are"):
         labels(scenes=["dog"])
@@ -97,6 +100,43 @@ def test_a_fingerprint_is_of_what_decides_the_result():
     assert told.strip() == fingerprint(quick, 1), "another process says the same"
 
 
+KEYS = """
+import sys
+sys.path.insert(0, {folder!r})
+from lab.grid import read_grid
+print(*[job.key for name in {names} for job in read_grid(name, "small").jobs({{}})])
+"""
+
+
+def test_keys_are_the_same_in_every_process():
+    script = KEYS.format(folder=str(EXPERIMENTS), names=NAMES)
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert told == [job.key for name in NAMES for job in read_grid(name, "small").jobs({})]
+
+
+def test_functions_without_a_name_have_no_fingerprint():
+    class Nameless(a2tg.A2tg):
+        def stages(self):
+            first, second = super().stages()
+            return dataclasses.replace(first, losses=(Term(lambda *_: 0.0),)), second
+
+    with pytest.raises(ValueError, match="make it a function of a module"):
+        fingerprint(Nameless(), 0)
+
+
+def test_a_stage_stopped_under_one_system_goes_on_under_another(tmp_path):
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
+    plain, textured = (a2tg.find_system(name).preset("smoke") for name in ("gaussians-2d-mcmc", "textured-gaussians"))
+    plain, textured = (dataclasses.replace(system, stage1_iterations=4) for system in (plain, textured))
+    path = tmp_path / "checkpoint.npz"
+    stopped = lambda checkpoint: checkpoint.iteration == 2 and a2tg.save_checkpoint(path, checkpoint)  # noqa: E731
+    fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2, progress=False)
+    resumed = _load_checkpoint(path, Job("synthetic", 1, textured, 0))
+    assert fit_stage(scene, textured, 0, resume=resumed, progress=False).model.num > 0
+    with pytest.raises(ValueError, match="made with other numbers"):
+        _load_checkpoint(path, Job("synthetic", 1, dataclasses.replace(textured, seed=5), 0))
+
+
 # The queue
 
 
@@ -114,7 +154,7 @@ class FakePool:
     def __init__(self, folders, slots=2, memory=np.inf, outcomes=None):
         self.slots, self.memory, self.folders = slots, memory, folders
         self.outcomes, self.order, self.most = outcomes or {}, [], 0
-        self.running, self.failures = [], []
+        self.running, self.failures, self.record = [], [], record()
 
     def is_death(self, error):
         return isinstance(error, concurrent.futures.BrokenExecutor)
@@ -140,7 +180,7 @@ class FakePool:
             path = folders.model(job)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
-            handle.set_result(record())
+            handle.set_result(self.record)
         return handle
 
 
@@ -180,6 +220,16 @@ def test_what_fails_is_told_and_takes_down_only_what_needs_it(folders):
     (failure,) = run_queue(pool, folders, records)
     assert failure.job.key == "first" and "no such scene" in failure.reason and set(records) == {"alone"}
     assert pool.failures == [failure], "told at once"
+
+
+def test_what_was_measured_without_lpips_is_measured_again_where_it_is_wanted(folders):
+    finished = {job.key: record(lpips_network=None) for job in [*CHAIN, FIRST]}
+    wanted = dataclasses.replace(folders, lpips_network="alex")
+    assert run_queue(FakePool(folders), folders, dict(finished)) == []
+    pool = FakePool(wanted)
+    pool.record = record(lpips_network="alex")
+    run_queue(pool, wanted, {**finished, "alone": pool.record})
+    assert {"second", "other"} <= set(pool.order) and "alone" not in pool.order
 
 
 def test_a_process_that_dies_is_tried_once_more(folders):
@@ -352,13 +402,34 @@ def test_gains_have_the_verdict_that_seeds_allow():
 def test_quality_is_averaged_over_seeds_and_what_is_missing_is_a_dash():
     grid = Grid("x", "X", "small", "quick", (CELL,), Method("own", "a2tg"), (), ())
     text = tables.quality_tables(grid, [result("own", 20.0), result("own", 22.0, 1), result("other", 30.0, lpips=None)])
-    assert "| own | 1,000 | 21.00 / .800 / .200 · 1.00 | 21.00 |" in text
+    assert "| own | 30,000 | 1,000 | 21.00 / .800 / .200 · 1.00 | 21.00 |" in text
     assert "30.00 / .800 / – · 1.00" in text
 
 
 def test_choices_are_compared_with_the_default():
-    text = tables.choices_table([result("own", 20.0), result("variant", 20.25, lpips=0.19)], "own")
-    assert "| variant | +0.25 · -0.010 | +0.25 · -0.010 | 1.00 |" in text
+    results = [result("own", 20.0), result("own", 21.0, 1), result("variant", 20.25, lpips=0.19)]
+    text = tables.choices_table([*results, result("variant", 20.75, 1)], "own")
+    assert "| variant | +0.00 · -0.005 | +0.00 · -0.005 | 1.00 |" in text
+
+
+def test_without_a_second_seed_nothing_is_said_to_be_above():
+    text = tables.gains_table([result("own", 21.0), result("other", 20.0)], "own", ["other"])
+    assert "| +1.00 · +0.000 |" in text and "No cell has two seeds" in text
+
+
+def test_columns_are_data_sets_and_what_is_missing_in_one_is_told():
+    """A mean over all of them counts each once, as the paper does."""
+    scenes = [SceneAt(label, label, 1) for label in ("A/x", "A/y", "B/z")]
+    cells = [dataclasses.replace(CELL, scene=scene) for scene in scenes]
+    method = Method("own", "a2tg")
+    results = [
+        tables.Result(Run(method, cell, False, Job(cell.scene.path, 1, a2tg.A2tg(), 0)), record(psnr))
+        for cell, psnr in zip(cells, (20.0, 22.0, 30.0), strict=True)
+    ]
+    grid = Grid("x", "X", "small", "quick", tuple(cells), method, (), ())
+    assert "| 21.00 / .800 / .200 · 1.00 | 30.00 / .800 / .200 · 1.00 | 25.50 |" in tables.quality_tables(grid, results)
+    other = dataclasses.replace(results[0], run=dataclasses.replace(results[0].run, method=Method("other", "a2tg")))
+    assert "20.00 / .800 / .200 · 1.00 (1 of 2 scenes) | – | – |" in tables.quality_tables(grid, [*results, other])
 
 
 def test_a_page_shows_the_tables_that_it_names(tmp_path):

@@ -3,8 +3,6 @@
 import argparse
 import contextlib
 import dataclasses
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,7 +10,10 @@ from typing import Any
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.metrics import load_lpips
 from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.results.record import SYNTHETIC
+from lab import machine
 from lab.grid import Grid, read_grid
 from lab.jobs import Folders, Job, Record
 from lab.plan import plan_of
@@ -22,6 +23,10 @@ from lab.tables import Result
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 MEMORY_SHARE = 0.8
 """Of the machine's, unless --memory-gb says otherwise."""
+MOST_SENT = 1_000
+"""Jobs that wait in a cluster's queue at a time."""
+CLUSTER_DEFAULTS = {"slurm": {"timeout_min": 24 * 60, "gpus_per_node": 1, "cpus_per_task": 4, "mem_gb": 32}}
+"""What --cluster-parameter may say otherwise; submitit's own are five minutes and no GPU."""
 
 
 class Lab:
@@ -31,23 +36,30 @@ class Lab:
         self.args = args
         self.scale: str = args.scale
         self.out: Path = args.out or EXPERIMENTS / "results" / args.scale
-        self.work: Path = args.work or Path("runs") / "experiments" / args.scale
-        self.folders = Folders(args.scenes, self.work, args.lpips_weights)
+        self.work: Path = args.work or EXPERIMENTS.parent / "runs" / "experiments" / args.scale
+        network = None if args.lpips_weights is None else load_lpips(args.lpips_weights).network
+        self.folders = Folders(args.scenes, self.work, args.lpips_weights, network)
         self._file = self.out / "records.json"
         self.records: dict[str, Record] = self._all_records()
 
     def grid(self, name: str) -> Grid:
-        """An experiment, with the scenes that are wanted."""
+        """A grid, with the scenes that are wanted."""
         return read_grid(name, self.scale, scenes=self.args.only, held_out=not self.args.without_held_out)
 
     def run(self, grids: Sequence[Grid]) -> list[Failure]:
         """Runs what is not finished of the grids, unless only tables are wanted."""
         if self.args.tables_only:
             return []
+        self._check_inputs(grids)
         self._save()
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
         with contextlib.closing(self._pool()) as pool:
             return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether scenes are left out."""
+        return bool(self.args.only or self.args.without_held_out)
 
     def model(self, result: Result) -> a2tg.Model | None:
         """What a run left; None, and a line that says so, where it is gone."""
@@ -58,11 +70,21 @@ class Lab:
         return None
 
     def write(self, name: str, text: str) -> None:
-        """Prints a page and keeps it among the results."""
+        """Prints a page and keeps it among the results; where only some scenes are wanted, under another name."""
+        path = self.out / (f"{name}-partial.md" if self.is_partial else f"{name}.md")
         self.out.mkdir(parents=True, exist_ok=True)
-        with replacing(self.out / f"{name}.md") as temporary:
+        with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
-        print(f"\n{text}\n{self.out / name}.md", flush=True)
+        print(f"\n{text}\n{path}", flush=True)
+
+    def _check_inputs(self, grids: Sequence[Grid]) -> None:
+        """Before anything is trained: the scenes and the weights are there."""
+        for path in {cell.scene.path for grid in grids for cell in grid.cells} - {SYNTHETIC}:
+            if not (self.folders.scenes / path).is_dir():
+                raise ValueError(
+                    f"there is no scene {self.folders.scenes / path}: --scenes must name the folder of the scenes, as "
+                    "grids/scales.toml has them (experiments/download.py fetches those of --scale full)"
+                )
 
     def _keep(self, job: Job, record: Record) -> None:
         self._save()
@@ -87,12 +109,14 @@ class Lab:
         return {**own, **self._kept()}
 
     def _pool(self) -> Pool:
-        args = self.args
+        args, inf = self.args, float("inf")
+        memory = args.memory_gb * 1e9 if args.memory_gb else MEMORY_SHARE * machine.memory_bytes()
         if args.cluster:
-            parameters = dict(_parameter(text) for text in args.cluster_parameter)
-            return SubmititPool(args.cluster, self.work / "submitit", args.jobs or 1_000, **parameters)
-        memory = args.memory_gb * 1e9 if args.memory_gb else MEMORY_SHARE * _machine_bytes()
-        return LocalPool(args.jobs or _default_jobs(), memory)
+            parameters = {**CLUSTER_DEFAULTS.get(args.cluster, {}), **dict(map(_parameter, args.cluster_parameter))}
+            is_here = args.cluster == "local"
+            slots = args.jobs or (machine.default_jobs() if is_here else MOST_SENT)
+            return SubmititPool(args.cluster, self.work / "submitit", slots, memory if is_here else inf, **parameters)
+        return LocalPool(args.jobs or machine.default_jobs(), memory, machine.num_gpus())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,21 +132,26 @@ class Experiment:
 
 def main(experiments: Sequence[Experiment], description: str) -> None:
     """Runs all that some experiments need, in one queue, and presents each."""
-    lab = Lab(parse_arguments(description))
-    names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
+    args = parse_arguments(description)
     try:
+        lab = Lab(args)
+        names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
         grids = {name: lab.grid(name) for name in names}
-        if lab.args.plan:
+        if args.plan:
             print(plan_of(list(grids.values()), lab.records))
             return
         failures = lab.run(list(grids.values()))
-        for experiment in experiments:
-            experiment.present(lab, [grids[name] for name in experiment.grids])
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError, RuntimeError, NameError) as error:  # The last two are submitit's.
         sys.exit(f"error: {error}")
-    if failures:
-        told = "\n".join(f"  {failure.job.key}: {failure.reason}" for failure in failures)
-        sys.exit(f"error: {len(failures)} jobs failed, and what needs them was not run; call again to retry:\n{told}")
+    errors = [f"{failure.job.key}: {failure.reason}" for failure in failures]
+    for experiment in experiments:
+        try:
+            experiment.present(lab, [grids[name] for name in experiment.grids])
+        except (ValueError, OSError) as error:
+            errors.append(f"{experiment.name}: {error}")
+    if errors:
+        told = "\n".join(f"  {error}" for error in errors)
+        sys.exit(f"error: not all could be done; what needs it is missing. Call again to retry:\n{told}")
 
 
 def _tell_failure(failure: Failure) -> None:
@@ -163,19 +192,10 @@ def parse_arguments(description: str, arguments: Sequence[str] | None = None) ->
 
 
 def _parameter(text: str) -> tuple[str, Any]:
-    name, _, value = text.partition("=")
-    return name, int(value) if value.lstrip("-").isdigit() else value
-
-
-def _machine_bytes() -> float:
-    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-
-
-def _default_jobs() -> int:
-    """One where there is a GPU, whose memory jobs would share; else one a core."""
-    # Another process asks: this one would take the GPU's memory for itself.
-    script = "import jax; print(jax.default_backend())"
-    asked = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    if asked.stdout.strip() == "gpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ValueError(f"--cluster-parameter wants NAME=VALUE; got {text!r}")
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return name, kind(value)
+    return name, value

@@ -154,6 +154,8 @@ def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, hel
     variants = [method(label) for label in file.get("variants", {})]
     blocks = [{**settings, **block} for block in settings.get("blocks", [{}])]
     cells = [cell for block in blocks for cell in _cells(block, scenes, held_out, name)]
+    if not cells:
+        raise ValueError(f"grids/{name}.toml: no scene is left")
     return Grid(
         name, file["title"], scale, settings["preset"], tuple(dict.fromkeys(cells)), method(file["reference"]),
         (*map(method, file.get("methods", [])), *variants), tuple(map(method, file.get("at_equal_bytes", []))),
@@ -177,7 +179,7 @@ def _scenes(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: 
     for label in wanted or ():
         if label not in table:
             raise ValueError(f"{name}: there is no scene {label!r} at this scale; there are {', '.join(table)}")
-    labels = [label for label in block.get("only", table) if wanted is None or label in wanted]
+    labels = block.get("only", table) if wanted is None else wanted
     found = [SceneAt(label, **table[label]) for label in labels]
     found = [dataclasses.replace(scene, downscale=block.get("downscale", scene.downscale)) for scene in found]
     return [scene for scene in found if held_out or not scene.held_out]

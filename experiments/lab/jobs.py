@@ -48,6 +48,11 @@ class Job:
         return self.system.stages()[self.stage].iterations
 
     @property
+    def all_iterations(self) -> tuple[int, ...]:
+        """Of its stage and those before it."""
+        return tuple(stage.iterations for stage in self.system.stages()[: self.stage + 1])
+
+    @property
     def key(self) -> str:
         """Unique; a file name."""
         return _key(self)
@@ -68,6 +73,8 @@ class Folders:
     work: Path
     """Models, checkpoints and records of single jobs: large, and made again where they are gone."""
     lpips_weights: Path | None = None
+    lpips_network: str | None = None
+    """Of the weights; jobs measured with another are measured again."""
 
     def model(self, job: Job) -> Path:
         return self.work / "models" / f"{job.key}.npz"

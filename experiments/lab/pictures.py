@@ -33,8 +33,9 @@ def colored_by_shape(model: a2tg.Model) -> a2tg.Model:
         sh[is_chosen] = 0
         sh[is_chosen, 0] = (np.asarray(color) - 0.5) / SH_C0
     gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(sh))
-    flat = jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), model.params)
-    return dataclasses.replace(model, gaussians=gaussians, params=flat)
+    buckets = zip(model.params.buckets, model.layout.resolutions, strict=True)
+    flat = [bucket if size == (1, 1) else bucket.at[..., :3].set(0.0) for bucket, size in buckets]
+    return dataclasses.replace(model, gaussians=gaussians, params=a2tg.Textures(tuple(flat)))
 
 
 def learned_textures(model: a2tg.Model, size: tuple[int, int], num: int) -> np.ndarray:

@@ -30,7 +30,8 @@ def plan_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
         f"{len(open_jobs)} stages left of those that can be named, {steps:,} iterations: {seconds / 3600:.1f} hours on "
         f"one machine, one at a time. Runs at equal bytes that follow from them: {unknown}, two stages each at most. "
         f"In all about {total / 3600:.1f} hours, or that divided by the machines. A step is taken to last as in runs "
-        "that are finished here, where there are some, and else what the paper tells of its GPU."
+        "that are finished here, where there are some, and else as the paper tells of its own program and GPU: this "
+        "one has not been timed on a GPU yet."
     )
 
 
@@ -44,7 +45,7 @@ def _all_jobs(grid: Grid, records: Mapping[str, Record]) -> Iterable[Job]:
 
 
 def seconds_of_step(job: Job, records: Mapping[str, Record]) -> float:
-    """Of a step of a job: scaled from finished runs of its system and stage, or as on the paper's GPU."""
+    """Of a step of a job: scaled from finished runs of such a stage at this size, or as on the paper's GPU."""
     num = getattr(getattr(job.system, "densify", None), "cap", 100_000)
     stage = job.system.stages()[job.stage].name
     paces = [
@@ -52,6 +53,6 @@ def seconds_of_step(job: Job, records: Mapping[str, Record]) -> float:
         for record in records.values()
         if record["stage"] == stage and record["downscale"] == job.downscale
     ]
-    if paces:
-        return float(np.median(paces))
+    if np.isfinite(paces).any():
+        return float(np.nanmedian(paces))
     return (GPU_SECONDS + GPU_SECONDS_A_SPLAT * num) * (GPU_TEXTURED if stage == "textures" else 1)

@@ -68,8 +68,8 @@ class LocalPool:
     """Processes of this machine, each with its share of the cores, which stay for one job after another: what one has
     compiled, the next may use."""
 
-    def __init__(self, slots: int, memory: float):
-        self.slots, self.memory = slots, memory
+    def __init__(self, slots: int, memory: float, num_gpus: int = 0):
+        self.slots, self.memory, self._num_gpus = slots, memory, num_gpus
         self._executor = self._new_executor()
 
     def _new_executor(self) -> concurrent.futures.ProcessPoolExecutor:
@@ -77,7 +77,7 @@ class LocalPool:
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         shares = context.Queue()
         for index in range(self.slots):
-            shares.put(cores[index :: self.slots] or cores)
+            shares.put((cores[index :: self.slots] or cores, index % self._num_gpus if self._num_gpus else None))
         return concurrent.futures.ProcessPoolExecutor(self.slots, context, _begin_worker, (shares,))
 
     def submit(self, job: Job, folders: Folders) -> Handle:
@@ -99,9 +99,12 @@ def _begin_worker(shares: Any) -> None:
     import a2tg_jax
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    cores = shares.get()
+    cores, gpu = shares.get()
     if cores:
         os.sched_setaffinity(0, cores)
+    if gpu is not None:
+        given = os.environ.get("CUDA_VISIBLE_DEVICES")
+        os.environ["CUDA_VISIBLE_DEVICES"] = given.split(",")[gpu] if given else str(gpu)
     a2tg_jax.configure_cpu()
 
 
@@ -116,11 +119,12 @@ def _end_with_parent() -> None:
 class SubmititPool:
     """Other machines, or processes of this one, by way of submitit."""
 
-    def __init__(self, cluster: str, folder: Path, slots: int, **parameters: Any):
+    def __init__(self, cluster: str, folder: Path, slots: int, memory: float, **parameters: Any):
         """Args:
         cluster: "slurm", "local", or what else submitit knows.
         folder: for its logs.
         slots: jobs at a time.
+        memory: bytes that they may take together.
         parameters: of `submitit.AutoExecutor.update_parameters`, such as slurm_partition, gpus_per_node, mem_gb.
 
         Raises:
@@ -130,7 +134,7 @@ class SubmititPool:
             import submitit
         except ImportError as error:
             raise ValueError("--cluster needs submitit: pip install 'a2tg-jax[experiments]'") from error
-        self.slots, self.memory = slots, float("inf")
+        self.slots, self.memory = slots, memory
         # What is sent out names this package, which its processes must find.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
@@ -238,7 +242,9 @@ def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]
 
 def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool = False) -> Job | None:
     """The job, or the one before it that has to be run for it; None where it is finished."""
-    if job.key in records and (not is_start or folders.model(job).is_file()):
+    record = records.get(job.key)
+    is_measured = record is not None and folders.lpips_network in (None, record.get("lpips_network"))
+    if is_measured and (not is_start or folders.model(job).is_file()):
         return None
     before = None if job.start is None else _first_open(job.start, folders, records, is_start=True)
     return before or job

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.results.folder import read_json
-from lab.grid import Cell, Grid, Run
+from lab.grid import Cell, Grid, Run, SceneAt
 from lab.jobs import Record
 
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
@@ -83,18 +83,39 @@ def quality(results: Sequence[Result]) -> str:
 
 
 def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
-    """For each number of Gaussians, the methods, and in each column quality and MB."""
-    columns = list(dict.fromkeys(result.column for result in results))
+    """For each number of Gaussians, the methods, and in each column quality and MB, means where it is of several."""
+    columns = {column: {r.run.cell.scene for r in own} for column, own in _grouped(results, lambda r: r.column)}
     parts = []
     for num, block in _grouped(results, lambda result: result.run.cell.gaussians):
         rows = []
         for label, own in _grouped(block, lambda result: result.label):
-            by_column = [[result for result in own if result.column == column] for column in columns]
-            shown = [f"{quality(found)} · {number(mean(found, 'mb'), 2)}" if found else MISSING for found in by_column]
-            rows.append([label, _splats(own), *shown, number(mean(own, "psnr"), 2)])
-        header = ["method", "splats", *(f"{column}: PSNR / SSIM / LPIPS · MB" for column in columns), "mean PSNR"]
-        parts.append(f"**{num:,} Gaussians** of {grid.reference.label}\n\n" + markdown(header, rows))
+            by_column = {column: [result for result in own if result.column == column] for column in columns}
+            shown = [_quality_and_size(found, columns[column]) for column, found in by_column.items()]
+            rows.append([label, _iterations(own), _splats(own), *shown, _mean_of_columns(by_column)])
+        header = ["method", "iterations", "splats", *(f"{column}: PSNR / SSIM / LPIPS · MB" for column in columns)]
+        parts.append(f"**{num:,} Gaussians** of {grid.reference.label}\n\n" + markdown([*header, "mean PSNR"], rows))
     return "\n".join(parts)
+
+
+def _quality_and_size(results: Sequence[Result], scenes: set[SceneAt]) -> str:
+    """With a note where some of the scenes are not finished."""
+    if not results:
+        return MISSING
+    found = {result.run.cell.scene for result in results}
+    note = "" if found == scenes else f" ({len(found)} of {len(scenes)} scenes)"
+    return f"{quality(results)} · {number(mean(results, 'mb'), 2)}{note}"
+
+
+def _mean_of_columns(by_column: Mapping[str, Sequence[Result]]) -> str:
+    """Of all columns, each counted once as in the paper, or none."""
+    if not all(by_column.values()):
+        return MISSING
+    return number(float(np.mean([mean(found, "psnr") for found in by_column.values()])), 2)
+
+
+def _iterations(results: Sequence[Result]) -> str:
+    """Of all stages."""
+    return "+".join(f"{count:,}" for count in results[0].run.job.all_iterations)
 
 
 def _splats(results: Sequence[Result]) -> str:
@@ -121,7 +142,7 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
     """
     spread = seed_spread(results, reference, others)
     rows: list[list[str]] = []
-    every: dict[str, list[float]] = {other: [] for other in others}
+    every: dict[str, dict[str, list[float]]] = {other: {} for other in others}
     for place, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         own = [result for result in block if result.label == reference]
         if not own:
@@ -129,14 +150,27 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
         shown = []
         for other in others:
             gains, lpips = (_gains(block, reference, other, figure) for figure in ("psnr", "lpips"))
-            every[other] += [float(np.mean(gains))] if gains else []
-            told = f"{np.mean(gains):+.2f} ({verdict(gains, spread)}) · {np.mean(lpips):+.3f}" if gains else MISSING
-            shown.append(told)
+            if not gains:
+                shown.append(MISSING)
+                continue
+            every[other].setdefault(place.scene.label, []).append(float(np.mean(gains)))
+            said = "" if spread is None else f" ({verdict(gains, spread)})"
+            shown.append(f"{np.mean(gains):+.2f}{said} · {np.mean(lpips):+.3f}")
         rows.append([*_told_place(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
     rows.append(["*mean ± standard error*", *[""] * 6, *map(_mean_and_error, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
     text = markdown([*header, *(f"against {other}: dB · LPIPS" for other in others)], rows)
-    return text + f"\nTwo seeds differ by {spread:.2f} dB in such a difference (root mean square); less is undecided.\n"
+    return f"{text}\n{_told_spread(spread)}\n"
+
+
+def _told_spread(spread: float | None) -> str:
+    errors = "The last row's errors are those of independent scenes."
+    if spread is None:
+        return f"No cell has two seeds, so that nothing is said of what is above what. {errors}"
+    return (
+        f"Two seeds differ by {spread:.2f} dB in such a difference (root mean square). A mean of n seeds that is not "
+        f"beyond that, divided by √n, is called undecided. {errors}"
+    )
 
 
 def _told_place(cell: Cell, result: Result) -> list[str]:
@@ -151,21 +185,22 @@ def _seeds(results: Sequence[Result]) -> str:
     return str(len({result.run.cell.seed for result in results}))
 
 
-def _mean_and_error(gains: Sequence[float]) -> str:
-    """Over the cells; the error is that of independent ones."""
-    if len(gains) < 2:
+def _mean_and_error(gains: Mapping[str, Sequence[float]]) -> str:
+    """Over scenes, within which the gains at several sizes are averaged first."""
+    means = [float(np.mean(own)) for own in gains.values()]
+    if len(means) < 2:
         return MISSING
-    return f"{np.mean(gains):+.2f} ± {np.std(gains, ddof=1) / np.sqrt(len(gains)):.2f}"
+    return f"{np.mean(means):+.2f} ± {np.std(means, ddof=1) / np.sqrt(len(means)):.2f}"
 
 
-def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float:
-    """By how much two seeds differ in a gain, root mean square, in dB; 0 where no cell has two."""
+def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float | None:
+    """By how much two seeds differ in a gain, root mean square, in dB; None where no cell has two."""
     spreads = []
     for _, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         for other in others:
             gains = _gains(block, reference, other, "psnr")
             spreads += [a - b for a, b in itertools.pairwise(gains)]
-    return float(np.sqrt(np.mean(np.square(spreads)))) if spreads else 0.0
+    return float(np.sqrt(np.mean(np.square(spreads)))) if spreads else None
 
 
 def verdict(gains: Sequence[float], spread: float) -> str:
@@ -187,58 +222,76 @@ def _gains(block: Sequence[Result], reference: str, other: str, figure: str) -> 
     ]
 
 
-def paper_table(name: str, place: str, columns: Sequence[tuple[str, str, int]]) -> str:
+def paper_table(
+    name: str, place: str, columns: Sequence[tuple[str, str]], everywhere: str = "mean of the data sets"
+) -> str:
     """A table of the paper.
 
     Args:
       name: its key in `paper.json`.
       place: what its blocks differ in: "gaussians" or "budget_mb".
-      columns: (key, heading, digits) of the figures.
+      columns: (key, heading) of the figures.
+      everywhere: heading of the figures of a table that names no data sets.
     """
     table = PAPER[name]
-    datasets = list(dict.fromkeys(row.get("dataset", "mean of the data sets") for row in table))
-    header = ["", "method", *(f"{dataset}: {' / '.join(heading for _, heading, _ in columns)}" for dataset in datasets)]
+    datasets = list(dict.fromkeys(row.get("dataset", everywhere) for row in table))
+    header = [PLACES[place], "method", *(f"{one}: {' / '.join(told for _, told in columns)}" for one in datasets)]
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for row in sorted(table, key=lambda row: -row[place]):
-        at = f"{row[place]:,}" + (" MB" if place == "budget_mb" else "")
         label = row["method"] + (f", {row['side']}×{row['side']}" if "side" in row else "")
-        shown = " / ".join(number(row[key], digits) for key, _, digits in columns)
-        cells.setdefault((at, label), {})[row.get("dataset", "mean of the data sets")] = shown
+        shown = " / ".join(_as_printed(key, row[key]) for key, _ in columns)
+        cells.setdefault((f"{row[place]:,}", label), {})[row.get("dataset", everywhere)] = shown
     rows = [[*key, *(found.get(dataset, MISSING) for dataset in datasets)] for key, found in cells.items()]
     return markdown(header, rows)
 
 
-QUALITY_COLUMNS = (("psnr", "PSNR", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("mb", "MB", 0))
+PLACES = {"gaussians": "Gaussians", "budget_mb": "MB"}
+DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
+
+
+def _as_printed(key: str, value: float) -> str:
+    """With the digits that such figures have in the paper, or those that it has."""
+    return number(value, DIGITS[key]) if key in DIGITS else f"{value:g}"
+
+
+QUALITY_COLUMNS = (("psnr", "PSNR"), ("ssim", "SSIM"), ("lpips", "LPIPS"), ("mb", "MB"))
 
 
 def choices_table(results: Sequence[Result], default: str) -> str:
-    """What each variant gains over the default, in dB and LPIPS, in each cell and on average."""
+    """What each variant gains over the default, in dB and LPIPS, in each column and on average.
+
+    Of the scenes and seeds of a column, those count that both have.
+    """
     counts = {result.run.cell.gaussians for result in results}
 
     def place(result: Result) -> str:
         return result.column if len(counts) == 1 else f"{result.column}, {result.run.cell.gaussians:,}"
 
     columns = list(dict.fromkeys(map(place, results)))
-    base = {place(result): result for result in results if result.label == default}
+    base = {result.run.cell: result for result in results if result.label == default}
     rows = []
     for label, own in _grouped(results, lambda result: result.label):
-        found = {place(result): result for result in own}
+        by_column = {column: [result for result in own if place(result) == column] for column in columns}
         if label == default:
-            shown = [quality([found[column]]) if column in found else MISSING for column in columns]
+            shown = [quality(found) for found in by_column.values()]
             rows.append([f"*{default}, as it is*", *shown, number(mean(own, "psnr"), 2), number(mean(own, "mb"), 2)])
             continue
-        gains = {column: _gain(found[column], base[column]) for column in columns if column in found and column in base}
-        shown = [_told(gains[column]) if column in gains else MISSING for column in columns]
-        average = _told(np.mean(list(gains.values()), axis=0)) if gains else MISSING
+        gains = [_mean_gain(found, base) for found in by_column.values()]
+        average = MISSING if None in gains else _told_gain(np.mean(gains, axis=0))
+        shown = [MISSING if gain is None else _told_gain(gain) for gain in gains]
         rows.append([label, *shown, average, number(mean(own, "mb"), 2)])
     return markdown(["choice", *(f"{column}: dB · LPIPS" for column in columns), "mean", "MB"], rows)
 
 
-def _gain(result: Result, base: Result) -> tuple[float, float]:
-    """In PSNR and in LPIPS."""
-    return result["psnr"] - base["psnr"], result["lpips"] - base["lpips"]
+def _mean_gain(results: Sequence[Result], base: Mapping[Cell, Result]) -> tuple[float, float] | None:
+    """In PSNR and in LPIPS, over the cells in which there is the default too."""
+    both = [(result, base[result.run.cell]) for result in results if result.run.cell in base]
+    if not both:
+        return None
+    psnr, lpips = (float(np.mean([a[figure] - b[figure] for a, b in both])) for figure in ("psnr", "lpips"))
+    return psnr, lpips
 
 
-def _told(gain: Sequence[float]) -> str:
+def _told_gain(gain: Sequence[float]) -> str:
     decibels, distance = gain
     return f"{decibels:+.2f} · {distance:+.3f}"
