@@ -29,6 +29,7 @@ SCALES = ("full", "small", "smoke")
 
 def record(psnr=25.0, mb=1.0, num=1_000, **others):
     figures = {"ssim": 0.8, "lpips": 0.2, "pixels": [20, 10], "stage": "gaussians", "downscale": 2, "ms_per_step": 10.0}
+    figures["train_psnr"] = psnr + 1
     return {"psnr": psnr, "mb": mb, "num": num, **figures, **others}
 
 
@@ -414,7 +415,7 @@ def test_choices_are_compared_with_the_default():
 
 def test_without_a_second_seed_nothing_is_said_to_be_above():
     text = tables.gains_table([result("own", 21.0), result("other", 20.0)], "own", ["other"])
-    assert "| +1.00 · +0.000 |" in text and "No cell has two seeds" in text
+    assert "| +1.00 · +0.000 · +1.00 |" in text and "No cell has two seeds" in text
 
 
 def test_columns_are_data_sets_and_what_is_missing_in_one_is_told():

@@ -51,7 +51,8 @@ class Lab:
         if self.args.tables_only:
             return []
         self._check_inputs(grids)
-        self._save()
+        if self.records:
+            self._save()
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
         with contextlib.closing(self._pool()) as pool:
             return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)

@@ -149,17 +149,17 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
             continue
         shown = []
         for other in others:
-            gains, lpips = (_gains(block, reference, other, figure) for figure in ("psnr", "lpips"))
+            gains, lpips, train = (_gains(block, reference, other, name) for name in ("psnr", "lpips", "train_psnr"))
             if not gains:
                 shown.append(MISSING)
                 continue
             every[other].setdefault(place.scene.label, []).append(float(np.mean(gains)))
             said = "" if spread is None else f" ({verdict(gains, spread)})"
-            shown.append(f"{np.mean(gains):+.2f}{said} · {np.mean(lpips):+.3f}")
+            shown.append(f"{np.mean(gains):+.2f}{said} · {np.mean(lpips):+.3f} · {np.mean(train):+.2f}")
         rows.append([*_told_place(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
     rows.append(["*mean ± standard error*", *[""] * 6, *map(_mean_and_error, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
-    text = markdown([*header, *(f"against {other}: dB · LPIPS" for other in others)], rows)
+    text = markdown([*header, *(f"against {other}: dB · LPIPS · train dB" for other in others)], rows)
     return f"{text}\n{_told_spread(spread)}\n"
 
 
