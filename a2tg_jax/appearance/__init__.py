@@ -14,6 +14,7 @@ from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
 from a2tg_jax.appearance.rule import PlainRule as PlainRule
 from a2tg_jax.appearance.rule import StaticRule as StaticRule
 from a2tg_jax.appearance.rule import gaussian_cutoff as gaussian_cutoff
+from a2tg_jax.appearance.textured import TexelRates as TexelRates
 from a2tg_jax.appearance.textured import Textured as Textured
 from a2tg_jax.appearance.textured import TexturedRule as TexturedRule
 from a2tg_jax.appearance.textured import TextureOptions as TextureOptions

@@ -38,7 +38,7 @@ class Appearance:
         """The parameters moved to where they are allowed, after an update; traceable."""
         return params
 
-    def rates(self, rate: Any) -> Any:
+    def rates(self, rate: Any, params: Any) -> Any:
         """Adam's learning rates, a prefix of the parameters' tree, given what a stage says of them; traceable."""
         return rate
 

@@ -119,7 +119,7 @@ class Billboards(Bucketed):
         """Alpha in [0, 1]."""
         return self._with_alpha(params, lambda alpha: jnp.clip(alpha, 0.0, 1.0))
 
-    def rates(self, rate: tuple[float, float]) -> Array:
+    def rates(self, rate: tuple[float, float], params: Textures) -> Array:
         """Of RGB and of alpha."""
         rgb, alpha = rate
         return jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)

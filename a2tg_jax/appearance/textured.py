@@ -6,7 +6,7 @@ textures one after the other as texels [T, 4], each row by row.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -142,6 +142,14 @@ def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
     return jnp.clip(x, 0.0, size - 1)
 
 
+class TexelRates(NamedTuple):
+    """Learning rates of texels by the size of their texture."""
+
+    larger: Any
+    single: Any
+    """Of textures of one texel, which are no more than another colour and opacity of their Gaussian."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Textured(Bucketed):
     """A texture for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
@@ -160,6 +168,13 @@ class Textured(Bucketed):
 
     def project(self, params: Textures) -> Textures:
         return project_texels(params, self.options)
+
+    def rates(self, rate: Any, params: Textures) -> Any:
+        """One for all texels, or `TexelRates`."""
+        if not isinstance(rate, TexelRates):
+            return rate
+        is_single = [bucket.shape[1:3] == (1, 1) for bucket in params.buckets]
+        return Textures(tuple(rate.single if single else rate.larger for single in is_single))
 
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
         return FLOATS_PER_GAUSSIAN * num + 4 * layout.count_texels(num)

@@ -4,7 +4,7 @@ import dataclasses
 from typing import ClassVar, Literal, Self
 
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Plain, Textured, TextureOptions
+from a2tg_jax.appearance import Plain, TexelRates, Textured, TextureOptions
 from a2tg_jax.events import Statistic
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.systems.stage1 import (
@@ -56,6 +56,9 @@ class TextureConfig:
     as in the paper, under 30,000 iterations every 0.15."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
+    single_rate: float | None = None
+    """That of textures of one texel, which are no more than another colour and opacity of their Gaussian; None:
+    `rate`; 0: they stay as they begin, until they grow."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
     """How textures are read."""
 
@@ -105,7 +108,9 @@ class A2tg(System):
         events = (*([Noise()] if self.noise_in_stage2 else []), self.texture.event())
         first = growing_stage(self, self.stage1_iterations, self.densify.events(), Plain(lookup.max_alpha))
         textured = Textured((1, 1), lookup)
-        return first, later_stage(self, "textures", textured, events, self.stage2_iterations, self.texture.rate)
+        single = self.texture.rate if self.texture.single_rate is None else self.texture.single_rate
+        rates = TexelRates(self.texture.rate, single)
+        return first, later_stage(self, "textures", textured, events, self.stage2_iterations, rates)
 
     @classmethod
     def presets(cls) -> dict[str, Self]:

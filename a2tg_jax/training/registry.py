@@ -96,15 +96,16 @@ def with_changes(system: System, changes: Mapping[str, Any], where: str) -> Syst
     Raises:
       ValueError: if an option is unknown or of another type; it is named.
     """
-    return config_from_dict(type(system), _merged(config_to_dict(system), changes), where)
+    return config_from_dict(type(system), merged(config_to_dict(system), changes), where)
 
 
-def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(values)
+def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested options with some of them changed."""
+    result = dict(values)
     for name, change in changes.items():
         is_group = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
-        merged[name] = _merged(values[name], change) if is_group else change
-    return merged
+        result[name] = merged(values[name], change) if is_group else change
+    return result
 
 
 def differences(system: System) -> dict[str, Any]:

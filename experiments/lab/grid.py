@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
-from a2tg_jax.training.registry import with_changes
+from a2tg_jax.training.registry import merged, with_changes
 from lab.jobs import Job, Record
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
@@ -143,8 +143,7 @@ def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, hel
     if scale not in file:
         raise ValueError(f"grids/{name}.toml has no table [{scale}]")
     settings = {**everywhere[scale], **file[scale]}
-    known = {**_read("methods"), **file.get("variants", {})}
-    methods = {label: Method(label, **values) for label, values in known.items()}
+    methods = _methods({**_read("methods"), **file.get("variants", {})})
 
     def method(label: str) -> Method:
         if label not in methods:
@@ -160,6 +159,18 @@ def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, hel
         name, file["title"], scale, settings["preset"], tuple(dict.fromkeys(cells)), method(file["reference"]),
         (*map(method, file.get("methods", [])), *variants), tuple(map(method, file.get("at_equal_bytes", []))),
     )  # fmt: skip
+
+
+def _methods(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Method]:
+    """By label. One that is `like` another has its system, and its options where it has none of its own."""
+    methods: dict[str, Method] = {}
+    for label, values in table.items():
+        own = dict(values)
+        base = methods[own.pop("like")] if "like" in own else None
+        if base is not None:
+            own = {"system": base.system, **own, "options": merged(base.options, own.get("options", {}))}
+        methods[label] = Method(label, **own)
+    return methods
 
 
 def _cells(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[Cell]:
