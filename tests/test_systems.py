@@ -13,7 +13,7 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import adapt
-from a2tg_jax.training import loop
+from a2tg_jax.training import fit_stage, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict, with_changes
@@ -127,6 +127,30 @@ def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
     assert loaded.num_bytes == 4 * (58 + 4) * loaded.num
     found = a2tg.evaluate(scene.test, loaded)
     assert found.psnr == pytest.approx(a2tg.evaluate(scene.test, result.model).psnr, abs=1e-6)
+
+
+def test_textures_of_one_texel_that_do_not_learn_change_nothing(scene):
+    """They stay (0, 0, 0, 1), and the Gaussians are those of a stage without textures."""
+    plain, textured = tiny("gaussians-2d-mcmc"), tiny("a2tg", texture={"fraction": 0.0, "single_rate": 0.0})
+    first = fit_stage(scene, plain, 0, progress=False).model
+    expected, found = (fit_stage(scene, one, 1, first, progress=False).model for one in (plain, textured))
+    (texels,) = found.params.buckets
+    np.testing.assert_array_equal(texels[: found.num], np.broadcast_to([0, 0, 0, 1], (found.num, 1, 1, 4)))
+    for a, b in zip(jax.tree.leaves(found.gaussians), jax.tree.leaves(expected.gaussians), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+
+
+def test_textures_that_have_grown_learn_though_those_of_one_texel_do_not(scene):
+    system = tiny("a2tg", texture={"fraction": 0.5, "single_rate": 0.0, "upscale_at": [0.5]})
+    model = a2tg.fit(scene, system, progress=False).model
+    for (height, width), bucket in zip(model.layout.resolutions, model.params.buckets, strict=True):
+        is_neutral = bool((bucket == jnp.asarray([0, 0, 0, 1], bucket.dtype)[None, None, None]).all())
+        assert is_neutral == (height * width == 1)
+
+
+def test_negative_rates_of_texels_are_refused():
+    with pytest.raises(ValueError, match=r"texture\.single_rate must be at least 0; got -1"):
+        tiny("a2tg", texture={"single_rate": -1.0}).check()
 
 
 def test_textured_gaussians_are_a2tg_with_one_size_and_no_events(scene):

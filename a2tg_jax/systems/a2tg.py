@@ -1,7 +1,7 @@
 """A²TG: plain Gaussians first, then textures that grow where the gradient asks for them (arXiv 2026, §3)."""
 
 import dataclasses
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Plain, TexelRates, Textured, TextureOptions
@@ -21,6 +21,8 @@ from a2tg_jax.systems.stage1 import (
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
+QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0, "moments": "zero"}
+"""What short runs want (docs/results.md)."""
 PAPER_THRESHOLD = 2e-5
 """k_G, in the unit of the authors' own statistic."""
 
@@ -123,18 +125,21 @@ class A2tg(System):
                 rates=QUICK_RATES,
                 stage2_iterations=1_000,
                 densify=McmcConfig(cap=QUICK_CAP),
-                texture=TextureConfig(rate=QUICK_TEXELS),
+                texture=TextureConfig(**QUICK_TEXTURES),
             ),
             "smoke": cls(
                 **SMOKE,
                 stage2_iterations=120,
                 densify=McmcConfig(cap=SMOKE_CAP),
-                texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), rate=1e-2),
+                texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), **QUICK_TEXTURES),
             ),
         }  # fmt: skip
 
     def check(self) -> None:
         super().check()
+        for name in ("rate", "single_rate"):
+            if (getattr(self.texture, name) or 0) < 0:
+                raise ValueError(f"texture.{name} must be at least 0; got {getattr(self.texture, name)}")
         budget = self.texture.budget_mb
         if self.texture.select == "budget" and budget is not None and budget <= 0:
             raise ValueError(f"texture.budget_mb must be positive; got {budget}")

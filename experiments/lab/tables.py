@@ -132,6 +132,18 @@ def _grouped(results: Iterable[Result], key: Callable[[Result], Any]) -> list[tu
     return list(groups.items())
 
 
+def variants_of_reference(grid: Grid, results: Sequence[Result]) -> str:
+    """A table of gains for the reference, and one for each method of the grid whose name begins with its.
+
+    Their bytes are their own; the splats of the others fit into those of the reference.
+    """
+    names = [method.label for method in (grid.reference, *grid.methods)]
+    variants = [name for name in names if name.startswith(grid.reference.label)]
+    others = [method.label + EQUAL_BYTES for method in grid.at_equal_bytes]
+    others += [name for name in names if name not in variants]
+    return "\n".join(gains_table(results, variant, others) for variant in variants)
+
+
 def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]) -> str:
     """By how much the reference is above other methods in its cell, with a verdict.
 
