@@ -68,8 +68,9 @@ class Upscale(HostEvent):
     gradient: Statistic = static(default="position")
     """The gradient that is averaged: by position in the world, as the paper has it, or "screen": by the position on
     the screen, in units of half an image, and only where the low-pass filter decides, as in the authors' program."""
-    moments: Literal["copied", "zero"] = static(default="copied")
-    """What Adam remembers of a texture that has grown: its old texels' moments, copied as they are, or nothing."""
+    moments: Literal["zero", "copied"] = static(default="zero")
+    """What Adam remembers of a texture that has grown: nothing, so that its texels part quickly, or its old texels'
+    moments, copied as they are."""
 
     @property
     def statistic(self) -> Statistic:

@@ -21,7 +21,7 @@ from a2tg_jax.systems.stage1 import (
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
-QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0, "moments": "zero"}
+QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0}
 """What short runs want (docs/results.md)."""
 PAPER_THRESHOLD = 2e-5
 """k_G, in the unit of the authors' own statistic."""
@@ -45,8 +45,8 @@ class TextureConfig:
     """Thin Gaussians double along their long axis, or along the short one as in the authors' program."""
     gradient: Statistic = "position"
     """The gradient that chooses: by position in the world, or "screen" as in the authors' program."""
-    moments: Literal["copied", "zero"] = "copied"
-    """Adam's moments of a texture that has grown: copied from its old texels, or zero."""
+    moments: Literal["zero", "copied"] = "zero"
+    """Adam's moments of a texture that has grown: zero, or copied from its old texels as in the authors' program."""
     k_a: float = 4.0
     """Aspect ratio above which a Gaussian counts as elongated."""
     k_s: float = 0.01
@@ -88,7 +88,12 @@ class TextureConfig:
         """The choices of the authors' own program."""
         lookup = TextureOptions.official()
         return TextureConfig(
-            select="threshold", threshold=PAPER_THRESHOLD, axes="authors", gradient="screen", lookup=lookup
+            select="threshold",
+            threshold=PAPER_THRESHOLD,
+            axes="authors",
+            gradient="screen",
+            moments="copied",
+            lookup=lookup,
         )
 
 
