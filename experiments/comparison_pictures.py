@@ -6,13 +6,13 @@ python experiments/comparison_pictures.py --scenes SCENES --scale small --lpips-
 from collections.abc import Sequence
 
 import numpy as np
-from lab import tables
+from lab import pictures, tables
 from lab.cli import Experiment, Lab, main
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
 from a2tg_jax.data import view_image
-from a2tg_jax.results.pictures import largest_gain, save_picture, side_by_side, to_uint8
+from a2tg_jax.results.pictures import largest_gain, save_picture, to_uint8
 
 ZOOM = 4
 
@@ -41,10 +41,10 @@ def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[s
         rows, key=lambda row: _squared_error(row[0], row[2]) - _squared_error(*row[:2])
     )
     images, captions = [target, first, second, *others], ["photograph", *models]
-    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", side_by_side(images, captions))
+    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(images, captions))
     crop = largest_gain(target, second, first)
-    close = [np.repeat(np.repeat(crop.of(image), ZOOM, 0), ZOOM, 1) for image in images]
-    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}-close.png", side_by_side(close, captions))
+    close = [pictures.enlarged(crop.of(image), ZOOM) for image in images]
+    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}-close.png", pictures.sheet(close, captions))
 
 
 def _squared_error(target: np.ndarray, image: np.ndarray) -> float:

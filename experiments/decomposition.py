@@ -13,7 +13,7 @@ from lab.jobs import background_of
 from PIL import Image
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.pictures import save_picture, side_by_side, to_uint8
+from a2tg_jax.results.pictures import save_picture, to_uint8
 
 NUM_TEXTURES, ZOOM = 16, 12
 
@@ -32,7 +32,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         camera = model.origin.cameras[0]
         shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in views.values()]
         stem = name.replace("/", "-")
-        save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", side_by_side(shown, list(views)))
+        save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(shown, list(views)))
         save_picture(lab.out / f"learned_textures-{stem}.png", _textures_picture(model))
         scene = lab.folders.load_scene(result.run.job)
         quality = [a2tg.evaluate(scene.test, one, background=background_of(scene)) for one in views.values()]
@@ -44,7 +44,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 def _textures_picture(model: a2tg.Model) -> Image.Image:
     """The most varied textures of 4×4, 1×4 and 4×1 texels (rows × columns): RGB above, alpha below."""
     sheets = [pictures.learned_textures(model, size, NUM_TEXTURES) for size in ((4, 4), (1, 4), (4, 1))]
-    sheets = [np.repeat(np.repeat(sheet, ZOOM, 0), ZOOM, 1) for sheet in sheets if sheet.shape[1]]
+    sheets = [pictures.enlarged(sheet, ZOOM) for sheet in sheets if sheet.shape[1]]
     width = max((sheet.shape[1] for sheet in sheets), default=1)
     padded = [np.pad(sheet, ((0, ZOOM), (0, width - sheet.shape[1]), (0, 0)), constant_values=255) for sheet in sheets]
     return Image.fromarray(np.concatenate(padded) if padded else np.full((1, 1, 3), 255, np.uint8))

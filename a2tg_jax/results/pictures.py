@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib
 import numpy as np
 from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
@@ -23,6 +24,8 @@ from a2tg_jax.texture import AtlasLayout, Textures
 
 ERROR_GAIN = 4
 MARGIN, CAPTION_HEIGHT = 6, 22
+FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
+"""Pillow's own font lacks × and ²."""
 LONGEST_SIDE = 1280
 """Of a picture in the report, in pixels."""
 
@@ -69,7 +72,7 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
     """One sheet of images in a row, each under its caption, which is cut off where the image ends."""
     height, width = images[0].shape[:2]
     sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
-    font = ImageFont.load_default(size=14)
+    font = ImageFont.truetype(FONT, size=13)
     for index, (image, caption) in enumerate(zip(images, captions, strict=True)):
         left = index * (width + MARGIN)
         strip = Image.new("RGB", (width, CAPTION_HEIGHT), "white")

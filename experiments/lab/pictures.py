@@ -1,16 +1,32 @@
 """Models changed so that a rendering shows something of them: what textures do, and where they are large."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.gaussians import SH_C0
+from a2tg_jax.results.pictures import side_by_side
 
+LEAST_WIDTH = 300
+"""Of an image in a sheet, in pixels."""
 SQUARE, OBLONG = (0.15, 0.35, 0.95), (0.9, 0.12, 0.1)
 """The paper's colours: blue for textures of 2×2 and 4×4 texels, red for those that are not square."""
+
+
+def sheet(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
+    """Images side by side under their captions, enlarged without smoothing until captions fit."""
+    zoom = -(-LEAST_WIDTH // images[0].shape[1])
+    return side_by_side([enlarged(image, zoom) for image in images], captions)
+
+
+def enlarged(image: np.ndarray, zoom: int) -> np.ndarray:
+    """Each pixel as zoom × zoom."""
+    return np.repeat(np.repeat(image, zoom, axis=0), zoom, axis=1)
 
 
 def without_textures(model: a2tg.Model) -> a2tg.Model:
