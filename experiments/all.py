@@ -6,9 +6,8 @@ Stopped and called again, it goes on where it was. `--plan` tells what is left t
 """
 
 import importlib
-from pathlib import Path
 
-from lab.cli import main
+from lab.cli import EXPERIMENTS, main
 from lab.pages import refresh
 
 NAMES = (
@@ -17,10 +16,10 @@ NAMES = (
     "efficiency",
 )  # fmt: skip
 
-PAGE = Path(__file__).parents[1] / "docs" / "results.md"
-"""Shows tables that lie in experiments/results."""
+PAGE = EXPERIMENTS.parent / "docs" / "results.md"
+"""Shows tables of this folder's results."""
 
 if __name__ == "__main__":
-    main([importlib.import_module(name).EXPERIMENT for name in NAMES], __doc__)
-    if PAGE.is_file():
-        refresh(PAGE, Path(__file__).parent)
+    lab = main([importlib.import_module(name).EXPERIMENT for name in NAMES], __doc__)
+    if lab is not None and lab.out.resolve().parent == EXPERIMENTS / "results" and not lab.is_partial:
+        refresh(PAGE, EXPERIMENTS)

@@ -131,8 +131,8 @@ class Experiment:
     """Called when the grids were run, also where runs are missing."""
 
 
-def main(experiments: Sequence[Experiment], description: str) -> None:
-    """Runs all that some experiments need, in one queue, and presents each."""
+def main(experiments: Sequence[Experiment], description: str) -> Lab | None:
+    """Runs all that some experiments need, in one queue, and presents each; None where only a plan was wanted."""
     args = parse_arguments(description)
     try:
         lab = Lab(args)
@@ -140,7 +140,7 @@ def main(experiments: Sequence[Experiment], description: str) -> None:
         grids = {name: lab.grid(name) for name in names}
         if args.plan:
             print(plan_of(list(grids.values()), lab.records))
-            return
+            return None
         failures = lab.run(list(grids.values()))
     except (ValueError, OSError, RuntimeError, NameError) as error:  # The last two are submitit's.
         sys.exit(f"error: {error}")
@@ -153,6 +153,7 @@ def main(experiments: Sequence[Experiment], description: str) -> None:
     if errors:
         told = "\n".join(f"  {error}" for error in errors)
         sys.exit(f"error: not all could be done; what needs it is missing. Call again to retry:\n{told}")
+    return lab
 
 
 def _tell_failure(failure: Failure) -> None:
