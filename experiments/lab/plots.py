@@ -9,15 +9,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 COLORS = {
     "A²TG": "#cc3311", "2DGS*-MCMC": "#4477aa", "Textured Gaussians*": "#228833", "SuperGaussians": "#aa3377",
-    "BBSplat": "#ccaa33", "2DGS*": "#66ccee",
+    "BBSplat": "#ccaa33", "2DGS*": "#66ccee", "A²TG, as quick has it": "#ee7733",
 }  # fmt: skip
 OTHER_COLOR = "#777777"
 Point = tuple[float, float]
 
 
 def color_of(label: str) -> str:
-    """A method's colour; its variants have the same."""
-    return next((color for name, color in COLORS.items() if label.split(",")[0] == name), OTHER_COLOR)
+    """A method's colour; variants without one of their own have the same."""
+    return COLORS.get(label) or COLORS.get(label.split(",")[0], OTHER_COLOR)
 
 
 def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_label: str, title: str) -> None:
