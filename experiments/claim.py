@@ -3,21 +3,10 @@
 python experiments/claim.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
 """
 
-from collections.abc import Sequence
+from lab.cli import main
+from lab.standard import gains_experiment
 
-from lab import tables
-from lab.cli import Experiment, Lab, main
-from lab.grid import Grid
-
-
-def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """By how much A²TG, and any variant of it, is above the others, with the spread of seeds."""
-    (grid,) = grids
-    results = tables.results_of(grid, lab.records)
-    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{tables.variants_of_reference(grid, results)}")
-
-
-EXPERIMENT = Experiment("claim", ("claim",), present)
+EXPERIMENT = gains_experiment("claim")
 
 if __name__ == "__main__":
     main([EXPERIMENT], __doc__)

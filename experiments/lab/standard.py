@@ -33,3 +33,14 @@ def choices_experiment(name: str) -> Experiment:
         lab.write(name, f"# {grid.title}\n\n{tables.choices_table(results, grid.reference.label)}")
 
     return Experiment(name, (name,), present)
+
+
+def gains_experiment(name: str) -> Experiment:
+    """By how much the reference of a grid, and any variant of it, is above the others, with the spread of seeds."""
+
+    def present(lab: Lab, grids: Sequence[Grid]) -> None:
+        (grid,) = grids
+        results = tables.results_of(grid, lab.records)
+        lab.write(name, f"# {grid.title}\n\n{tables.variants_of_reference(grid, results)}")
+
+    return Experiment(name, (name,), present)
