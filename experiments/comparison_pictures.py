@@ -30,7 +30,6 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[str, a2tg.Model]) -> None:
     """One of the whole view, one of a part; the first model is the reference, the second what it gains over."""
-    lab.out.mkdir(parents=True, exist_ok=True)
     background = next(iter(models.values())).background
     drawn = {label: a2tg.Renderer(model) for label, model in models.items()}
     rows = []
@@ -41,10 +40,10 @@ def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[s
         rows, key=lambda row: _squared_error(row[0], row[2]) - _squared_error(*row[:2])
     )
     images, captions = [target, first, second, *others], ["photograph", *models]
-    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(images, captions))
+    save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(images, captions))
     crop = largest_gain(target, second, first)
     close = [pictures.enlarged(crop.of(image), ZOOM) for image in images]
-    save_picture(lab.out / f"{EXPERIMENT.name}-{stem}-close.png", pictures.sheet(close, captions))
+    save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}-close.png", pictures.sheet(close, captions))
 
 
 def _squared_error(target: np.ndarray, image: np.ndarray) -> float:

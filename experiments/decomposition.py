@@ -27,13 +27,12 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         if model is None:
             continue
         name = result.run.cell.scene.label
-        lab.out.mkdir(parents=True, exist_ok=True)
         views = {"full": model, "SH only": pictures.without_textures(model), "texture only": pictures.without_sh(model)}
         camera = model.origin.cameras[0]
         shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in views.values()]
         stem = name.replace("/", "-")
-        save_picture(lab.out / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(shown, list(views)))
-        save_picture(lab.out / f"learned_textures-{stem}.png", _textures_picture(model))
+        save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(shown, list(views)))
+        save_picture(lab.pages / f"learned_textures-{stem}.png", _textures_picture(model))
         scene = lab.folders.load_scene(result.run.job)
         quality = [a2tg.evaluate(scene.test, one, background=background_of(scene)) for one in views.values()]
         rows.append([name, *(tables.number(found.psnr, 2) for found in quality)])

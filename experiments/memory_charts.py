@@ -26,9 +26,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     sizes = {label: _points(results, label, "num", "mb") for label in METHODS}
     panels.append(("memory of all scenes", sizes, "Gaussians", "MB"))
     log_y = [False] * (len(panels) - 1) + [True]
-    lab.out.mkdir(parents=True, exist_ok=True)
-    save_figure(lab.out / "memory_charts.png", plots.charts(panels, log_y=log_y))
-    print(lab.out / "memory_charts.png")
+    save_figure(lab.pages / "memory_charts.png", plots.charts(panels, log_y=log_y))
+    print(lab.pages / "memory_charts.png")
 
 
 def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> list[plots.Point]:

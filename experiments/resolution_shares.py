@@ -29,7 +29,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     densest = {result.run.cell.scene.label: result for result in sorted(results, key=lambda result: result["num"])}
     if densest:
         charted = {_place(result): shares[_place(result)] for result in densest.values()}
-        save_figure(lab.out / f"{EXPERIMENT.name}.png", plots.shares_chart(charted))
+        save_figure(lab.pages / f"{EXPERIMENT.name}.png", plots.shares_chart(charted))
     for result in tables.results_of(grids[-1], lab.records):
         if result.label == label:
             _picture(lab, result)
@@ -54,7 +54,7 @@ def _picture(lab: Lab, result: tables.Result) -> None:
     camera = model.origin.cameras[0]
     shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in (model, pictures.colored_by_shape(model))]
     sheet = pictures.sheet(shown, ["full", "blue: 2×2, 4×4; red: not square"])
-    save_picture(lab.out / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
+    save_picture(lab.pages / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
 
 
 EXPERIMENT = Experiment("resolution_shares", ("ablation", "pictures"), present)

@@ -25,7 +25,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         panels.append((column, _curves(own, "psnr"), "MB", "test PSNR, dB"))
         panels.append((column, _curves(own, "lpips"), "MB", "test LPIPS"))
     if panels:
-        save_figure(lab.out / f"{EXPERIMENT.name}.png", plots.charts(panels))
+        save_figure(lab.pages / f"{EXPERIMENT.name}.png", plots.charts(panels))
 
 
 def _curves(results: Sequence[tables.Result], figure: str) -> dict[str, list[plots.Point]]:

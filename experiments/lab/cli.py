@@ -62,6 +62,13 @@ class Lab:
         """Whether scenes are left out."""
         return bool(self.args.only or self.args.without_held_out)
 
+    @property
+    def pages(self) -> Path:
+        """Where tables and pictures go: a folder of their own where only some scenes are wanted. It is made."""
+        folder = self.out / "partial" if self.is_partial else self.out
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
     def model(self, result: Result) -> a2tg.Model | None:
         """What a run left; None, and a line that says so, where it is gone."""
         path = self.folders.model(result.run.job)
@@ -71,9 +78,8 @@ class Lab:
         return None
 
     def write(self, name: str, text: str) -> None:
-        """Prints a page and keeps it among the results; where only some scenes are wanted, under another name."""
-        path = self.out / (f"{name}-partial.md" if self.is_partial else f"{name}.md")
-        self.out.mkdir(parents=True, exist_ok=True)
+        """Prints a page and keeps it among the results."""
+        path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
         print(f"\n{text}\n{path}", flush=True)
