@@ -124,7 +124,7 @@ def next_sizes(
     """The texture sizes one upscaling would give (A²TG, anisotropic upscaling).
 
     s_x/s_y > k_A and s_y < k_S: Tu doubles. s_y/s_x > k_A and s_x < k_S: Tv doubles. Otherwise both double. Each
-    axis stops at the cap, so that a 4×1 texture becomes 4×2 at a cap of 4.
+    axis stops at the cap, so that a 4×1 texture becomes 4×2 at a cap of 4. An empty texture grows as one of 1×1 does.
 
     Args:
       sizes: [N, 2] integers (Tv, Tu).
@@ -150,7 +150,8 @@ def next_sizes(
     if axes == "authors":
         is_thin_u, is_thin_v = is_thin_v, is_thin_u
     doubles = np.stack([~is_thin_u, ~is_thin_v], axis=1)
-    return np.where(doubles, np.maximum(sizes, np.minimum(2 * sizes, cap)), sizes)
+    present = np.maximum(sizes, 1)
+    return np.where(doubles, np.maximum(present, np.minimum(2 * present, cap)), present)
 
 
 def select(
@@ -229,13 +230,13 @@ def reallocate(
 ) -> ReallocateResult:
     """Rebuilds the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
-    Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding
-    is (0, 0, 0, 1) in textures and 0 in moments.
+    Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding, and
+    what grows from an empty texture, is (0, 0, 0, 1) in textures and 0 in moments.
 
     Args:
       textures: the present texels.
       layout: their layout, of N Gaussians.
-      new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+      new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0.
       moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay as they are.
       known: shapes of buckets to prefer (`texture.plan_layout`).
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
@@ -307,6 +308,8 @@ def _move_texels(old, resolutions, capacities, moves: list[_Move], padding: tupl
         buckets.append(np.broadcast_to(np.asarray(padding, dtype), (capacity, *resolution, 4)).copy())
     for move in moves:
         source, target = old[move.old_bucket], buckets[move.new_bucket]
+        if not source.size:
+            continue
         v, u = (_nearest(source.shape[axis], target.shape[axis]) for axis in (1, 2))
         target[move.new_rows] = source[move.old_rows][:, v][:, :, u]
     return Textures(tuple(jnp.asarray(bucket) for bucket in buckets))

@@ -4,6 +4,7 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 """
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from a2tg_jax.checks import check_floats, dtype_of, short_repr
 from a2tg_jax.numerics import safe_divide, safe_sqrt
+from a2tg_jax.sh import NUM_BASES
 
-FLOATS_PER_GAUSSIAN = 58
 INITIAL_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
 
@@ -33,12 +34,22 @@ class Gaussians:
     logit_opacities: Array
     """[N] logits of the peak opacities."""
     sh: Array
-    """[N, 16, 3] spherical-harmonic coefficients of the colour, degree 0 first."""
+    """[N, K, 3] spherical-harmonic coefficients of the colour, degree 0 first; K is 1, 4, 9 or 16."""
 
     @property
     def num(self) -> int:
         """Number of rows N."""
         return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of their spherical harmonics, 0 to 3."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    @property
+    def floats_per_row(self) -> int:
+        """Floats of one Gaussian: 58 at degree 3, 13 at degree 0."""
+        return floats_per_gaussian(self.sh_degree)
 
     @property
     def scales(self) -> Array:
@@ -58,13 +69,19 @@ class Gaussians:
         return short_repr(self)
 
 
+def floats_per_gaussian(sh_degree: int = 3) -> int:
+    """Mean, rotation, scales, opacity, and the coefficients up to a degree."""
+    return 10 + 3 * NUM_BASES[sh_degree]
+
+
 def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     """Raises ValueError, naming the field, unless all fields have their shapes and one float dtype."""
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
     check_floats(f"{name}.means", gaussians.means, ("N", 3))
     num, dtype = gaussians.num, dtype_of(gaussians.means)
-    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, 16, 3)}
+    bases = gaussians.sh.shape[1] if np.ndim(gaussians.sh) == 3 and gaussians.sh.shape[1] in NUM_BASES else 16
+    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, bases, 3)}
     for field, shape in shapes.items():
         value = getattr(gaussians, field)
         check_floats(f"{name}.{field}", value, shape)
@@ -96,7 +113,7 @@ def logit(p: Array) -> Array:
 
 
 def init_from_points(
-    points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY
+    points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY, sh_degree: int = 3
 ) -> Gaussians:
     """Initial Gaussians from points of a sparse reconstruction.
 
@@ -109,6 +126,7 @@ def init_from_points(
       num: how many Gaussians; None or anything >= P takes all the points, less draws that many without replacement.
       seed: of the drawing and of the rotations.
       opacity: of every Gaussian, between 0 and 1.
+      sh_degree: highest degree of spherical harmonics that they have coefficients of, 0 to 3.
 
     Returns:
       float32 Gaussians, min(num, P) of them.
@@ -133,7 +151,7 @@ def init_from_points(
     distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
     scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
     count = len(points)
-    sh = np.zeros((count, 16, 3))
+    sh = np.zeros((count, NUM_BASES[sh_degree], 3))
     sh[:, 0] = (colors - 0.5) / SH_C0
     quats = rng.normal(size=(count, 4))
     as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax import losses
-from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
+from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.texture import AtlasLayout
 
@@ -99,14 +99,14 @@ def lpips(image: Array, target: Array, weights: LpipsWeights | str | os.PathLike
 
 
 def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> int:
-    """Reported memory in bytes: 232 a Gaussian and 16 a texel, the 1×1 textures counted, padding not.
+    """Reported memory in bytes: 232 a Gaussian (of degree 3) and 16 a texel, 1×1 textures counted, padding not.
 
     Args:
       gaussians: the live Gaussians only.
       layout: of their textures; None when there are none.
     """
     texels = 0 if layout is None else layout.num_texels
-    return BYTES_PER_FLOAT * FLOATS_PER_GAUSSIAN * gaussians.num + BYTES_PER_TEXEL * texels
+    return BYTES_PER_FLOAT * gaussians.floats_per_row * gaussians.num + BYTES_PER_TEXEL * texels
 
 
 def _clip_pair(image: Array, target: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from a2tg_jax.appearance.base import BYTES_PER_FLOAT
 from a2tg_jax.cameras import Camera
 from a2tg_jax.checks import short_repr
 from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
+from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.origin import BLACK, Origin
 from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
 from a2tg_jax.transform import transform_gaussians
@@ -59,18 +59,23 @@ class Model:
     @property
     def num_bytes(self) -> int:
         """Bytes of the trained floats of the Gaussians that exist, padding left out (host)."""
-        return BYTES_PER_FLOAT * self.appearance.num_floats(self.layout, self.num)
+        return self.bytes_of(self.num)
 
     @property
     def num_published_bytes(self) -> int:
         """Bytes as the method's authors count them (host)."""
-        return BYTES_PER_FLOAT * self.appearance.num_published_floats(self.layout, self.num)
+        own = self.gaussians.floats_per_row * self.num
+        return BYTES_PER_FLOAT * (own + self.appearance.num_published_floats(self.layout, self.num))
+
+    def bytes_of(self, num: int) -> int:
+        """Bytes of the trained floats of the first `num` Gaussians and of what they show (host)."""
+        return BYTES_PER_FLOAT * (self.gaussians.floats_per_row * num + self.appearance.num_floats(self.layout, num))
 
     @property
     def num_padding_bytes(self) -> int:
         """Bytes that exist in the buffers only (host)."""
         allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.params))
-        return int(allocated) + BYTES_PER_FLOAT * FLOATS_PER_GAUSSIAN * self.num - self.num_bytes
+        return int(allocated) + BYTES_PER_FLOAT * self.gaussians.floats_per_row * self.num - self.num_bytes
 
     @property
     def background(self) -> tuple[float, float, float]:

@@ -53,7 +53,7 @@ def adam_update(
       grads: the same pytree of gradients.
       state: from `adam_init` or the update before.
       rates: learning rates, a pytree prefix of `params`: one for all, or one per field. A rate is a scalar or an
-        array that broadcasts against its leaf at equal rank ([1, 16, 1] sets one per spherical harmonic).
+        array that broadcasts against its leaf at equal rank ([1, K, 1] sets one per spherical harmonic).
       b1: decay of the first moment, in [0, 1).
       b2: decay of the second moment, in [0, 1).
       eps: ε > 0.

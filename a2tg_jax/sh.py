@@ -8,7 +8,8 @@ from jax import Array
 
 from a2tg_jax.numerics import normalize
 
-NUM_BASES = 16
+NUM_BASES = (1, 4, 9, 16)
+"""Of degrees 0 to the index."""
 
 
 def sh_basis(directions: Array) -> Array:
@@ -48,12 +49,12 @@ def sh_colors(sh: Array, means: Array, center: Array, degree) -> Array:
     """View-dependent colours [N, 3], max(Σ Y_l·sh_l + 0.5, 0).
 
     Args:
-      sh: [N, 16, 3] coefficients.
+      sh: [N, K, 3] coefficients, K being 1, 4, 9 or 16.
       means: [N, 3] positions in the world.
       center: [3] camera centre in the world.
       degree: highest degree used, 0 to 3, an int or a traced integer.
     """
     directions = normalize(means - center[None, :])
-    basis = jnp.where(degree_mask(degree)[None, :], sh_basis(directions), 0.0)
+    basis = jnp.where(degree_mask(degree)[None, :], sh_basis(directions), 0.0)[:, : sh.shape[1]]
     # A sum, which CPUs do several times faster than many small matrix products.
     return jnp.maximum(jnp.sum(basis[:, :, None] * sh, axis=1) + 0.5, 0.0)

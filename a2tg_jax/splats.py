@@ -15,7 +15,6 @@ from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.geometry import homographies
 from a2tg_jax.pixel import Statistic
-from a2tg_jax.sh import sh_colors
 from a2tg_jax.tiles import TileGrid
 
 Compositor = Literal["native", "pallas", "xla"]
@@ -84,7 +83,7 @@ def project_gaussians(
     M, normals = homographies(gaussians, camera)
     opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
     _check_rule(rule, opacities, numbers, gaussians.num)
-    colors = sh_colors(gaussians.sh, gaussians.means, camera.center, sh_degree)
+    colors = rule.colors(gaussians, camera, sh_degree)
     # Not >=: a depth that is no number is not behind the camera.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:

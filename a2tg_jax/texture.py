@@ -113,7 +113,7 @@ def plan_layout(sizes, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[
     """The layout for textures of the given sizes, and the capacity of each bucket (host).
 
     Args:
-      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0: an empty texture, of no bytes.
       known: shapes to choose from where the textures fit and it costs at most `KNOWN_SLACK` times the texels: what is
         compiled for a shape need not be compiled again.
 
@@ -123,8 +123,10 @@ def plan_layout(sizes, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[
     sizes = np.asarray(sizes)
     if sizes.ndim != 2 or sizes.shape[1] != 2 or not np.issubdtype(sizes.dtype, np.integer):
         raise ValueError(f"sizes must be integers [N, 2] as (Tv, Tu); got {sizes.dtype} {sizes.shape}")
-    if sizes.size and (sizes.min() < 1 or sizes.max() > MAX_SIDE):
-        raise ValueError(f"texture sides must lie in 1..{MAX_SIDE}; got {sizes.min()}..{sizes.max()}")
+    is_wrong = ((sizes < 1) | (sizes > MAX_SIDE)).any(axis=1) & (sizes != 0).any(axis=1)
+    if is_wrong.any():
+        found = sizes[is_wrong]
+        raise ValueError(f"texture sides must lie in 1..{MAX_SIDE}, or both be 0; got {found.min()}..{found.max()}")
     codes, bucket, counts = np.unique(sizes @ np.array([64, 1]), return_inverse=True, return_counts=True)
     order = np.argsort(bucket, kind="stable")
     starts = np.repeat(np.cumsum(counts) - counts, counts)
@@ -157,7 +159,7 @@ def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Te
     """Textures of the given sizes whose texels are all (rgb, rgb, rgb, 1): with rgb = 0 they show nothing.
 
     Args:
-      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16.
+      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0: an empty texture, of no bytes.
       rgb: initial RGB residual.
       dtype: of the texels.
     """

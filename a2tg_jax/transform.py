@@ -38,7 +38,8 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
     means = similarity.apply(np.asarray(gaussians.means, np.float64))
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.asarray(gaussians.quats), scalar_first=True)
     log_scales = np.asarray(gaussians.log_scales, np.float64) + np.log(similarity.scale)
-    sh = np.einsum("lk,nkc->nlc", sh_rotation(rotation), np.asarray(gaussians.sh, np.float64))
+    turned_sh = sh_rotation(rotation)[: gaussians.sh.shape[1], : gaussians.sh.shape[1]]
+    sh = np.einsum("lk,nkc->nlc", turned_sh, np.asarray(gaussians.sh, np.float64))
     dtype = gaussians.means.dtype
     return Gaussians(
         means=jnp.asarray(means, dtype),

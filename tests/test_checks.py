@@ -34,7 +34,7 @@ WRONG_FIELDS = [
     (changed(quats=jnp.zeros((6, 4))), "quats must be [7, 4]; got [6, 4]"),
     (changed(log_scales=jnp.zeros((7, 3))), "log_scales must be [7, 2]; got [7, 3]"),
     (changed(logit_opacities=jnp.zeros((7, 1))), "logit_opacities must be [7]; got [7, 1]"),
-    (FLAT_SH, "sh must be [7, 16, 3]; got [7, 1, 3]"),
+    (FLAT_SH, "sh must be [7, 16, 3]; got [7, 2, 3]"),
     (changed(sh=jnp.zeros((7, 16, 3), jnp.int32)), "sh must be floats; got int32"),
     (changed(sh=jnp.zeros((7, 16, 3), jnp.float16)), "sh must be float32 as the means are; got float16"),
 ]

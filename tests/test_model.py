@@ -205,7 +205,7 @@ def head(**values) -> str:
         (with_header(head(appearance={"name": "Textured"})), "lacks 'module'"),
         (changed("means", lambda x: x[:, :2]), r"gaussians\.means must be \[N, 3\]; got \[7, 2\]"),
         (changed("means", lambda x: x[0, 0]), r"gaussians\.means must be \[N, 3\]"),
-        (changed("sh", lambda x: x[:, :1]), r"gaussians\.sh must be \[7, 16, 3\]; got \[7, 1, 3\]"),
+        (changed("sh", lambda x: x[:, :2]), r"gaussians\.sh must be \[7, 16, 3\]; got \[7, 2, 3\]"),
         (changed("quats", lambda x: x.astype(np.int32)), r"gaussians\.quats must be floats"),
         (changed("quats", lambda x: x.astype(str)), "must be floats"),
         (edit(lambda header, arrays: arrays.pop("quats")), "lacks 'quats'"),
@@ -261,7 +261,7 @@ def test_missing_file(tmp_path):
 
 def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
     gaussians = dataclasses.replace(some_gaussians(), sh=jnp.zeros((7, 1, 3)))
-    with pytest.raises(ValueError, match=r"model\.gaussians\.sh must be \[7, 16, 3\]; got \[7, 1, 3\]"):
+    with pytest.raises(ValueError, match=r"model\.gaussians\.sh must be \[7, 16, 3\]; got \[7, 2, 3\]"):
         save_model(tmp_path / "m.npz", Model(gaussians))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.rule import AppearanceRule
-from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians, logit
+from a2tg_jax.gaussians import Gaussians, logit
 from a2tg_jax.sharing import share
 
 BYTES_PER_FLOAT = 4
@@ -43,9 +43,9 @@ class Appearance:
         return rate
 
     def num_floats(self, layout: Any, num: int) -> int:
-        """Trained floats of `num` live Gaussians with all that they show, padding left out (host)."""
+        """Trained floats of what `num` live Gaussians show, their own and padding left out (host)."""
         per_row = sum(np.prod(leaf.shape[1:], dtype=int) for leaf in jax.tree.leaves(self._shapes(1)[0]))
-        return (FLOATS_PER_GAUSSIAN + int(per_row)) * num
+        return int(per_row) * num
 
     def num_published_floats(self, layout: Any, num: int) -> int:
         """Floats as the method's authors count them (host)."""

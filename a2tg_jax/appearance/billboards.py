@@ -20,7 +20,7 @@ from jax import Array
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule
 from a2tg_jax.bilinear import TextureRegion
-from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
+from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.numerics import safe_divide
 from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures
 
@@ -125,8 +125,8 @@ class Billboards(Bucketed):
         return jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
 
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
-        """57 + 4·S² a splat; the Gaussian's own opacity is not trained."""
-        return (FLOATS_PER_GAUSSIAN - 1 + 4 * self.side**2) * num
+        """4·S² − 1 more than the Gaussian's own: its opacity is not trained."""
+        return (4 * self.side**2 - 1) * num
 
     def opacities(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout) -> Array:
         """[N] mean alpha of the texels."""

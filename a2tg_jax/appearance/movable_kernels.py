@@ -19,7 +19,7 @@ from jax import Array
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.rule import PlainRule, gaussian_cutoff
 from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians, logit
+from a2tg_jax.gaussians import Gaussians, logit
 from a2tg_jax.sharing import LARGEST_OPACITY, share
 
 NUM_KERNELS = 4
@@ -28,8 +28,8 @@ INITIAL_CENTERS = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 INITIAL_SHARPNESS = 0.1
 LARGEST_INITIAL_OPACITY = 0.999
 FLOATS_PER_KERNEL = 7
-PUBLISHED_FLOATS = 74
-"""Floats a splat that the authors' figures of memory imply."""
+PUBLISHED_FLOATS = 16
+"""Floats of the kernels of a splat that the authors' figures of memory, 74 a splat in all, imply."""
 
 
 @jax.tree_util.register_dataclass
@@ -112,8 +112,8 @@ class MovableKernels(Appearance):
         return dataclasses.replace(params, sharpness=jnp.maximum(params.sharpness, 0.0))
 
     def num_floats(self, layout: tuple, num: int) -> int:
-        """85 a splat; the Gaussian's own opacity is not trained."""
-        return (FLOATS_PER_GAUSSIAN - 1 + NUM_KERNELS * FLOATS_PER_KERNEL) * num
+        """27 more than the Gaussian's own: its opacity is not trained."""
+        return (NUM_KERNELS * FLOATS_PER_KERNEL - 1) * num
 
     def num_published_floats(self, layout: tuple, num: int) -> int:
         return PUBLISHED_FLOATS * num

@@ -23,6 +23,7 @@ from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import classes_of
 from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.sh import sh_colors
 
 Residual = tuple[Array, Array, Array] | None
 """Added to red, green and blue; None stands for 0."""
@@ -54,6 +55,10 @@ class AppearanceRule:
     def opacities(self, gaussians: Gaussians) -> Array:
         """[N] peak opacities."""
         return gaussians.opacities
+
+    def colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        """[N, 3] colours in this view, of spherical harmonics up to `degree`, which may be traced."""
+        return sh_colors(gaussians.sh, gaussians.means, camera.center, degree)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         """(x, y) where a texture is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""

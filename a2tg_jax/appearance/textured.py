@@ -16,8 +16,8 @@ from jax import Array
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
 from a2tg_jax.bilinear import TextureRegion
-from a2tg_jax.gaussians import FLOATS_PER_GAUSSIAN, Gaussians
-from a2tg_jax.texture import AtlasLayout, Textures, allocate_textures
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
 
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
@@ -85,13 +85,17 @@ class TexturedRule(AppearanceRule):
 
 
 def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedRule:
-    """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels."""
-    textures = shown_textures(textures, layout, options)
-    areas = [height * width for height, width in layout.resolutions]
+    """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels.
+
+    An empty texture is shown as one texel that changes nothing, of which nothing is trained.
+    """
+    textures = _without_empty(shown_textures(textures, layout, options))
+    resolutions = [bucket.shape[1:3] for bucket in textures.buckets]
+    areas = [height * width for height, width in resolutions]
     capacities = [bucket.shape[0] for bucket in textures.buckets]
     starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
     bucket_starts, bucket_areas = jnp.asarray(starts, jnp.int32), jnp.asarray(areas, jnp.int32)
-    sizes = jnp.asarray(layout.resolutions, jnp.int32)[layout.bucket]
+    sizes = jnp.asarray(resolutions, jnp.int32)[layout.bucket]
     peaks = jnp.stack([_padded_peaks(bucket, max(capacities)) for bucket in textures.buckets])
     peaks = jax.lax.stop_gradient(peaks[layout.bucket, layout.row])
     offsets = bucket_starts[layout.bucket] + layout.row * bucket_areas[layout.bucket]
@@ -117,6 +121,17 @@ def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOpti
         return jnp.concatenate([rgb, alpha], axis=-1)
 
     return jax.tree.map(shown, textures)
+
+
+def _without_empty(textures: Textures) -> Textures:
+    """The textures with a neutral texel in place of each empty one."""
+
+    def filled(bucket: Array) -> Array:
+        if bucket.size or not bucket.shape[0]:
+            return bucket
+        return jnp.broadcast_to(jnp.asarray(NEUTRAL_TEXEL, bucket.dtype), (bucket.shape[0], 1, 1, 4))
+
+    return Textures(tuple(map(filled, textures.buckets)))
 
 
 def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
@@ -155,7 +170,7 @@ class Textured(Bucketed):
     """A texture for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
 
     start: tuple[int, int] = (1, 1)
-    """(Tv, Tu) of every texture at first, each 1 to 16."""
+    """(Tv, Tu) of every texture at first, each 1 to 16; (0, 0): none has a texture until it grows."""
     options: TextureOptions = TextureOptions()
     """How textures are read."""
 
@@ -177,7 +192,7 @@ class Textured(Bucketed):
         return Textures(tuple(rate.single if single else rate.larger for single in is_single))
 
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
-        return FLOATS_PER_GAUSSIAN * num + 4 * layout.count_texels(num)
+        return 4 * layout.count_texels(num)
 
 
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:

@@ -72,7 +72,8 @@ def save_ply(
     if transform is not None:
         gaussians = transform_gaussians(gaussians, transform.inverse())
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
-    names = list(ATTRIBUTES)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, -1)
+    names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
     if third_scale:
         names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
         third = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
@@ -81,7 +82,7 @@ def save_ply(
         np.asarray(gaussians.means),
         np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
         sh[:, 0],
-        sh[:, 1:].transpose(0, 2, 1).reshape(-1, 45),
+        rest,
         np.asarray(gaussians.logit_opacities)[:, None],
         log_scales,
         np.asarray(gaussians.quats),
@@ -105,7 +106,7 @@ def _as_plain(model: Model) -> Gaussians:
 def load_ply(path: str | os.PathLike) -> Gaussians:
     """Reads Gaussians from a PLY file of 2DGS, or of a program that uses its attribute names.
 
-    Fewer SH degrees than 3 are filled up with zeros; further attributes are left aside. A 3DGS file (scale_2) holds
+    They have the SH degree of the file; further attributes are left aside. A 3DGS file (scale_2) holds
     ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning where that is more
     than a thousandth of the others.
 
@@ -167,11 +168,11 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     def columns(wanted) -> np.ndarray:
         return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
 
-    sh = np.zeros((len(vertices), 16, 3), np.float32)
+    sh = np.zeros((len(vertices), 1 + len(rest) // 3, 3), np.float32)
     sh[:, 0] = columns(SH_DEGREE0)
     if rest:
         per_channel = columns(rest).reshape(len(vertices), 3, -1)
-        sh[:, 1 : 1 + per_channel.shape[2]] = per_channel.transpose(0, 2, 1)
+        sh[:, 1:] = per_channel.transpose(0, 2, 1)
     quats, log_scales = columns(QUATS), columns(SCALES)
     if THIRD_SCALE in names:
         quats, log_scales = _without_thinnest_axis(quats, columns((*SCALES, THIRD_SCALE)), path)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Hashable
 import jax
 import jax.numpy as jnp
 
-from a2tg_jax.appearance.base import BYTES_PER_FLOAT
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import HostEvent, StepEvent
 from a2tg_jax.memory import keep_room_for_programs, return_free_memory
@@ -188,10 +187,10 @@ class StageRun:
     def _log(self, iteration: int, info: StepInfo) -> None:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
             model = self.state.model
-            num_floats = model.appearance.num_floats(model.layout, int(info.num_live))
+            num_bytes = model.bytes_of(int(info.num_live))
             self.history = self.history.with_point(
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
-                BYTES_PER_FLOAT * num_floats / 1e6, self.seconds,
+                num_bytes / 1e6, self.seconds,
             )  # fmt: skip
 
     def _host_events(self, iteration: int) -> None:

@@ -55,7 +55,7 @@ class System:
     background: Literal["black", "white", "random"] = "black"
     """Behind everything, where photographs are transparent too."""
     sh_degree: int = 3
-    """Highest degree of spherical harmonics, 0 to 3."""
+    """Highest degree of spherical harmonics, 0 to 3; coefficients above it do not exist."""
     seed: int = 0
     tile_size: int = 8
     """Side of a tile in pixels; results do not depend on it."""

@@ -14,6 +14,7 @@ from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput
+from a2tg_jax.sh import NUM_BASES
 from a2tg_jax.training.terms import Target
 
 Background = Literal["black", "white", "random"]
@@ -47,9 +48,9 @@ class LearningRates:
     sh_degree0: float = 2.5e-3
     sh_rest: float = 1.25e-4
 
-    def of_gaussians(self, means: Any) -> Gaussians:
-        """One rate per field of the Gaussians, given that of the means now."""
-        sh = jnp.full((1, 16, 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
+    def of_gaussians(self, means: Any, sh_degree: int = 3) -> Gaussians:
+        """One rate per field of the Gaussians, given that of the means now, and the degree of their SH."""
+        sh = jnp.full((1, NUM_BASES[sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
         fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
         return Gaussians(*fields)
 

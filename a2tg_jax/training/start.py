@@ -21,7 +21,7 @@ def initial_model(scene: Scene, system: System) -> Model:
     num = system.initial_gaussians or len(scene.points)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     num = min(num, *caps) if caps else num
-    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity))
+    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=system.sh_degree))
 
 
 def padded(model: Model, stage: Stage, system: System) -> Model:
@@ -62,6 +62,6 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
         quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),
         log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE, dtype),
         logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE, dtype),
-        sh=jnp.zeros((num, 16, 3), dtype),
+        sh=jnp.zeros((num, *gaussians.sh.shape[1:]), dtype),
     )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
