@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -104,11 +105,15 @@ class Model:
     def transform(self, similarity: Similarity) -> "Model":
         """The same model in the world that `similarity` leads to, its cameras carried along (host).
 
-        What the splats show is theirs and stays as it is.
+        View dependence turns with the world; what the splats show besides is theirs and stays as it is.
         """
+        sh = self.appearance.sh(self.gaussians, self.params, self.layout)
+        turned = transform_gaussians(dataclasses.replace(self.gaussians, sh=jnp.asarray(sh)), similarity)
+        own = turned.sh[:, : self.gaussians.sh.shape[1]]
         return dataclasses.replace(
             self,
-            gaussians=transform_gaussians(self.gaussians, similarity),
+            gaussians=dataclasses.replace(turned, sh=own),
+            params=self.appearance.with_sh(np.asarray(turned.sh), self.params, self.layout),
             origin=None if self.origin is None else self.origin.moved(similarity),
         )
 

@@ -26,7 +26,7 @@ def changed(**fields) -> a2tg.Gaussians:
     return dataclasses.replace(some_gaussians(), **fields)
 
 
-FLAT_SH = changed(sh=jnp.zeros((7, 1, 3)))
+FLAT_SH = changed(sh=jnp.zeros((7, 2, 3)))
 WRONG_FIELDS = [
     (changed(means=jnp.zeros((7, 4))), "means must be [N, 3]; got [7, 4]"),
     (changed(means=jnp.zeros(())), "means must be [N, 3]; got []"),

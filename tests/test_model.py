@@ -260,7 +260,7 @@ def test_missing_file(tmp_path):
 
 
 def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
-    gaussians = dataclasses.replace(some_gaussians(), sh=jnp.zeros((7, 1, 3)))
+    gaussians = dataclasses.replace(some_gaussians(), sh=jnp.zeros((7, 2, 3)))
     with pytest.raises(ValueError, match=r"model\.gaussians\.sh must be \[7, 16, 3\]; got \[7, 2, 3\]"):
         save_model(tmp_path / "m.npz", Model(gaussians))
 

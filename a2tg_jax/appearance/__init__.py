@@ -1,8 +1,11 @@
 """What a splat shows: `AppearanceRule` is what the renderer is given, `Appearance` the value that makes one.
 
-`rule` and `base` are these two interfaces; `plain`, `textured`, `movable_kernels` and `billboards` implement both.
+`rule` and `base` are these two interfaces; `plain`, `textured`, `movable_kernels` and `billboards` implement both,
+`banded` adds view dependence to any of them.
 """
 
+from a2tg_jax.appearance.banded import Banded as Banded
+from a2tg_jax.appearance.banded import BandedRates as BandedRates
 from a2tg_jax.appearance.base import Appearance as Appearance
 from a2tg_jax.appearance.billboards import BillboardRule as BillboardRule
 from a2tg_jax.appearance.billboards import Billboards as Billboards

@@ -81,6 +81,14 @@ class Appearance:
         (host)."""
         return jax.tree.map(lambda x: x[:num], params), layout
 
+    def sh(self, gaussians: Gaussians, params: Any, layout: Any) -> np.ndarray:
+        """[N, K, 3] all spherical-harmonic coefficients, zeros for what a Gaussian lacks (host)."""
+        return np.asarray(gaussians.sh)
+
+    def with_sh(self, sh: np.ndarray, params: Any, layout: Any) -> Any:
+        """The parameters with other coefficients, as `sh` gives them; those of the Gaussians are not its (host)."""
+        return params
+
     # Files.
 
     def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:

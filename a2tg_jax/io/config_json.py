@@ -17,13 +17,16 @@ def config_to_dict(config: Any) -> dict[str, Any]:
     return {field.name: _to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
-def config_from_dict(kind: type[ConfigT], data: Mapping[str, Any], where: str = "config") -> ConfigT:
+def config_from_dict(
+    kind: type[ConfigT], data: Mapping[str, Any], where: str = "config", *, given: Mapping[str, Any] | None = None
+) -> ConfigT:
     """The dataclass `kind` that `config_to_dict` was given.
 
     Args:
       kind: the dataclass.
       data: one entry per field.
       where: what the errors call this place, such as the name of the file.
+      given: values of fields that are not among the data.
 
     Raises:
       ValueError: if a field is missing or unknown, or has a value of another type; the field is named.
@@ -31,14 +34,16 @@ def config_from_dict(kind: type[ConfigT], data: Mapping[str, Any], where: str = 
     if not isinstance(data, Mapping):
         raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {data!r}")
     hints = typing.get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    given = given or {}
+    names = [field.name for field in dataclasses.fields(kind) if field.name not in given]  # type: ignore[arg-type]
     for name in data:
         if name not in names:
             raise ValueError(f"{_within(where, name)} is not a field of {kind.__name__}; {_instead(name, names)}")
     for name in names:
         if name not in data:
             raise ValueError(f"{_within(where, name)} is missing; it was written by another version")
-    return kind(**{name: _from_json(hints[name], data[name], _within(where, name)) for name in names})
+    values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names}
+    return kind(**values, **given)
 
 
 def _within(where: str, name: str) -> str:

@@ -110,20 +110,31 @@ def _check_rows(appearance: Appearance, params: Any, layout: Any, num: int) -> N
 
 
 def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
+    """Class and options; of an appearance that holds others, theirs too."""
     kind = type(appearance)
-    options = config_to_dict(appearance)
+    held = _held_appearances(appearance)
+    described = {"module": kind.__module__, "name": kind.__qualname__}
+    if held:
+        described["held"] = {name: _appearance_to_dict(inner) for name, inner in held.items()}
+    options = {name: value for name, value in config_to_dict(appearance).items() if name not in held}
     try:
-        is_kept = config_from_dict(kind, json.loads(json.dumps(options, allow_nan=False))) == appearance
+        back = config_from_dict(kind, json.loads(json.dumps(options, allow_nan=False)), given=held)
     except (TypeError, ValueError) as error:
         raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
-    if not is_kept:
+    if back != appearance:
         raise ValueError(f"the options of {kind.__name__} do not come back from JSON: {options}")
-    return {"module": kind.__module__, "name": kind.__qualname__, "options": options}
+    return {**described, "options": options}
+
+
+def _held_appearances(appearance: Appearance) -> dict[str, Appearance]:
+    values = {field.name: getattr(appearance, field.name) for field in dataclasses.fields(appearance)}
+    return {name: value for name, value in values.items() if isinstance(value, Appearance)}
 
 
 def _appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
     kind = _known_class(data["module"], data["name"], appearances)
-    return config_from_dict(kind, data["options"], f"options of {kind.__name__}")
+    held = {name: _appearance_from_dict(inner, appearances) for name, inner in data.get("held", {}).items()}
+    return config_from_dict(kind, data["options"], f"options of {kind.__name__}", given=held)
 
 
 def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]) -> type[Appearance]:

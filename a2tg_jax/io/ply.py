@@ -17,7 +17,7 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance import Appearance, Banded
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.io.atomic import replacing
@@ -95,12 +95,19 @@ def save_ply(
 
 
 def _as_plain(model: Model) -> Gaussians:
-    """The Gaussians of a model, opaque by themselves."""
-    if type(model.appearance).opacities is Appearance.opacities:
-        return model.gaussians
-    opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
-    opacities = jnp.clip(opacities, LEAST_OPACITY, LARGEST_OPACITY)
-    return dataclasses.replace(model.gaussians, logit_opacities=logit(opacities))
+    """The Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
+    shown = model.gaussians, model.params, model.layout
+    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.appearance.sh(*shown)))
+    if has_own_opacities(model.appearance):
+        return gaussians
+    opacities = jnp.clip(model.appearance.opacities(*shown), LEAST_OPACITY, LARGEST_OPACITY)
+    return dataclasses.replace(gaussians, logit_opacities=logit(opacities))
+
+
+def has_own_opacities(appearance: Appearance) -> bool:
+    """Whether splats are as opaque as their Gaussians say."""
+    inner = appearance.inner if isinstance(appearance, Banded) else appearance
+    return type(inner).opacities is Appearance.opacities
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
