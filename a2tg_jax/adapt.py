@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.budget import within_budget
 from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
 from a2tg_jax.gradient_statistics import GradientStatistics
@@ -199,7 +200,7 @@ def select(
     if fraction is not None:
         return _select_fraction(statistic, can_grow, fraction)
     if budget_bytes is not None:
-        return _select_budget(statistic, can_grow, added_bytes, budget_bytes)
+        return within_budget(statistic, can_grow, added_bytes, budget_bytes)
     return can_grow & (statistic > threshold)
 
 
@@ -327,25 +328,6 @@ def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: floa
     order = np.argsort(-statistic[candidates], kind="stable")
     num = math.floor(fraction * len(statistic) + 0.5)
     return _mask(len(statistic), candidates[order[:num]])
-
-
-def _select_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget: float) -> np.ndarray:
-    if not budget >= 0:
-        raise ValueError(f"budget_bytes must be at least 0; got {budget}")
-    candidates = np.flatnonzero(can_grow & (statistic >= 0))
-    gain = statistic[candidates].astype(np.float64) / cost[candidates]
-    queue = candidates[np.argsort(-gain, kind="stable")]
-    chosen = []
-    # Whatever fails once fails for good, for the rest of the budget only shrinks. So each round takes all up to the
-    # first that does not fit and drops everything dearer than the rest: one round per distinct cost at most.
-    while len(queue):
-        spent = np.cumsum(cost[queue])
-        num = int(np.searchsorted(spent, budget, side="right"))
-        chosen.append(queue[:num])
-        budget -= int(spent[num - 1]) if num else 0
-        queue = queue[num:]
-        queue = queue[cost[queue] <= budget]
-    return _mask(len(statistic), np.concatenate(chosen) if chosen else [])
 
 
 def _mask(num: int, chosen) -> np.ndarray:

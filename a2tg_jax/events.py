@@ -44,6 +44,8 @@ class Seen(NamedTuple):
     image; 0 where a Gaussian was not seen."""
     is_visible: Array
     """[V, N] whether the Gaussian was composited at one pixel at least."""
+    colors: Array
+    """[V, N, 3] gradients by the colour of each Gaussian in the view."""
 
 
 class Now(NamedTuple):
@@ -87,6 +89,11 @@ class Event:
     def statistic(self) -> Statistic | None:
         """The statistic of the gradients that `observe` wants."""
         return None
+
+    @property
+    def observes(self) -> bool:
+        """Whether `observe` is to be called. Without a statistic it is told no `Seen.gradients` and `is_visible`."""
+        return self.statistic is not None
 
     def init(self, model: Model) -> Any:
         """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered.
