@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Banded
 from a2tg_jax.budget import within_budget
 from a2tg_jax.events import Change, HostEvent, Seen, event, static
 from a2tg_jax.model import Model

@@ -107,7 +107,7 @@ class BandedRule(AppearanceRule):
 class Banded(Appearance):
     """What another appearance shows, and view dependence of a degree per Gaussian."""
 
-    inner: Appearance = Plain()
+    inner: Appearance = dataclasses.field(default_factory=Plain)
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[BandedParams, BandedLayout]:
         degrees = np.full(gaussians.num, gaussians.sh_degree)

@@ -214,7 +214,7 @@ class StageRun:
 
     def _settings(self, size: tuple[int, int]) -> RenderSettings:
         """Render settings with the capacity for views of a size, planned before the first of them."""
-        settings = RenderSettings(tile_size=self.system.tile_size, sh_degree=self.system.sh_degree)
+        settings = RenderSettings(tile_size=self.system.tile_size)
         if size not in self.capacities:
             views = [view for view in self.views if view.image.shape[:2] == size]
             live, dtype = self.model, self.scene_scale.dtype
