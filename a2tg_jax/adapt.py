@@ -95,7 +95,8 @@ class Upscale(HostEvent):
         return state.observe_views(seen.gradients, seen.is_visible)
 
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
-        layout, num = model.layout, model.num
+        textures, layout = model.appearance.textures(model.params, model.layout)
+        num = model.num
         new_sizes, scales, averages = layout.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
         sizes = new_sizes[:num]
@@ -107,9 +108,10 @@ class Upscale(HostEvent):
         mask = select(averages[:num], sizes, proposed, **how)
         new_sizes[:num] = np.where(mask[:, None], proposed, sizes)
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
-        rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
+        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
-        model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
+        shown = model.appearance.with_textures(model.params, model.layout, rebuilt.textures, rebuilt.layout)
+        model = dataclasses.replace(model, params=shown[0], layout=shown[1])
         return Change(model, rebuilt.moments, self.init(model))
 
     def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:

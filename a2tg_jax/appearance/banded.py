@@ -26,6 +26,7 @@ from a2tg_jax.sh_bands import (
     gather_bands,
     split_sh,
 )
+from a2tg_jax.texture import AtlasLayout, Textures
 
 
 class BandedParams(NamedTuple):
@@ -158,6 +159,13 @@ class Banded(Appearance):
     def with_sh(self, sh: np.ndarray, params: BandedParams, layout: BandedLayout) -> BandedParams:
         bands, _ = split_sh(sh, layout.bands.degrees, layout.bands.base_degree)
         return params._replace(bands=bands)
+
+    def textures(self, params: BandedParams, layout: BandedLayout) -> tuple[Textures, AtlasLayout]:
+        return self.inner.textures(params.inner, layout.inner)
+
+    def with_textures(self, params: BandedParams, layout: BandedLayout, textures: Textures, atlas: AtlasLayout):
+        inner, inner_layout = self.inner.with_textures(params.inner, layout.inner, textures, atlas)
+        return params._replace(inner=inner), layout._replace(inner=inner_layout)
 
     # Files.
 
