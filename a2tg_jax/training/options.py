@@ -92,9 +92,7 @@ class System:
             return None
         needed = bytes_per_gaussian(self.sh_degree, floats)
         cap = int(self.budget_bytes // needed)
-        has_room = (
-            f"memory_budget of {self.memory_budget} MB has room for {cap:,} Gaussians of {needed:,.0f} bytes each"
-        )
+        has_room = f"memory_budget of {self.memory_budget} MB has room for {cap:,} Gaussians of {needed:,.0f} bytes"
         if cap < 2:
             raise ValueError(f"{has_room}, and there must be 2: raise memory_budget")
         if self.initial_gaussians is not None and self.initial_gaussians > cap:
