@@ -138,11 +138,11 @@ def fit_stage(
     run.train(on_checkpoint, checkpoint_every, progress, title)
     model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
     if index == len(system.stages()) - 1:
-        _compare_with_budget(system, model)
+        warn_of_budget(system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)
 
 
-def _compare_with_budget(system: System, model: Model) -> None:
+def warn_of_budget(system: System, model: Model) -> None:
     """Warns where a finished model is not what its memory budget asks for."""
     budget, used = system.budget_bytes, model.num_bytes
     if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
@@ -153,7 +153,5 @@ def _compare_with_budget(system: System, model: Model) -> None:
         advice = f"there is no room for another Gaussian of {used / model.num:,.0f} bytes: raise memory_budget"
     else:
         advice = "raise stage1_iterations or initial_gaussians"
-    warnings.warn(
-        f"the model takes {used:,} bytes, {used / budget:.1%} of the memory_budget of {budget:,}: {advice}",
-        stacklevel=3,
-    )
+    share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
+    warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=3)
