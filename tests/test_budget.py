@@ -124,6 +124,26 @@ def test_events_double_at_most_and_the_last_leaves_the_cap(seed):
         assert num == cap
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("num_iterations, count", [(60, 5), (200, 16)])
+def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
+    """From few Gaussians, at the times that a stage of so many iterations has."""
+    model = random_model(0, 300, 4, np.tile([0.5, 0.003], 150))
+    model = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, model)
+    event, moments = FillingMcmc(300), adam_init((model.gaussians, ()))
+    times = event.times(num_iterations)
+    apply = jax.jit(lambda iteration, *rest: event.apply(now(iteration, num_iterations, times, 2), *rest, ()))
+    counts = [4]
+    for iteration in range(1, num_iterations + 1):
+        if times.is_due(iteration):
+            model, moments, *_ = apply(jnp.asarray(iteration, jnp.int32), model, moments)
+            counts.append(int(model.num_live))
+    factors = np.divide(counts[1:], counts[:-1])
+    assert len(factors) == times.num_times == count and counts[-1] == 300
+    assert abs(np.log(factors[1:]) - np.log(75) / count).max() < 0.2, "by one factor, rounded up"
+    assert model.gaussians.means.dtype == dtype
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_caps_use_up_every_budget(name):
     """But for less than one Gaussian, of whatever degree; for A²TG textures make up the rest."""
@@ -172,9 +192,9 @@ def random_model(seed: int, num: int, num_live: int, opacities) -> Model:
     return Model(gaussians, num_live=jnp.asarray(num_live, jnp.int32))
 
 
-def now(iteration, num_iterations: int, times: Times) -> Now:
+def now(iteration, num_iterations: int, times: Times, num_keys: int = 1) -> Now:
     whole = lambda number: jnp.asarray(number, jnp.int32)  # noqa: E731
-    key, rate, scale = jax.random.split(jax.random.key(0), 1), jnp.float32(1e-4), jnp.float32(1.0)
+    key, rate, scale = jax.random.split(jax.random.key(0), num_keys), jnp.float32(1e-4), jnp.float32(1.0)
     return Now(key, whole(iteration), rate, whole(num_iterations), scale, times)
 
 

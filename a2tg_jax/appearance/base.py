@@ -19,8 +19,6 @@ from a2tg_jax.appearance.rule import AppearanceRule
 from a2tg_jax.gaussians import Gaussians, logit
 from a2tg_jax.sharing import share
 
-BYTES_PER_FLOAT = 4
-
 
 @dataclasses.dataclass(frozen=True)
 class Appearance:

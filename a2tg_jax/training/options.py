@@ -54,8 +54,8 @@ class System:
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from."""
     memory_budget: float | str | None = None
-    """Reported bytes that the model never exceeds and that it comes within half a percent of at the end: 1.5MB, 800kB,
-    2GB, or a number of MB (10^6 bytes). It says how many Gaussians and texels there are, in place of densify.cap."""
+    """Bytes that the model never exceeds, and takes all but half a percent of in the end: 1.5MB, 800kB, 2GB, or a
+    number of MB (10^6 bytes). It says how many Gaussians and texels there are, in place of densify.cap."""
     background: Literal["black", "white", "random"] = "black"
     """Behind everything, where photographs are transparent too."""
     sh_degree: int = 3
