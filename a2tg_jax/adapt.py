@@ -106,13 +106,34 @@ class Upscale(HostEvent):
         )  # fmt: skip
         how = self._how_to_select(model.num_bytes, index, count)
         mask = select(averages[:num], sizes, proposed, **how)
-        new_sizes[:num] = np.where(mask[:, None], proposed, sizes)
+        grown = np.where(mask[:, None], proposed, sizes)
+        if self.select == "budget" and index == count and (grown == proposed).all():
+            left = how["budget_bytes"] - _bytes_between(sizes, grown)
+            grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
+        new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
         rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
         shown = model.appearance.with_textures(model.params, model.layout, rebuilt.textures, rebuilt.layout)
         model = dataclasses.replace(model, params=shown[0], layout=shown[1])
         return Change(model, rebuilt.moments, self.init(model))
+
+    def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
+        """Sizes after further upscalings, where the last one gave every texture what it proposed and bytes are left.
+
+        When thin Gaussians have what they propose as well, both axes double.
+        """
+        for anisotropic in (self.anisotropic, False):
+            is_chosen = np.ones(1, bool)
+            while is_chosen.any():
+                proposed = next_sizes(
+                    sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
+                )
+                is_chosen = select(averages, sizes, proposed, budget_bytes=left)
+                grown = np.where(is_chosen[:, None], proposed, sizes)
+                left -= _bytes_between(sizes, grown)
+                sizes = grown
+        return sizes
 
     def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
         """The keyword that tells `select` how to choose."""
@@ -330,6 +351,11 @@ def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: floa
     order = np.argsort(-statistic[candidates], kind="stable")
     num = math.floor(fraction * len(statistic) + 0.5)
     return _mask(len(statistic), candidates[order[:num]])
+
+
+def _bytes_between(sizes: np.ndarray, larger: np.ndarray) -> int:
+    """Bytes that textures take more at their larger sizes."""
+    return BYTES_PER_TEXEL * int(np.prod(larger, axis=1).sum() - np.prod(sizes, axis=1).sum())
 
 
 def _mask(num: int, chosen) -> np.ndarray:

@@ -30,6 +30,15 @@ class Times(NamedTuple):
         """Whether the event follows this iteration."""
         return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
 
+    def num_left(self, iteration: Any) -> Any:
+        """How often the event happens from an iteration on, its first at the earliest."""
+        return self.last // self.every - (iteration - 1) // self.every
+
+    @property
+    def num_times(self) -> int:
+        """How often it happens in all (host)."""
+        return max(0, self.num_left(max(1, self.first)))
+
 
 EVERY_ITERATION = Times(1, 2**31 - 1, 1)
 
@@ -61,6 +70,8 @@ class Now(NamedTuple):
     """Of the stage."""
     scene_scale: Array
     """1.1 × the largest distance of a camera from the cameras' mean."""
+    times: Times | None = None
+    """When the event happens; None: after every iteration."""
 
 
 class EventInfo(NamedTuple):

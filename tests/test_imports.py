@@ -14,7 +14,7 @@ LAYERS = (
     {"classes", "cores", "memory"},
     {"numerics", "startup", "bilinear", "checks"},
     {"gaussians", "cameras", "sh"},
-    {"geometry", "sharing", "gradient_statistics"},
+    {"geometry", "sharing", "gradient_statistics", "budget"},
     {"texture", "tiles", "data"},
     {"appearance", "transform", "paths", "origin"},
     {"pixel"},

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from scenes_random import as_camera, as_gaussians, as_settings, draw_scene
+from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax import Model, load_model, load_ply, plan_render, save_model, save_ply

@@ -20,8 +20,6 @@ from a2tg_jax.gaussians import Gaussians, logit
 from a2tg_jax.sharing import share
 from a2tg_jax.texture import AtlasLayout, Textures
 
-BYTES_PER_FLOAT = 4
-
 
 @dataclasses.dataclass(frozen=True)
 class Appearance:

@@ -217,7 +217,7 @@ def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, mome
         if state is not None and event.observes:
             state = event.observe(state, model, seen)
         if isinstance(event, StepEvent):
-            own = now._replace(keys=now.keys[at : at + event.num_keys])
+            own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
             at += event.num_keys
             model, moments, state, info = _at_its_times(event, times, own, model, moments, state)
             possible = infos.is_possible & info.is_possible
