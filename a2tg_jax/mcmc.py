@@ -116,18 +116,27 @@ class Moves(NamedTuple):
     info: MoveInfo
 
 
-def plan_relocation(key: Array, opacities: Array, num_live: Array) -> Moves:
-    """What `relocate` does to rows of these opacities [N], of which the first `num_live` exist."""
+def plan_relocation(key: Array, opacities: Array, num_live: Array, *, hosts: Array | None = None) -> Moves:
+    """What `relocate` does to rows of these opacities [N], of which the first `num_live` exist.
+
+    Hosts are drawn with probability ∝ opacity, or `hosts` [N].
+    """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     is_dead = is_live & ~is_host
     has_hosts = jnp.any(is_host)
-    rows, num_draws = _copied_rows(draw_hosts(key, opacities, is_host), is_dead & has_hosts)
+    weights = opacities if hosts is None else hosts
+    rows, num_draws = _copied_rows(draw_hosts(key, weights, is_host), is_dead & has_hosts)
     info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), num_draws > 0, info)
 
 
-def plan_growth(key: Array, opacities: Array, num_live: Array, cap: Array | int, least: Array | int = 0) -> Moves:
-    """What `grow` does to rows of these opacities [N], of which the first `num_live` exist; or more, up to `least`."""
+def plan_growth(
+    key: Array, opacities: Array, num_live: Array, cap: Array | int, least: Array | int = 0, hosts: Array | None = None
+) -> Moves:
+    """What `grow` does to rows of these opacities [N], of which the first `num_live` exist; or more, up to `least`.
+
+    Hosts are drawn with probability ∝ opacity, or `hosts` [N].
+    """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
@@ -135,7 +144,8 @@ def plan_growth(key: Array, opacities: Array, num_live: Array, cap: Array | int,
     wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), wanted)
     grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
     is_added = ~is_live & (jnp.arange(opacities.shape[0], dtype=jnp.int32) < grown)
-    rows, num_draws = _copied_rows(draw_hosts(key, opacities, is_host), is_added)
+    weights = opacities if hosts is None else hosts
+    rows, num_draws = _copied_rows(draw_hosts(key, weights, is_host), is_added)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), (num_draws > 0) | is_added, info)
 

@@ -212,5 +212,5 @@ def split_sh(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> tuple[
 
 def _owned(owners: Array, num: int) -> np.ndarray:
     """The Gaussians that own the rows in use, in the rows' order."""
-    owners = np.asarray(owners)
-    return owners[owners < num]
+    found = np.asarray(owners)
+    return found[found < num]

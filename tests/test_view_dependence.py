@@ -107,7 +107,7 @@ def test_whatever_else_is_shown_is_as_without(inner, tmp_path):
 
 
 def test_view_dependence_turns_with_the_world():
-    model, plain, camera = banded(4)
+    model, plain, _ = banded(4)
     world = Similarity(1.5, Rotation.random(random_state=0).as_matrix(), np.array([0.3, -0.2, 0.1]))
     moved = model.transform(world)
     np.testing.assert_allclose(

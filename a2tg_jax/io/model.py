@@ -113,7 +113,7 @@ def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     """Class and options; of an appearance that holds others, theirs too."""
     kind = type(appearance)
     held = _held_appearances(appearance)
-    described = {"module": kind.__module__, "name": kind.__qualname__}
+    described: dict[str, Any] = {"module": kind.__module__, "name": kind.__qualname__}
     if held:
         described["held"] = {name: _appearance_to_dict(inner) for name, inner in held.items()}
     options = {name: value for name, value in config_to_dict(appearance).items() if name not in held}
