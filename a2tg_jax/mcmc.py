@@ -297,9 +297,9 @@ class Mcmc(StepEvent):
                 num = min(self.cap, max(num + 1, num + num // 20))
         return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
-        least, cap = self.least(now, _num_live(model)), min(self.cap, model.gaussians.num)
+        least, cap = self.least(now, num_rows_live(model)), min(self.cap, model.gaussians.num)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
@@ -311,7 +311,7 @@ class Mcmc(StepEvent):
     @staticmethod
     def _move(model: Model, moments: AdamState, plan) -> tuple[Model, AdamState, MoveInfo]:
         appearance, layout = model.appearance, model.layout
-        num_live = _num_live(model)
+        num_live = num_rows_live(model)
         moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)
         gaussians, params = appearance.share(model.gaussians, model.params, layout, moves.num_shares)
         num_live = num_live + moves.info.num_added
@@ -336,6 +336,6 @@ class FillingMcmc(Mcmc):
         return number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
 
 
-def _num_live(model: Model) -> Array:
+def num_rows_live(model: Model) -> Array:
     """How many rows exist, int32."""
     return jnp.asarray(model.gaussians.num if model.num_live is None else model.num_live, jnp.int32)

@@ -1,4 +1,4 @@
-"""Densification that splits where the image is wrong: the schedule of MCMC, hosts by gradient, halves instead of shares.
+"""Densification that splits where the image is wrong: the schedule of MCMC, hosts by gradient, halves for shares.
 
 3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies where the host is, which look like it together: they part
 slowly, and not where detail is missing. Here hosts are drawn by how much a move by its own size would change the loss,
@@ -7,6 +7,7 @@ control (`densify`).
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jax import Array
 from a2tg_jax.densify import halved
 from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, event, gather_rows
 from a2tg_jax.gradient_statistics import GradientStatistics
-from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
+from a2tg_jax.mcmc import FillingMcmc, Moves, num_rows_live, plan_growth, plan_relocation
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
 
@@ -37,12 +38,13 @@ class SplitByGradient(FillingMcmc):
     def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
         return state.observe_views(seen.gradients, seen.is_visible)
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         to_move, to_add, to_split = jax.random.split(now.keys[0], 3)
-        moves = plan_relocation(to_move, self._opacities(model), model.num_live, hosts=draw_weights(model, state))
+        num_live = num_rows_live(model)
+        moves = plan_relocation(to_move, self._opacities(model), num_live, hosts=draw_weights(model, state))
         model, moments, state = split_rows(to_split, moves, model, moments, state)
-        cap, least = min(self.cap, model.gaussians.num), self.least(now, model.num_live)
-        moves = plan_growth(to_add, self._opacities(model), model.num_live, cap, least, draw_weights(model, state))
+        cap, least = min(self.cap, model.gaussians.num), self.least(now, num_live)
+        moves = plan_growth(to_add, self._opacities(model), num_live, cap, least, draw_weights(model, state))
         model, moments, state = split_rows(now.keys[1], moves, model, moments, state)
         return Change(model, moments, state, EventInfo(is_possible=moves.info.has_hosts))
 
@@ -65,5 +67,6 @@ def split_rows(
     total = state.total / moves.num_shares.astype(state.total.dtype)
     state = GradientStatistics(total[moves.rows], state.views[moves.rows])
     moments = clear_moments(model, moments, is_split)
-    model = dataclasses.replace(gather_rows(model, moves.rows), num_live=model.num_live + moves.info.num_added)
+    num_live = num_rows_live(model) + moves.info.num_added
+    model = dataclasses.replace(gather_rows(model, moves.rows), num_live=num_live)
     return dataclasses.replace(model, gaussians=halved(key, model.gaussians, is_split)), moments, state
