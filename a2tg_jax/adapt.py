@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.budget import within_budget
+from a2tg_jax.budget import event_budget, within_budget
 from a2tg_jax.checks import check_shape
-from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
+from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, iterations_at, static
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
@@ -83,10 +83,7 @@ class Upscale(HostEvent):
             interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
-        if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
-            raise ValueError(f"texture.upscale_at must be ascending fractions between 0 and 1; got {fractions}")
-        # In a short stage two of them may fall together: there textures grow once.
-        return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
+        return iterations_at(fractions, num_iterations, "texture.upscale_at")
 
     def init(self, model: Model) -> GradientStatistics:
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
@@ -225,28 +222,6 @@ def select(
     if budget_bytes is not None:
         return within_budget(statistic, can_grow, added_bytes, budget_bytes)
     return can_grow & (statistic > threshold)
-
-
-def event_budget(total_bytes: float, current_bytes: float, event_index: int, num_events: int) -> int:
-    """Bytes that event j of m may add: 1/(m - j + 1) of what is left of the memory budget, rounded down.
-
-    Args:
-      total_bytes: largest reported memory (`metrics.parameter_bytes`).
-      current_bytes: reported memory now.
-      event_index: j, from 1.
-      num_events: m.
-
-    Raises:
-      ValueError: if the budget is already exceeded or the event does not exist.
-    """
-    if not 1 <= event_index <= num_events:
-        raise ValueError(f"event_index must lie in 1..{num_events}; got {event_index}")
-    if total_bytes < current_bytes:
-        raise ValueError(
-            f"the memory budget of {total_bytes / 1e6:.3f} MB is below the {current_bytes / 1e6:.3f} MB the Gaussians "
-            "already take: raise the budget or lower the number of Gaussians"
-        )
-    return int((total_bytes - current_bytes) // (num_events - event_index + 1))
 
 
 def reallocate(

@@ -103,3 +103,25 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
     mask = np.zeros(len(statistic), bool)
     mask[np.concatenate([np.zeros(0, np.int64), *chosen])] = True
     return mask
+
+
+def event_budget(total_bytes: float, current_bytes: float, event_index: int, num_events: int) -> int:
+    """Bytes that event j of m may add: 1/(m - j + 1) of what is left of the memory budget, rounded down.
+
+    Args:
+      total_bytes: largest reported memory (`metrics.parameter_bytes`).
+      current_bytes: reported memory now.
+      event_index: j, from 1.
+      num_events: m.
+
+    Raises:
+      ValueError: if the budget is already exceeded or the event does not exist.
+    """
+    if not 1 <= event_index <= num_events:
+        raise ValueError(f"event_index must lie in 1..{num_events}; got {event_index}")
+    if total_bytes < current_bytes:
+        raise ValueError(
+            f"the memory budget of {total_bytes / 1e6:.3f} MB is below the {current_bytes / 1e6:.3f} MB the Gaussians "
+            "already take: raise the budget or lower the number of Gaussians"
+        )
+    return int((total_bytes - current_bytes) // (num_events - event_index + 1))

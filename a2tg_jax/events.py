@@ -156,6 +156,17 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 
+def iterations_at(fractions: tuple[float, ...], num_iterations: int, name: str = "at") -> tuple[int, ...]:
+    """The iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
+
+    Raises:
+      ValueError: calling them `name`, unless they are ascending and between 0 and 1.
+    """
+    if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
+        raise ValueError(f"{name} must be ascending fractions between 0 and 1; got {fractions}")
+    return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
+
+
 def static(*, default: Any = dataclasses.MISSING) -> Any:
     """A field of an event (or loss term) that chooses shapes or code, and is not traced."""
     return dataclasses.field(default=default, metadata={"static": True})

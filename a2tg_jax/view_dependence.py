@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.budget import within_budget
-from a2tg_jax.events import Change, HostEvent, Seen, event, static
+from a2tg_jax.budget import event_budget, within_budget
+from a2tg_jax.events import Change, HostEvent, Seen, event, iterations_at, static
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import normalize
 from a2tg_jax.optim import AdamState
@@ -70,17 +70,15 @@ class AdaptDegrees(HostEvent):
 
     budget_mb: float = 0.0
     """Reported memory never exceeds this many MB (10^6 bytes)."""
-    at: tuple[float, ...] = static(default=(0.1, 0.3, 0.5))
-    """Fractions of the stage at which it happens."""
-    shares: tuple[float, ...] = static(default=(0.5, 0.5, 1.0))
-    """Of what is left of the budget, spent each time."""
+    at: tuple[float, ...] = static(default=(0.05, 0.1, 0.15))
+    """Fractions of the stage at which it happens. Each time an equal part of what is left of the budget is spent."""
     idle: float = 0.0
     """Bands that change a colour by less than this (root mean square over all directions) are given up."""
 
     observes = True
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in self.at))
+        return iterations_at(self.at, num_iterations)
 
     def init(self, model: Model) -> ViewDependence:
         return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
@@ -92,8 +90,9 @@ class AdaptDegrees(HostEvent):
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: ViewDependence) -> Change:
         bands, layout, num = model.params.bands, model.layout.bands, model.num
         degrees = without_idle(bands, layout, self.idle)
-        left = 1e6 * self.budget_mb - (model.num_bytes - saved_bytes(layout, degrees, num))
-        degrees[:num] = raised(degrees[:num], state.strengths()[:num], self.shares[index - 1] * left)
+        used = model.num_bytes - saved_bytes(layout, degrees, num)
+        budget = event_budget(1e6 * self.budget_mb, used, index, count)
+        degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget)
         bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
         model = dataclasses.replace(
             model, params=model.params._replace(bands=bands), layout=model.layout._replace(bands=layout)
@@ -135,4 +134,4 @@ def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float) -> np.ndar
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]
     strength = np.take_along_axis(strengths, following[:, None], axis=1)[:, 0]
     is_candidate = (degrees < MAX_DEGREE) & (strength > 0)
-    return degrees + within_budget(strength, is_candidate, cost, max(0.0, budget))
+    return degrees + within_budget(strength, is_candidate, cost, budget)

@@ -15,6 +15,7 @@ SYSTEMS = {
     "textured-gaussians": "a2tg_jax.systems.textured_gaussians:TexturedGaussians",
     "supergaussians": "a2tg_jax.systems.supergaussians:SuperGaussians",
     "bbsplat": "a2tg_jax.systems.bbsplat:BBSplat",
+    "bytewise": "a2tg_jax.systems.bytewise:Bytewise",
 }
 """Where the systems of this library are; each is imported where it is asked for."""
 

@@ -1,0 +1,121 @@
+"""Bytes where they pay: many Gaussians of one colour, then view dependence and texels for those that ask for them."""
+
+import dataclasses
+from typing import Any, ClassVar, Self
+
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured, TextureOptions
+from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.events import Event
+from a2tg_jax.mcmc import Noise
+from a2tg_jax.splitting import SplitByGradient
+from a2tg_jax.systems.stage1 import QUICK, QUICK_TEXELS, SMOKE, growing_stage, later_stage
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+from a2tg_jax.view_dependence import AdaptDegrees
+
+QUICK_BUDGET, SMOKE_BUDGET, PAPER_BUDGET = 2.4, 0.1, 100.0
+"""MB."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewDependenceConfig:
+    """Spherical harmonics above the Gaussians' own degree."""
+
+    share: float = 0.05
+    """Of the memory budget; 0: none."""
+    rate: float = 2e-3
+    """Adam's learning rate of the coefficients."""
+    idle: float = 0.0
+    """Bands that change a colour by less than this are given up for others."""
+    at: tuple[float, ...] = (0.05, 0.1, 0.15)
+    """Fractions of the second stage at which degrees change."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DetailTextureConfig:
+    """Textures of the Gaussians that get one."""
+
+    share: float = 0.05
+    """Of the memory budget; 0: none."""
+    rate: float = 2.5e-3
+    """Adam's learning rate of the texels."""
+    cap: int = 4
+    """Largest texture side in texels (at most 16)."""
+    at: tuple[float, ...] = (0.1, 0.2, 0.3)
+    """Fractions of the second stage at which textures grow."""
+    lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
+    """How textures are read."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bytewise(System):
+    """Gaussians of degree 0 first, then degrees and textures for those whose gradients ask for them, within a budget."""
+
+    stage1_iterations: int = 30_000
+    stage2_iterations: int = 30_000
+    memory_budget: float | str | None = PAPER_BUDGET
+    """As in every system; here there is always one: so many MB (10^6 bytes) are filled with what brings most."""
+    sh_degree: int = 0
+    """Degree of spherical harmonics that all Gaussians have, 0 to 3; those that need it get more."""
+    view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
+    texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
+
+    name: ClassVar[str] = "bytewise"
+
+    def stages(self) -> tuple[Stage, ...]:
+        shown, rates = self._appearance()
+        growth = (Noise(), SplitByGradient(self._num_gaussians()))
+        first = growing_stage(self, self.stage1_iterations, growth, Plain(self.texture.lookup.max_alpha))
+        return first, later_stage(self, "details", shown, self._details(), self.stage2_iterations, rates)
+
+    def _num_gaussians(self) -> int:
+        """As many as there is room for beside degrees and texels."""
+        own = bytes_per_gaussian(self.sh_degree)
+        share = self.view_dependence.share + self.texture.share
+        num = self.budget_cap(own / 4 * share / (1 - share))
+        assert num is not None
+        return num
+
+    def _appearance(self) -> tuple[Banded, BandedRates]:
+        """Textures that are empty at first, if there are any, and rates of all that is shown."""
+        inner: Any = (
+            Textured((0, 0), self.texture.lookup) if self.texture.share else Plain(self.texture.lookup.max_alpha)
+        )
+        of_texels = TexelRates(self.texture.rate, 0.0) if self.texture.share else 0.0
+        return Banded(inner), BandedRates(self.view_dependence.rate, of_texels)
+
+    def _details(self) -> tuple[Event, ...]:
+        """Degrees first, up to their share, then texels for all that is left."""
+        megabytes = (self.budget_bytes or 0) / MEGABYTE
+        view, texture = self.view_dependence, self.texture
+        events: list[Event] = []
+        if view.share:
+            events.append(AdaptDegrees(megabytes * (1 - texture.share), at=view.at, idle=view.idle))
+        if texture.share:
+            events.append(Upscale("budget", budget_mb=megabytes, cap=texture.cap, at=texture.at))
+        return tuple(events)
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        quick = DetailTextureConfig(rate=QUICK_TEXELS)
+        return {
+            "paper": cls(),
+            "quick": cls(**QUICK, memory_budget=QUICK_BUDGET, texture=quick),
+            "smoke": cls(**SMOKE, stage2_iterations=120, memory_budget=SMOKE_BUDGET, texture=quick),
+        }
+
+    def check(self) -> None:
+        if self.memory_budget is None:
+            raise ValueError("memory_budget must say how many bytes there are to fill, such as 20MB; got none")
+        for name, share in (
+            ("view_dependence.share", self.view_dependence.share),
+            ("texture.share", self.texture.share),
+        ):
+            if not 0 <= share < 1:
+                raise ValueError(f"{name} must lie in [0, 1); got {share}")
+        if self.view_dependence.share + self.texture.share >= 1:
+            raise ValueError(
+                "view_dependence.share and texture.share must leave bytes for Gaussians: their sum is 1 or more"
+            )
+        super().check()
