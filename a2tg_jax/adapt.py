@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.budget import event_budget, within_budget
+from a2tg_jax.budget import bytes_of, event_budget, within_budget
 from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, iterations_at, static
 from a2tg_jax.gradient_statistics import GradientStatistics
@@ -135,7 +135,7 @@ class Upscale(HostEvent):
     def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
         """The keyword that tells `select` how to choose."""
         if self.select == "budget":
-            return {"budget_bytes": event_budget(1e6 * (self.budget_mb or 0.0), used_bytes, index, count)}
+            return {"budget_bytes": event_budget(bytes_of(self.budget_mb or 0.0), used_bytes, index, count)}
         return {self.select: getattr(self, self.select)}
 
 

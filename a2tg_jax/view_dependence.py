@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.budget import event_budget, within_budget
+from a2tg_jax.budget import bytes_of, event_budget, within_budget
 from a2tg_jax.events import Change, HostEvent, Seen, event, iterations_at, static
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import normalize
@@ -91,7 +91,7 @@ class AdaptDegrees(HostEvent):
         bands, layout, num = model.params.bands, model.layout.bands, model.num
         degrees = without_idle(bands, layout, self.idle)
         used = model.num_bytes - saved_bytes(layout, degrees, num)
-        budget = event_budget(1e6 * self.budget_mb, used, index, count)
+        budget = event_budget(bytes_of(self.budget_mb), used, index, count)
         degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget)
         bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
         model = dataclasses.replace(

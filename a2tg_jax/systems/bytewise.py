@@ -79,9 +79,8 @@ class Bytewise(System):
 
     def _appearance(self) -> tuple[Banded, BandedRates]:
         """Textures that are empty at first, if there are any, and rates of all that is shown."""
-        inner: Any = (
-            Textured((0, 0), self.texture.lookup) if self.texture.share else Plain(self.texture.lookup.max_alpha)
-        )
+        lookup = self.texture.lookup
+        inner: Any = Textured((0, 0), lookup) if self.texture.share else Plain(lookup.max_alpha)
         of_texels = TexelRates(self.texture.rate, 0.0) if self.texture.share else 0.0
         return Banded(inner), BandedRates(self.view_dependence.rate, of_texels)
 
