@@ -28,7 +28,7 @@ class ViewDependenceConfig:
     """Adam's learning rate of the coefficients."""
     idle: float = 0.0
     """Bands that change a colour by less than this are given up for others."""
-    at: tuple[float, ...] = (0.05, 0.1, 0.15)
+    at: tuple[float, ...] = (0.05, 0.1)
     """Fractions of the second stage at which degrees change."""
 
 
@@ -116,5 +116,10 @@ class Bytewise(System):
         if self.view_dependence.share + self.texture.share >= 1:
             raise ValueError(
                 "view_dependence.share and texture.share must leave bytes for Gaussians: their sum is 1 or more"
+            )
+        if self.texture.share and self.view_dependence.at[-1:] > self.texture.at[:1]:
+            raise ValueError(
+                "view_dependence.at must be over when textures begin to take the rest of the bytes, at "
+                f"texture.at {self.texture.at}; got {self.view_dependence.at}"
             )
         super().check()
