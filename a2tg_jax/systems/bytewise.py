@@ -1,12 +1,14 @@
 """Bytes where they pay: many Gaussians of one colour, then view dependence and texels for those that ask for them."""
 
 import dataclasses
+import math
 from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured, TextureOptions
 from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.events import Event
+from a2tg_jax.gaussians import floats_per_gaussian
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.stage1 import QUICK, QUICK_TEXELS, SMOKE, growing_stage, later_stage
@@ -14,8 +16,15 @@ from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.view_dependence import AdaptDegrees
 
-QUICK_BUDGET, SMOKE_BUDGET, PAPER_BUDGET = 2.4, 0.1, 100.0
-"""MB."""
+QUICK_CAP, SMOKE_CAP = 40_000, 2_000
+
+
+@dataclasses.dataclass(frozen=True)
+class CapConfig:
+    """How large the model becomes where there is no memory_budget."""
+
+    cap: int = 2_000_000
+    """Its bytes are those of so many Gaussians without view dependence and textures."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,14 +59,13 @@ class DetailTextureConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bytewise(System):
-    """Gaussians of degree 0 first, then degrees and textures for those whose gradients ask for them, within a budget."""
+    """Gaussians of degree 0 first, then degrees and textures for those whose gradients ask for them."""
 
     stage1_iterations: int = 30_000
     stage2_iterations: int = 30_000
-    memory_budget: float | str | None = PAPER_BUDGET
-    """As in every system; here there is always one: so many MB (10^6 bytes) are filled with what brings most."""
     sh_degree: int = 0
     """Degree of spherical harmonics that all Gaussians have, 0 to 3; those that need it get more."""
+    densify: CapConfig = dataclasses.field(default_factory=CapConfig)
     view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
     texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
 
@@ -71,11 +79,14 @@ class Bytewise(System):
 
     def _num_gaussians(self) -> int:
         """As many as there is room for beside degrees and texels."""
-        own = bytes_per_gaussian(self.sh_degree)
         share = self.view_dependence.share + self.texture.share
-        num = self.budget_cap(own / 4 * share / (1 - share))
-        assert num is not None
-        return num
+        num = self.budget_cap(floats_per_gaussian(self.sh_degree) * share / (1 - share))
+        return math.floor(self.densify.cap * (1 - share)) if num is None else num
+
+    def _num_bytes(self) -> int:
+        """Of all that there is in the end."""
+        own = int(bytes_per_gaussian(self.sh_degree))
+        return self.densify.cap * own if self.budget_bytes is None else self.budget_bytes
 
     def _appearance(self) -> tuple[Banded, BandedRates]:
         """Textures that are empty at first, if there are any, and rates of all that is shown."""
@@ -86,7 +97,7 @@ class Bytewise(System):
 
     def _details(self) -> tuple[Event, ...]:
         """Degrees first, up to their share, then texels for all that is left."""
-        megabytes = (self.budget_bytes or 0) / MEGABYTE
+        megabytes = self._num_bytes() / MEGABYTE
         view, texture = self.view_dependence, self.texture
         events: list[Event] = []
         if view.share:
@@ -100,13 +111,13 @@ class Bytewise(System):
         quick = DetailTextureConfig(rate=QUICK_TEXELS)
         return {
             "paper": cls(),
-            "quick": cls(**QUICK, memory_budget=QUICK_BUDGET, texture=quick),
-            "smoke": cls(**SMOKE, stage2_iterations=120, memory_budget=SMOKE_BUDGET, texture=quick),
+            "quick": cls(**QUICK, densify=CapConfig(QUICK_CAP), texture=quick),
+            "smoke": cls(**SMOKE, stage2_iterations=120, densify=CapConfig(SMOKE_CAP), texture=quick),
         }
 
     def check(self) -> None:
-        if self.memory_budget is None:
-            raise ValueError("memory_budget must say how many bytes there are to fill, such as 20MB; got none")
+        if self._num_gaussians() < 2:
+            raise ValueError(f"densify.cap must leave room for 2 Gaussians; got {self.densify.cap}")
         for name, share in (
             ("view_dependence.share", self.view_dependence.share),
             ("texture.share", self.texture.share),
