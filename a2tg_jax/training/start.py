@@ -21,11 +21,7 @@ def initial_model(scene: Scene, system: System) -> Model:
     num = system.initial_gaussians or len(scene.points)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     num = min(num, *caps) if caps else num
-    return Model(
-        init_from_points(
-            scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=system.sh_degree
-        )
-    )
+    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=system.sh_degree))
 
 
 def padded(model: Model, stage: Stage, system: System) -> Model:

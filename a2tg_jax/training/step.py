@@ -199,10 +199,7 @@ def _seen(stage: Stage, batch: Photographs, found: _ViewGradients) -> Seen | Non
 def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
     """Model and moments after Adam, with the parameters projected to where they belong."""
     model = state.model
-    rates = (
-        stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree),
-        stage.appearance.rates(stage.params_rate, model.params),
-    )
+    rates = stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree), stage.appearance.rates(stage.params_rate, model.params)
     step = adam_update((model.gaussians, model.params), grads, state.moments, rates)
     gaussians, params = step.params
     return dataclasses.replace(model, gaussians=gaussians, params=stage.appearance.project(params)), step.state
