@@ -27,7 +27,7 @@ LAYERS = (
     {"events"},
     {"adapt", "mcmc", "densify"},
     {"training"},
-    {"systems", "evaluation"},
+    {"systems", "evaluation", "compaction"},
     {"results"},
     {"cli"},
 )

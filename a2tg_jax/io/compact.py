@@ -61,6 +61,10 @@ class CompactChoices:
     coder: Coder = "lzma"
     """lzma, of Python's own library; zstd; webp, as lossless images; or none."""
 
+    def keeping(self, precisions: Mapping[str, Precision]) -> Self:
+        """The choices with other precisions, by name."""
+        return dataclasses.replace(self, **dict(precisions))  # type: ignore[arg-type]
+
     def check(self) -> Self:
         """Raises ValueError, naming the choice, if one cannot be."""
         for field in dataclasses.fields(self):

@@ -46,8 +46,8 @@ def check_kind(appearance: Appearance) -> None:
     """Raises ValueError unless a compact file can hold what splats show."""
     if type(_inner(appearance)) not in (Plain, Textured) or type(appearance) not in (Plain, Textured, Banded):
         raise ValueError(
-            f"model shows {type(_inner(appearance)).__name__}: a compact file holds Plain, Textured and Banded of these; "
-            "save_model keeps any model"
+            f"model shows {type(_inner(appearance)).__name__}: a compact file holds Plain, Textured and Banded of "
+            "these; save_model keeps any model"
         )
 
 
