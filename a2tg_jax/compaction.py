@@ -31,7 +31,7 @@ LADDER: Ladder = MappingProxyType(
         "quats": (5, 6, 7, 8, 10),
         "opacities": (3, 4, 5, 6, 8, 10),
         "sh_0": (4, 5, 6, 7, 8, 10),
-        "sh_rest": (3, 4, 5, 6, 7, 8, 10),
+        "sh_rest": (2, 3, 4, 5, 6, 8, 10),
         "texels": (3, 4, 5, 6, 7, 8, 10),
     }
 )

@@ -260,6 +260,8 @@ def _textures_of(reader: Reader, table: Any, num: int, choices: CompactChoices) 
     """Sizes [N, 2] and texels [T, 4]."""
     if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in table for side in size):
         raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {table}")
+    if any(len(size) != 2 for size in table):
+        raise ValueError(f"texture sides must be pairs; got {table}")
     sizes = np.asarray(table, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(table))]
     count = int(sizes.prod(axis=1).sum())
     colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)

@@ -3,13 +3,13 @@
 All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precision is a number of bits or a float type.
 """
 
+import math
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 Precision = int | Literal["float32", "float16"]
 MOST_BITS = 16
-ENDS_DTYPE = np.float32
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
@@ -27,12 +27,20 @@ def check_precision(name: str, precision: Precision) -> None:
         raise ValueError(f"{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
 
 
-def ends_of(values: np.ndarray) -> Ends:
-    """The smallest and the largest of all numbers, as float32 can hold them; 0 and 0 where there are none."""
+def ends_of(values: np.ndarray, bits: int) -> Ends:
+    """The smallest and the largest of all numbers; 0 and 0 where there are none.
+
+    Where 0 lies between them, they are moved apart, by a step together, so that a step lies on 0: most of what is added
+    to something else is about 0.
+    """
     if not values.size:
         return Ends(0.0, 0.0)
-    low, high = ENDS_DTYPE(values.min()), ENDS_DTYPE(values.max())
-    return Ends(_short(low), _short(high))
+    low, high = float(values.min()), float(values.max())
+    if low < 0 < high and bits > 1:
+        step = (high - low) / ((1 << bits) - 2)
+        low = -math.ceil(-low / step) * step
+        high = low + step * ((1 << bits) - 1)
+    return Ends(_short(np.float32(low)), _short(np.float32(high)))
 
 
 def _short(value: np.float32) -> float:
@@ -81,13 +89,13 @@ def to_byte_planes(values: np.ndarray) -> np.ndarray:
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     num_columns, length = values.shape
     by_byte = values.view(np.uint8).reshape(num_columns, length, values.dtype.itemsize)
-    return by_byte.transpose(2, 0, 1).reshape(-1, length)
+    return by_byte.transpose(2, 0, 1).reshape(values.dtype.itemsize * num_columns, length)
 
 
 def from_byte_planes(planes: np.ndarray, num_columns: int, dtype: np.dtype) -> np.ndarray:
     """The numbers [num_columns, n] that `to_byte_planes` was given."""
     dtype = np.dtype(dtype).newbyteorder("<")
-    by_byte = planes.reshape(dtype.itemsize, num_columns, -1).transpose(1, 2, 0)
+    by_byte = planes.reshape(dtype.itemsize, num_columns, planes.shape[1]).transpose(1, 2, 0)
     return np.ascontiguousarray(by_byte).view(dtype)[..., 0]
 
 

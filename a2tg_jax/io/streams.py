@@ -65,7 +65,7 @@ class Writer:
         if not isinstance(precision, int):
             self.planes(name, quantise.to_byte_planes(_as_float(name, values, precision)))
             return
-        ends = quantise.ends_of(values)
+        ends = quantise.ends_of(values, precision)
         self.layout.ends[name] = list(ends)
         if ends.low == ends.high:
             self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
@@ -80,7 +80,7 @@ class Writer:
         bits = precision if isinstance(precision, int) else MEANS_FLOAT_BITS
         contractions = [Contraction.of(axis) for axis in values]
         contracted = [of.contracted(axis) for of, axis in zip(contractions, values, strict=True)]
-        ends = [quantise.ends_of(axis) for axis in contracted]
+        ends = [quantise.ends_of(axis, bits) for axis in contracted]
         codes = [quantise.quantised(axis, end, bits) for axis, end in zip(contracted, ends, strict=True)]
         key = quantise.morton(np.stack(codes), bits)
         order = np.argsort(key, kind="stable")
