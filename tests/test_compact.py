@@ -21,7 +21,7 @@ from a2tg_jax.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.io import coders, compact, quantise
 from a2tg_jax.io.compact import GROUPS, HEAD, CompactChoices, decode_model, encode_model, load_compact, save_compact
 from a2tg_jax.io.ply import load_ply, save_ply
-from a2tg_jax.io.streams import Layout, Reader, Writer
+from a2tg_jax.io.streams import Reader, Writer
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderSettings
@@ -139,11 +139,12 @@ def test_what_comes_back_looks_the_same(name, choices):
     assert difference.mean() < (1e-4 if choices is EXACT else 0.003)
 
 
-@pytest.mark.parametrize("coder", coders.CODERS)
+@pytest.mark.parametrize("coder", ["smallest", *coders.CODERS])
 def test_coders_do_not_change_what_comes_back(coder):
     model = banded(0, textured(True))
-    wanted = decode_model(encode_model(model))
-    found = decode_model(encode_model(model, CompactChoices(coder=coder)))
+    data = encode_model(model, CompactChoices(coder=coder))
+    wanted, found = decode_model(encode_model(model, CompactChoices(coder="none"))), decode_model(data)
+    assert len(encode_model(model)) < len(data) or coder == "smallest"
     assert jax.tree.structure(found) == jax.tree.structure(wanted)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -186,7 +187,7 @@ def test_means_are_within_a_step_that_grows_with_the_distance(bits):
     means = np.random.default_rng(0).standard_t(2, size=(3, 400)).astype(np.float32) * 5
     writer = Writer("none")
     order = writer.means("means", means, bits)
-    found = Reader(writer.body, writer.layout, "none", 10**6).means("means", 400, bits)
+    found = Reader(writer.body, writer.layout, 10**6).means("means", 400, bits)
     for axis, values in zip(means[:, order], found, strict=True):
         contraction = quantise.Contraction.of(axis)
         step = np.ptp(contraction.contracted(axis)) / (2**bits - 2)
@@ -398,6 +399,10 @@ def sizes_of(*size):
         (header_with(lengths__means=2**70), "its parts must have"),
         (header_with(lengths__means="many"), "its parts must have"),
         (header_with(lengths=[1, 2]), "damaged"),
+        (header_with(coders={}), "damaged"),
+        (header_with(coders__quats="pickle"), "the part quats is of the coder pickle, which is not known"),
+        (header_with(coders__quats=["lzma"]), "damaged"),
+        (header_with(coders__means="none"), "the part means"),
         (header_with(ends__means=[0.0]), "the ends of means must be 12 numbers"),
         (header_with(ends__means=[1e30] * 12), "means|the part"),
         (header_with(ends__means=[0.0, 1e38, -1e3, 1e3] * 3), "means must be finite"),
@@ -461,7 +466,7 @@ def test_a_file_of_many_rows_and_few_bytes_is_refused(tmp_path):
     header, _ = compact._unframed(encode_model(plain(1), CompactChoices(coder="zstd")))
     num = 10**7
     means = coders.encode("zstd", np.zeros((6, num), np.uint8))
-    header |= {"num": num, "lengths": {"means": len(means)}}
+    header |= {"num": num, "lengths": {"means": len(means)}, "coders": {"means": "zstd"}}
     refused(tmp_path, sealed(header, means), "too small")
 
 
@@ -494,16 +499,16 @@ def test_a_reader_reads_all_or_nothing():
     writer = Writer("zstd")
     writer.numbers("a", np.eye(3), 8)
     writer.numbers("b", np.eye(3), 8)
-    reader = Reader(writer.body, writer.layout, "zstd", 1000)
+    reader = Reader(writer.body, writer.layout, 1000)
     with pytest.raises(ValueError, match="the part b is missing"):
         reader.numbers("b", 3, 3, 8)
     reader.numbers("a", 3, 3, 8)
     with pytest.raises(ValueError, match="the part b is not known"):
         reader.end()
     with pytest.raises(ValueError, match="its parts must have"):
-        Reader(writer.body[:-1], writer.layout, "zstd", 1000)
+        Reader(writer.body[:-1], writer.layout, 1000)
     with pytest.raises(ValueError, match="would take 9 bytes"):
-        Reader(writer.body, Layout(writer.layout.lengths, writer.layout.ends), "zstd", 8).numbers("a", 3, 3, 8)
+        Reader(writer.body, writer.layout, 8).numbers("a", 3, 3, 8)
 
 
 def test_fewer_bits_take_fewer_bytes():

@@ -15,6 +15,8 @@ import zstandard
 from PIL import Image
 
 Coder = Literal["lzma", "zstd", "webp", "none"]
+Choice = Literal["smallest", "lzma", "zstd", "webp", "none"]
+"""A coder, or whichever makes least of it."""
 ZSTD_LEVEL = 19
 LZMA_FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 20}
@@ -28,12 +30,21 @@ class CodedError(ValueError):
     """What is read is not what a coder wrote."""
 
 
+def encode_smallest(planes: np.ndarray) -> tuple[Coder, bytes]:
+    """The coder that makes least of planes [C, n], and what it makes."""
+    fitting: list[Coder] = ["lzma", "zstd", "none"]
+    if max(_webp_sides(*planes.shape)) <= LONGEST_WEBP_SIDE:
+        fitting.append("webp")
+    coded = {coder: encode(coder, planes) for coder in fitting}
+    return min(coded.items(), key=lambda pair: len(pair[1]))
+
+
 def encode(coder: Coder, planes: np.ndarray) -> bytes:
     """Codes planes [C, n] of uint8; no bytes where there are none."""
     return CODERS[coder].encode(np.ascontiguousarray(planes)) if planes.size else b""
 
 
-def decode(coder: Coder, data: bytes, num_planes: int, length: int) -> np.ndarray:
+def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
     """The planes [num_planes, length] of uint8 that `encode` was given.
 
     Raises:
@@ -78,22 +89,28 @@ def _decode_lzma(data: bytes, num_planes: int, length: int) -> np.ndarray:
     return np.frombuffer(found, np.uint8)
 
 
+def _webp_sides(num_planes: int, length: int) -> tuple[int, int]:
+    """Height and width of the whole image."""
+    num, height, width = _webp_shape(num_planes, length)
+    return num * height, width
+
+
 def _webp_shape(num_planes: int, length: int) -> tuple[int, int, int]:
     """Images below each other, the height and the width of one: a square for three planes."""
-    width = math.isqrt(length - 1) + 1
+    width = math.isqrt(max(length - 1, 0)) + 1
     return -(-num_planes // WEBP_CHANNELS), -(-length // width), width
 
 
 def _encode_webp(planes: np.ndarray) -> bytes:
     """Three planes as the channels of an image, row by row."""
     num, height, width = _webp_shape(*planes.shape)
-    if max(num * height, width) > LONGEST_WEBP_SIDE:
-        raise ValueError(f"coder: {planes.size} bytes are more than an image of WebP holds; choose lzma or zstd")
+    if max(_webp_sides(*planes.shape)) > LONGEST_WEBP_SIDE:
+        raise ValueError(f"coder: {planes.size} bytes are more than an image of WebP holds; choose another")
     pixels = np.zeros((num * WEBP_CHANNELS, height * width), np.uint8)
     pixels[: len(planes), : planes.shape[1]] = planes
     image = pixels.reshape(num, WEBP_CHANNELS, height * width).transpose(0, 2, 1).reshape(num * height, width, -1)
     file = io.BytesIO()
-    Image.fromarray(image).save(file, "WEBP", lossless=True, quality=100, method=6, exact=True)
+    Image.fromarray(image).save(file, "WEBP", lossless=True, quality=75, method=4, exact=True)
     return file.getvalue()
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from a2tg_jax.appearance import Banded
 from a2tg_jax.gaussians import check_gaussians
 from a2tg_jax.io.atomic import replacing
-from a2tg_jax.io.coders import Coder, decode, encode
+from a2tg_jax.io.coders import Choice, decode, encode
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.io.model import appearance_from_dict, appearance_to_dict, origin_arrays, origin_of, origin_to_dict
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
@@ -58,12 +58,12 @@ class CompactChoices:
     """Of the higher degrees, each with ends of its own."""
     texels: Precision = 6
     """RGB and alpha, each with ends of its own."""
-    coder: Coder = "lzma"
-    """lzma, of Python's own library; zstd; webp, as lossless images; or none."""
+    coder: Choice = "smallest"
+    """lzma, of Python's own library; zstd; webp, as lossless images; none; or for each part the smallest of them."""
 
-    def keeping(self, precisions: Mapping[str, Precision]) -> Self:
-        """The choices with other precisions, by name."""
-        return dataclasses.replace(self, **dict(precisions))  # type: ignore[arg-type]
+    def keeping(self, others: Mapping[str, Any]) -> Self:
+        """The choices with others, by name."""
+        return dataclasses.replace(self, **dict(others))  # type: ignore[arg-type]
 
     def check(self) -> Self:
         """Raises ValueError, naming the choice, if one cannot be."""
@@ -169,7 +169,7 @@ def _encoded(model: Model, choices: CompactChoices) -> tuple[bytes, int]:
         header["origin"] = origin_to_dict(model.origin)
         for name, array in origin_arrays(model.origin).items():
             writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
-    header |= {"lengths": writer.layout.lengths, "ends": writer.layout.ends}
+    header |= dataclasses.asdict(writer.layout)
     return _framed(header, writer.body), writer.num_unpacked
 
 
@@ -192,7 +192,7 @@ def _decoded(data: bytes) -> Model:
     choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
     appearance = appearance_from_dict(header["appearance"], ())
     check_kind(appearance)
-    reader = Reader(body, Layout(header["lengths"], header["ends"]), choices.coder, _room(data))
+    reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
     rows = _rows_of(reader, header, choices)
     origin = None
     if "origin" in header:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.io import quantise
-from a2tg_jax.io.coders import CodedError, Coder, decode, encode
+from a2tg_jax.io.coders import CODERS, Choice, CodedError, decode, encode, encode_smallest
 from a2tg_jax.io.quantise import Contraction, Ends, Precision
 
 MEANS_FLOAT_BITS = 16
@@ -23,6 +23,8 @@ class Layout:
 
     lengths: dict[str, int] = dataclasses.field(default_factory=dict)
     """Coded bytes by name, in order."""
+    coders: dict[str, str] = dataclasses.field(default_factory=dict)
+    """By name."""
     ends: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     """Of what is kept in bits, the smallest and the largest; of each axis of the means, centre and spread before."""
 
@@ -30,7 +32,7 @@ class Layout:
 class Writer:
     """Codes columns one after the other."""
 
-    def __init__(self, coder: Coder):
+    def __init__(self, coder: Choice):
         self.coder = coder
         self.layout = Layout()
         self.num_unpacked = 0
@@ -43,8 +45,13 @@ class Writer:
 
     def planes(self, name: str, planes: np.ndarray) -> None:
         """uint8 [C, n]."""
-        piece = encode(self.coder, planes)
+        coder = self.coder
+        if coder == "smallest":
+            coder, piece = encode_smallest(planes)
+        else:
+            piece = encode(coder, planes)
         self._pieces.append(piece)
+        self.layout.coders[name] = coder
         self.layout.lengths[name] = len(piece)
         self.num_unpacked += planes.size
 
@@ -99,18 +106,17 @@ class Reader:
     Args:
       body: the coded bytes.
       layout: what was written beside them.
-      coder: the coder.
       room: so many bytes may be unpacked in all.
 
     Raises:
       ValueError: if the lengths are not those of the body.
     """
 
-    def __init__(self, body: bytes, layout: Layout, coder: Coder, room: int):
+    def __init__(self, body: bytes, layout: Layout, room: int):
         lengths = list(layout.lengths.values())
         if not all(type(length) is int and length >= 0 for length in lengths) or sum(lengths) != len(body):
             raise ValueError(f"its parts must have {len(body)} bytes in all; got {lengths}")
-        self.coder, self.layout, self.room = coder, layout, room
+        self.layout, self.room = layout, room
         self._body, self._at = body, 0
         self._names = list(layout.lengths)
 
@@ -123,11 +129,13 @@ class Reader:
         self.take_room(name, num_planes * length)
         if not self._names or self._names[0] != name:
             raise ValueError(f"the part {name} is missing; {self._names[:1]} came")
-        size = self.layout.lengths[self._names.pop(0)]
+        size, coder = self.layout.lengths[self._names.pop(0)], self.layout.coders[name]
+        if coder not in CODERS:
+            raise ValueError(f"the part {name} is of the coder {coder}, which is not known here")
         data = self._body[self._at : self._at + size]
         self._at += size
         try:
-            return decode(self.coder, data, num_planes, length)
+            return decode(coder, data, num_planes, length)
         except CodedError as error:
             raise ValueError(f"the part {name} {error}") from error
 
