@@ -27,6 +27,7 @@ from a2tg_jax.data import synthetic_scene as synthetic_scene
 from a2tg_jax.data import view_image as view_image
 from a2tg_jax.data.world import Similarity as Similarity
 from a2tg_jax.densify import CloneSplitPrune as CloneSplitPrune
+from a2tg_jax.densify import FillingDensity as FillingDensity
 from a2tg_jax.densify import OpacityReset as OpacityReset
 from a2tg_jax.evaluation import evaluate as evaluate
 from a2tg_jax.events import Change as Change
@@ -50,6 +51,7 @@ from a2tg_jax.io.ply import load_ply as load_ply
 from a2tg_jax.io.ply import save_ply as save_ply
 from a2tg_jax.losses import normal_consistency as normal_consistency
 from a2tg_jax.losses import photometric_loss as photometric_loss
+from a2tg_jax.mcmc import FillingMcmc as FillingMcmc
 from a2tg_jax.mcmc import Mcmc as Mcmc
 from a2tg_jax.mcmc import Noise as Noise
 from a2tg_jax.mcmc import grow as grow

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.budget import within_budget
 from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, static
 from a2tg_jax.gradient_statistics import GradientStatistics
@@ -94,7 +95,8 @@ class Upscale(HostEvent):
         return state.observe_views(seen.gradients, seen.is_visible)
 
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
-        layout, num = model.layout, model.num
+        textures, layout = model.appearance.textures(model.params, model.layout)
+        num = model.num
         new_sizes, scales, averages = layout.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
         sizes = new_sizes[:num]
@@ -104,12 +106,34 @@ class Upscale(HostEvent):
         )  # fmt: skip
         how = self._how_to_select(model.num_bytes, index, count)
         mask = select(averages[:num], sizes, proposed, **how)
-        new_sizes[:num] = np.where(mask[:, None], proposed, sizes)
+        grown = np.where(mask[:, None], proposed, sizes)
+        if self.select == "budget" and index == count and (grown == proposed).all():
+            left = how["budget_bytes"] - _bytes_between(sizes, grown)
+            grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
+        new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
-        rebuilt = reallocate(model.params, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
+        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
-        model = dataclasses.replace(model, params=rebuilt.textures, layout=rebuilt.layout)
+        shown = model.appearance.with_textures(model.params, model.layout, rebuilt.textures, rebuilt.layout)
+        model = dataclasses.replace(model, params=shown[0], layout=shown[1])
         return Change(model, rebuilt.moments, self.init(model))
+
+    def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
+        """Sizes after further upscalings, where the last one gave every texture what it proposed and bytes are left.
+
+        When thin Gaussians have what they propose as well, both axes double.
+        """
+        for anisotropic in (self.anisotropic, False):
+            is_chosen = np.ones(1, bool)
+            while is_chosen.any():
+                proposed = next_sizes(
+                    sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
+                )
+                is_chosen = select(averages, sizes, proposed, budget_bytes=left)
+                grown = np.where(is_chosen[:, None], proposed, sizes)
+                left -= _bytes_between(sizes, grown)
+                sizes = grown
+        return sizes
 
     def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
         """The keyword that tells `select` how to choose."""
@@ -199,7 +223,7 @@ def select(
     if fraction is not None:
         return _select_fraction(statistic, can_grow, fraction)
     if budget_bytes is not None:
-        return _select_budget(statistic, can_grow, added_bytes, budget_bytes)
+        return within_budget(statistic, can_grow, added_bytes, budget_bytes)
     return can_grow & (statistic > threshold)
 
 
@@ -329,23 +353,9 @@ def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: floa
     return _mask(len(statistic), candidates[order[:num]])
 
 
-def _select_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget: float) -> np.ndarray:
-    if not budget >= 0:
-        raise ValueError(f"budget_bytes must be at least 0; got {budget}")
-    candidates = np.flatnonzero(can_grow & (statistic >= 0))
-    gain = statistic[candidates].astype(np.float64) / cost[candidates]
-    queue = candidates[np.argsort(-gain, kind="stable")]
-    chosen = []
-    # Whatever fails once fails for good, for the rest of the budget only shrinks. So each round takes all up to the
-    # first that does not fit and drops everything dearer than the rest: one round per distinct cost at most.
-    while len(queue):
-        spent = np.cumsum(cost[queue])
-        num = int(np.searchsorted(spent, budget, side="right"))
-        chosen.append(queue[:num])
-        budget -= int(spent[num - 1]) if num else 0
-        queue = queue[num:]
-        queue = queue[cost[queue] <= budget]
-    return _mask(len(statistic), np.concatenate(chosen) if chosen else [])
+def _bytes_between(sizes: np.ndarray, larger: np.ndarray) -> int:
+    """Bytes that textures take more at their larger sizes."""
+    return BYTES_PER_TEXEL * int(np.prod(larger, axis=1).sum() - np.prod(sizes, axis=1).sum())
 
 
 def _mask(num: int, chosen) -> np.ndarray:

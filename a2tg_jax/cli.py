@@ -38,6 +38,7 @@ from a2tg_jax.startup import configure_cpu
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import SYSTEMS, System
+from a2tg_jax.training.start import check_start
 
 BASELINE = "gaussians-2d-mcmc"
 DEMO_SYSTEM = A2tg(
@@ -89,7 +90,7 @@ class Train:
     Examples:
       a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
       a2tg train scenes/fox --out runs/fox --resume
-      a2tg train scenes/fox --out runs/small --texture.select budget --texture.budget-mb 20 --baseline
+      a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
       a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
       a2tg train --config runs/fox/run.toml --out runs/again
 
@@ -367,6 +368,8 @@ def _begin(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path
         load_lpips(lpips_weights)
     check_free(out, overwrite=overwrite)
     scene = record.scene.load()
+    for system in record.systems.values():
+        check_start(scene, system)
     run = create_run(out, overwrite=overwrite)
     write_record(run, record)
     _train_and_report(run, scene, lpips_weights)

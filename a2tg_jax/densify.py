@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.budget import number_to_reach
 from a2tg_jax.events import (
     Change,
     EventInfo,
@@ -101,23 +102,77 @@ class CloneSplitPrune(StepEvent):
         Args:
           gradients: [N] averages.
         """
-        num, size = model.gaussians.num, jnp.max(model.gaussians.scales, axis=1)
-        is_live = jnp.arange(num, dtype=jnp.int32) < (num if model.num_live is None else model.num_live)
+        is_kept = is_live(model) & ~self._is_pruned(now, model)
+        # A copy of what is pruned would be pruned as well.
+        is_wanted = is_kept & (gradients >= self.threshold)
+        room = min(model.gaussians.num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
+        edit = self._edit(now, model, is_kept, is_wanted & (_ranks(gradients, is_wanted) < room))
+        return edit, jnp.sum(is_wanted & ~(edit.is_cloned | edit.is_split), dtype=jnp.int32)
+
+    def _is_pruned(self, now: Now, model: Model) -> Array:
+        """[N] what is too faint or too large."""
         opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
         between = reset_interval(now.num_iterations)
         is_late, since_reset = now.iteration > between, now.iteration % between
         is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
-        is_pruned = is_faint | (is_late & (size > self.largest_share * now.scene_scale))
-        is_kept = is_live & ~is_pruned
-        # A copy of what is pruned would be pruned as well.
-        is_wanted = is_kept & (gradients >= self.threshold)
-        room = min(num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
-        order = jnp.argsort(jnp.where(is_wanted, -gradients, jnp.inf), stable=True)
-        rank = jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
-        is_doubled = is_wanted & (rank < room)
-        is_large = size > self.dense_share * now.scene_scale
-        num_refused = jnp.sum(is_wanted & ~is_doubled, dtype=jnp.int32)
-        return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large), num_refused
+        return is_faint | (is_late & (_sizes(model) > self.largest_share * now.scene_scale))
+
+    def _edit(self, now: Now, model: Model, is_kept: Array, is_doubled: Array) -> Edit:
+        """Doubled rows are split where they are large, and cloned where they are not."""
+        is_large = _sizes(model) > self.dense_share * now.scene_scale
+        return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large)
+
+
+@event
+class FillingDensity(CloneSplitPrune):
+    """As `CloneSplitPrune`, but with so many Gaussians after each event that the last leaves the cap.
+
+    The largest gradients are doubled, whether above the threshold or not. Pruning goes on while those that are left
+    suffice: where too many would go, the most opaque stay.
+    """
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        count = self.times(num_iterations).num_times
+        if num * 2.0**count < self.cap:
+            raise ValueError(
+                f"{num:,} Gaussians that double at most in each of the {count} densifications of {num_iterations} "
+                f"iterations do not become the {self.cap:,} of memory_budget: raise stage1_iterations or "
+                "initial_gaussians, or lower memory_budget"
+            )
+        return max(num, self.cap)
+
+    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
+        assert now.times is not None
+        is_there = is_live(model)
+        num_live = jnp.sum(is_there, dtype=jnp.int32)
+        reached = number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
+        reached = jnp.minimum(reached, 2 * num_live)
+        is_kept = is_there & ~self._is_pruned(now, model)
+        opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+        # Those that would stay anyway come first.
+        place = _ranks(jnp.where(is_kept, jnp.inf, opacities), is_there)
+        is_kept = is_kept | (is_there & jnp.any(is_kept) & (place < (reached + 1) // 2))
+        num_doubled = reached - jnp.sum(is_kept, dtype=jnp.int32)
+        is_doubled = is_kept & (_ranks(gradients, is_kept) < num_doubled)
+        return self._edit(now, model, is_kept, is_doubled), jnp.zeros((), jnp.int32)
+
+
+def is_live(model: Model) -> Array:
+    """[N] which rows exist."""
+    num = model.gaussians.num
+    return jnp.arange(num, dtype=jnp.int32) < (num if model.num_live is None else model.num_live)
+
+
+def _sizes(model: Model) -> Array:
+    """[N] the larger standard deviations."""
+    return jnp.max(model.gaussians.scales, axis=1)
+
+
+def _ranks(values: Array, is_ranked: Array) -> Array:
+    """[N] int32 places in descending order of value, equal ones in the order of rows, those not ranked last."""
+    num = values.shape[0]
+    order = jnp.argsort(jnp.where(is_ranked, -values, jnp.inf), stable=True)
+    return jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
 
 
 def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tuple[Model, AdamState]:

@@ -30,6 +30,15 @@ class Times(NamedTuple):
         """Whether the event follows this iteration."""
         return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
 
+    def num_left(self, iteration: Any) -> Any:
+        """How often the event happens from an iteration on, its first at the earliest."""
+        return self.last // self.every - (iteration - 1) // self.every
+
+    @property
+    def num_times(self) -> int:
+        """How often it happens in all (host)."""
+        return max(0, self.num_left(max(1, self.first)))
+
 
 EVERY_ITERATION = Times(1, 2**31 - 1, 1)
 
@@ -44,6 +53,8 @@ class Seen(NamedTuple):
     image; 0 where a Gaussian was not seen."""
     is_visible: Array
     """[V, N] whether the Gaussian was composited at one pixel at least."""
+    colors: Array
+    """[V, N, 3] gradients by the colour of each Gaussian in the view."""
 
 
 class Now(NamedTuple):
@@ -59,6 +70,8 @@ class Now(NamedTuple):
     """Of the stage."""
     scene_scale: Array
     """1.1 × the largest distance of a camera from the cameras' mean."""
+    times: Times | None = None
+    """When the event happens; None: after every iteration."""
 
 
 class EventInfo(NamedTuple):
@@ -87,6 +100,11 @@ class Event:
     def statistic(self) -> Statistic | None:
         """The statistic of the gradients that `observe` wants."""
         return None
+
+    @property
+    def observes(self) -> bool:
+        """Whether `observe` is to be called. Without a statistic it is told no `Seen.gradients` and `is_visible`."""
+        return self.statistic is not None
 
     def init(self, model: Model) -> Any:
         """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered.

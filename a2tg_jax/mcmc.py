@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.budget import number_to_reach
 from a2tg_jax.checks import check_shape
 from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, event, gather_rows, static
 from a2tg_jax.gaussians import Gaussians, check_gaussians, rotation_matrices
@@ -115,25 +116,36 @@ class Moves(NamedTuple):
     info: MoveInfo
 
 
-def plan_relocation(key: Array, opacities: Array, num_live: Array) -> Moves:
-    """What `relocate` does to rows of these opacities [N], of which the first `num_live` exist."""
+def plan_relocation(key: Array, opacities: Array, num_live: Array, *, hosts: Array | None = None) -> Moves:
+    """What `relocate` does to rows of these opacities [N], of which the first `num_live` exist.
+
+    Hosts are drawn with probability ∝ opacity, or `hosts` [N].
+    """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     is_dead = is_live & ~is_host
     has_hosts = jnp.any(is_host)
-    rows, num_draws = _copied_rows(draw_hosts(key, opacities, is_host), is_dead & has_hosts)
+    weights = opacities if hosts is None else hosts
+    rows, num_draws = _copied_rows(draw_hosts(key, weights, is_host), is_dead & has_hosts)
     info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), num_draws > 0, info)
 
 
-def plan_growth(key: Array, opacities: Array, num_live: Array, cap: Array | int) -> Moves:
-    """What `grow` does to rows of these opacities [N], of which the first `num_live` exist."""
+def plan_growth(
+    key: Array, opacities: Array, num_live: Array, cap: Array | int, least: Array | int = 0, hosts: Array | None = None
+) -> Moves:
+    """What `grow` does to rows of these opacities [N], of which the first `num_live` exist; or more, up to `least`.
+
+    Hosts are drawn with probability ∝ opacity, or `hosts` [N].
+    """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
-    wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), jnp.maximum(num_live + 1, num_live + num_live // 20))
+    wanted = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
+    wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), wanted)
     grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
     is_added = ~is_live & (jnp.arange(opacities.shape[0], dtype=jnp.int32) < grown)
-    rows, num_draws = _copied_rows(draw_hosts(key, opacities, is_host), is_added)
+    weights = opacities if hosts is None else hosts
+    rows, num_draws = _copied_rows(draw_hosts(key, weights, is_host), is_added)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), (num_draws > 0) | is_added, info)
 
@@ -285,18 +297,45 @@ class Mcmc(StepEvent):
                 num = min(self.cap, max(num + 1, num + num // 20))
         return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
-        plan = functools.partial(plan_growth, now.keys[1], cap=min(self.cap, model.gaussians.num))
+        least, cap = self.least(now, num_rows_live(model)), min(self.cap, model.gaussians.num)
+        plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
+
+    def least(self, now: Now, num_live: Array) -> Array | int:
+        """How many Gaussians growth leaves at least; traced."""
+        return 0
 
     @staticmethod
     def _move(model: Model, moments: AdamState, plan) -> tuple[Model, AdamState, MoveInfo]:
         appearance, layout = model.appearance, model.layout
-        num_live = jnp.asarray(model.gaussians.num if model.num_live is None else model.num_live, jnp.int32)
+        num_live = num_rows_live(model)
         moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)
         gaussians, params = appearance.share(model.gaussians, model.params, layout, moves.num_shares)
         num_live = num_live + moves.info.num_added
         shared = dataclasses.replace(model, gaussians=gaussians, params=params, num_live=num_live)
         return gather_rows(shared, moves.rows), clear_moments(model, moments, moves.is_reset), moves.info
+
+
+@event
+class FillingMcmc(Mcmc):
+    """As `Mcmc`, but growth by 5 % is made faster where the cap would not be reached by the last of its events."""
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        if num < self.cap and not self.times(num_iterations).num_times:
+            raise ValueError(
+                f"in {num_iterations} iterations there is no growth from {num:,} Gaussians to the {self.cap:,} of "
+                "memory_budget: raise stage1_iterations or initial_gaussians"
+            )
+        return max(num, self.cap)
+
+    def least(self, now: Now, num_live: Array) -> Array | int:
+        assert now.times is not None
+        return number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
+
+
+def num_rows_live(model: Model) -> Array:
+    """How many rows exist, int32."""
+    return jnp.asarray(model.gaussians.num if model.num_live is None else model.num_live, jnp.int32)

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
-from a2tg_jax.appearance.base import BYTES_PER_FLOAT
+from a2tg_jax.budget import BYTES_PER_FLOAT
 from a2tg_jax.cameras import Camera
 from a2tg_jax.checks import short_repr
 from a2tg_jax.data.world import Similarity

@@ -1,8 +1,8 @@
 """Spherical harmonics of a degree per Gaussian, as they are stored and trained: one padded table for each band.
 
-Band l holds the 2l + 1 coefficients of degree l. All Gaussians have those of `Gaussians.sh`; one of a higher degree owns
-a row in the table of every band between. `Bands` holds parameters only and is differentiable; `BandLayout` says whose
-a row is. A Gaussian without a row in a table pays nothing for it.
+Band l holds the 2l + 1 coefficients of degree l. All Gaussians have those of `Gaussians.sh`; one of a higher degree
+owns a row in the table of every band between. `Bands` holds parameters only and is differentiable; `BandLayout` says
+whose a row is. A Gaussian without a row in a table pays nothing for it.
 """
 
 import dataclasses
@@ -212,5 +212,5 @@ def split_sh(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> tuple[
 
 def _owned(owners: Array, num: int) -> np.ndarray:
     """The Gaussians that own the rows in use, in the rows' order."""
-    owners = np.asarray(owners)
-    return owners[owners < num]
+    found = np.asarray(owners)
+    return found[found < num]

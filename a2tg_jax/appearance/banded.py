@@ -26,6 +26,7 @@ from a2tg_jax.sh_bands import (
     gather_bands,
     split_sh,
 )
+from a2tg_jax.texture import AtlasLayout, Textures
 
 
 class BandedParams(NamedTuple):
@@ -107,7 +108,7 @@ class BandedRule(AppearanceRule):
 class Banded(Appearance):
     """What another appearance shows, and view dependence of a degree per Gaussian."""
 
-    inner: Appearance = Plain()
+    inner: Appearance = dataclasses.field(default_factory=Plain)
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[BandedParams, BandedLayout]:
         degrees = np.full(gaussians.num, gaussians.sh_degree)
@@ -158,6 +159,13 @@ class Banded(Appearance):
     def with_sh(self, sh: np.ndarray, params: BandedParams, layout: BandedLayout) -> BandedParams:
         bands, _ = split_sh(sh, layout.bands.degrees, layout.bands.base_degree)
         return params._replace(bands=bands)
+
+    def textures(self, params: BandedParams, layout: BandedLayout) -> tuple[Textures, AtlasLayout]:
+        return self.inner.textures(params.inner, layout.inner)
+
+    def with_textures(self, params: BandedParams, layout: BandedLayout, textures: Textures, atlas: AtlasLayout):
+        inner, inner_layout = self.inner.with_textures(params.inner, layout.inner, textures, atlas)
+        return params._replace(inner=inner), layout._replace(inner=inner_layout)
 
     # Files.
 

@@ -18,8 +18,7 @@ from jax import Array
 from a2tg_jax.appearance.rule import AppearanceRule
 from a2tg_jax.gaussians import Gaussians, logit
 from a2tg_jax.sharing import share
-
-BYTES_PER_FLOAT = 4
+from a2tg_jax.texture import AtlasLayout, Textures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +87,18 @@ class Appearance:
     def with_sh(self, sh: np.ndarray, params: Any, layout: Any) -> Any:
         """The parameters with other coefficients, as `sh` gives them; those of the Gaussians are not its (host)."""
         return params
+
+    def textures(self, params: Any, layout: Any) -> tuple[Textures, AtlasLayout]:
+        """Its textures and their layout.
+
+        Raises:
+          ValueError: if it has none.
+        """
+        raise ValueError(f"{type(self).__name__} has no textures that could grow: a stage of Textured is wanted")
+
+    def with_textures(self, params: Any, layout: Any, textures: Textures, atlas: AtlasLayout) -> tuple[Any, Any]:
+        """Parameters and layout with other textures."""
+        return params, layout
 
     # Files.
 

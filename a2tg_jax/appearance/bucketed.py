@@ -36,6 +36,12 @@ class Bucketed(Appearance):
     def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
         return packed_textures(params, layout) if num == layout.num else first_textures(params, layout, num)
 
+    def textures(self, params: Textures, layout: AtlasLayout) -> tuple[Textures, AtlasLayout]:
+        return params, layout
+
+    def with_textures(self, params: Textures, layout: AtlasLayout, textures: Textures, atlas: AtlasLayout):
+        return textures, atlas
+
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
         """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
         texels = [array.reshape(-1, 4) for array in texture_arrays(params, layout)]

@@ -72,7 +72,7 @@ def evaluate_run(
 
 def settings_of(system: System) -> RenderSettings:
     """How the models of a system are rendered."""
-    return RenderSettings(tile_size=system.tile_size, sh_degree=system.sh_degree)
+    return RenderSettings(tile_size=system.tile_size)
 
 
 def _seconds(run: RunFolder, name: str) -> float:

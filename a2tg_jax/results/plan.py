@@ -10,7 +10,7 @@ import numpy as np
 from a2tg_jax.classes import classes_of
 from a2tg_jax.training import Stage, System
 
-STAGE_OPTIONS = ("loss", "rates")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget")
 """Options of every system that reach training through its stages alone."""
 
 
@@ -124,7 +124,8 @@ def _is_equal(a: Stage, b: Stage) -> bool:
 def fingerprint(system: System, index: int) -> str:
     """A text that two systems share where they make the same of a stage's start, in this process or another.
 
-    It tells classes and functions apart by module and name, and is another one for another version's options.
+    It tells classes and functions apart by module and name. What has its default is left out, so that an option that
+    is new changes nothing of what was trained before there was one.
 
     Raises:
       ValueError: if a stage holds a function without such a name, or a value that nothing is known of.
@@ -137,8 +138,8 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return _name_of(type(value)), fields
+        described = ((field, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
+        return _name_of(type(value)), tuple((field.name, x) for field, x in described if x != _default_of(field))
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
     if isinstance(value, Mapping):
@@ -148,6 +149,13 @@ def _described(value: Any) -> Any:
     if isinstance(value, type) or callable(value):
         return _name_of(value)
     raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
+
+
+def _default_of(field: dataclasses.Field) -> Any:
+    """What is described of a field's default; something that nothing equals where it has none."""
+    if field.default is not dataclasses.MISSING:
+        return _described(field.default)
+    return object() if field.default_factory is dataclasses.MISSING else _described(field.default_factory())
 
 
 def _name_of(value: Any) -> str:

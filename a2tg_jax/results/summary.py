@@ -142,8 +142,20 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
         lines += ["", *aligned([names, *block])] if lines else aligned([names, *block])
     if result.lpips_network:
         lines.append(f"LPIPS with {result.lpips_network}")
+    lines += budget_lines(result)
     lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
     return "\n".join(lines)
+
+
+def budget_lines(result: RunResult) -> list[str]:
+    """What each finished model of a system with a memory budget takes of it."""
+    lines = []
+    for name in dict.fromkeys(chain[-1] for chain in result.plan.chains.values()):
+        budget = result.plan[name].system.budget_bytes
+        if budget is not None and name in result.models:
+            used = result.models[name].num_bytes
+            lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
+    return lines
 
 
 def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: int) -> list[list[tuple[str, ...]]]:

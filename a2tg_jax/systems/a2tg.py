@@ -5,9 +5,11 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Plain, TexelRates, Textured, TextureOptions
+from a2tg_jax.budget import megabytes_of
 from a2tg_jax.events import Statistic
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.systems.stage1 import (
+    FLOATS_PER_TEXEL,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -23,6 +25,9 @@ from a2tg_jax.training.stage import Stage
 
 QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0}
 """What short runs want (docs/results.md)."""
+BUDGET_TEXELS = 5
+"""Texels a Gaussian that a memory budget leaves room for on average: about as many as two or three upscalings of a
+quarter of the Gaussians make. Gaussians then take four fifths of the bytes."""
 PAPER_THRESHOLD = 2e-5
 """k_G, in the unit of the authors' own statistic."""
 
@@ -32,13 +37,14 @@ class TextureConfig:
     """Adaptive anisotropic textures."""
 
     select: Literal["fraction", "threshold", "budget"] = "fraction"
-    """How the Gaussians to upscale are chosen."""
+    """How the Gaussians to upscale are chosen; with a memory_budget, always as by "budget"."""
     fraction: float = 0.25
     """Share of the Gaussians upscaled at each event."""
     threshold: float | None = None
     """Smallest average gradient that is upscaled (k_G); needed by select="threshold"."""
     budget_mb: float | None = None
-    """Reported memory never exceeds this many MB (10^6 bytes); needed by select="budget"."""
+    """Reported memory never exceeds this many MB (10^6 bytes); needed by select="budget". It bounds the textures alone,
+    beside the Gaussians of densify.cap: memory_budget chooses both."""
     anisotropic: bool = True
     """Double one axis only on thin Gaussians; off: always both."""
     axes: Literal["paper", "authors"] = "paper"
@@ -111,13 +117,27 @@ class A2tg(System):
     name: ClassVar[str] = "a2tg"
 
     def stages(self) -> tuple[Stage, ...]:
-        lookup = self.texture.lookup
-        events = (*([Noise()] if self.noise_in_stage2 else []), self.texture.event())
-        first = growing_stage(self, self.stage1_iterations, self.densify.events(), Plain(lookup.max_alpha))
+        lookup, upscale = self.texture.lookup, self._texture().event()
+        events = (*([Noise()] if self.noise_in_stage2 else []), upscale)
+        cap = self.budget_cap(FLOATS_PER_TEXEL * self._budget_texels(upscale))
+        first = growing_stage(self, self.stage1_iterations, self.densify.events(cap), Plain(lookup.max_alpha))
         textured = Textured((1, 1), lookup)
         single = self.texture.rate if self.texture.single_rate is None else self.texture.single_rate
         rates = TexelRates(self.texture.rate, single)
         return first, later_stage(self, "textures", textured, events, self.stage2_iterations, rates)
+
+    def _texture(self) -> TextureConfig:
+        """The textures' options, those of a memory budget in place of others."""
+        if self.memory_budget is None:
+            return self.texture
+        if self.texture.budget_mb is not None:
+            raise ValueError("memory_budget and texture.budget_mb both say how much memory there is: give one of them")
+        return dataclasses.replace(self.texture, select="budget", budget_mb=megabytes_of(self.memory_budget))
+
+    def _budget_texels(self, upscale: Upscale) -> float:
+        """Texels a Gaussian that the number of Gaussians leaves room for: at most half of what there can be."""
+        can_grow = bool(upscale.iterations(self.stage2_iterations))
+        return min(BUDGET_TEXELS, (1 + upscale.cap**2) / 2) if can_grow else 1
 
     @classmethod
     def presets(cls) -> dict[str, Self]:

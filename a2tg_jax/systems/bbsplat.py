@@ -4,8 +4,8 @@ import dataclasses
 from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Billboards
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.stage1 import QUICK, SMOKE, continued, growing_stage
+from a2tg_jax.mcmc import FillingMcmc, Mcmc
+from a2tg_jax.systems.stage1 import FLOATS_PER_TEXEL, QUICK, SMOKE, continued, growing_stage
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -27,7 +27,8 @@ class BillboardMcmcConfig:
     """MCMC densification of billboards."""
 
     cap: int = 160_000
-    """Largest number of billboards, each, at 16 × 16, of as many bytes as 18.6 plain Gaussians."""
+    """Largest number of billboards, each, at 16 × 16, of as many bytes as 18.6 plain Gaussians. A memory_budget takes
+    its place."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,7 +47,8 @@ class BBSplat(System):
         if self.densify.cap < 2:
             raise ValueError(f"densify.cap must be at least 2 billboards; got {self.densify.cap}")
         pictures, rates = Billboards(self.billboard.side), (self.billboard.rgb, self.billboard.alpha)
-        events = (Mcmc(self.densify.cap),)
+        cap = self.budget_cap(FLOATS_PER_TEXEL * self.billboard.side**2 - 1)  # Their opacity is not trained.
+        events = (Mcmc(self.densify.cap) if cap is None else FillingMcmc(cap),)
         first = growing_stage(self, self.stage1_iterations, events, pictures, rates, name="billboards")
         return continued(self, first, self.stage2_iterations)
 

@@ -20,7 +20,7 @@ class Gaussians2dMcmc(System):
     name: ClassVar[str] = "gaussians-2d-mcmc"
 
     def stages(self) -> tuple[Stage, ...]:
-        first = growing_stage(self, self.stage1_iterations, self.densify.events())
+        first = growing_stage(self, self.stage1_iterations, self.densify.events(self.budget_cap()))
         return continued(self, first, self.stage2_iterations)
 
     @classmethod

@@ -4,9 +4,9 @@ import dataclasses
 from typing import Any
 
 from a2tg_jax.appearance import Appearance, Plain
-from a2tg_jax.densify import CloneSplitPrune, OpacityReset
+from a2tg_jax.densify import CloneSplitPrune, FillingDensity, OpacityReset
 from a2tg_jax.events import Event
-from a2tg_jax.mcmc import Mcmc, Noise
+from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import LearningRates, Stage
 
@@ -22,6 +22,7 @@ SMOKE: dict[str, Any] = {
     "stage1_iterations": 200, "initial_gaussians": 800, "initial_opacity": QUICK_OPACITY, "rates": QUICK_RATES,
 }  # fmt: skip
 SMOKE_CAP = 1_000
+FLOATS_PER_TEXEL = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,12 +30,20 @@ class McmcConfig:
     """MCMC densification (3DGS-MCMC)."""
 
     cap: int = 500_000
-    """Largest number of Gaussians."""
+    """Largest number of Gaussians; a memory_budget takes its place."""
     is_enabled: bool = True
     """Relocate and grow."""
 
-    def events(self) -> tuple[Event, ...]:
-        """Noise after every iteration; relocation and growth at their times."""
+    def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
+        """Noise after every iteration; relocation and growth at their times.
+
+        Args:
+          budget_cap: how many Gaussians there shall be in the end; None: at most `cap`.
+        """
+        if budget_cap is not None:
+            if not self.is_enabled:
+                raise ValueError("densify.is_enabled is off, so that no Gaussians can fill a memory_budget")
+            return (Noise(), FillingMcmc(budget_cap))
         if self.cap < 2:
             raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
         return (Noise(), Mcmc(self.cap)) if self.is_enabled else (Noise(),)
@@ -45,21 +54,27 @@ class DensityConfig:
     """Adaptive density control (3DGS, 2DGS)."""
 
     cap: int = 500_000
-    """Largest number of Gaussians; so many rows are allocated."""
+    """Largest number of Gaussians; so many rows are allocated. A memory_budget takes its place."""
     threshold: float = 2e-4
-    """Smallest average gradient, by the position on the screen in units of half an image, that is densified."""
+    """Smallest average gradient, by the position on the screen in units of half an image, that is densified. With a
+    memory_budget the largest gradients are, however small."""
     least_opacity: float = 0.05
     """Fainter Gaussians are pruned."""
     reset_opacity: float = 0.01
     """No Gaussian stays more opaque, every max(500, n/10) of n iterations until n/2."""
 
-    def events(self) -> tuple[Event, ...]:
-        """Clone, split and prune; reset opacities."""
+    def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
+        """Clone, split and prune; reset opacities.
+
+        Args:
+          budget_cap: how many Gaussians there shall be in the end; None: at most `cap`.
+        """
         if self.cap < 2:
             raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
         if not 0 < self.reset_opacity < 1:
             raise ValueError(f"densify.reset_opacity must lie between 0 and 1; got {self.reset_opacity}")
-        density = CloneSplitPrune(self.cap, threshold=self.threshold, least_opacity=self.least_opacity)
+        kind, cap = (CloneSplitPrune, self.cap) if budget_cap is None else (FillingDensity, budget_cap)
+        density = kind(cap, threshold=self.threshold, least_opacity=self.least_opacity)
         return (density, OpacityReset(self.reset_opacity))
 
 

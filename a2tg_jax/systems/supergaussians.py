@@ -51,7 +51,8 @@ class SuperGaussians(System):
 
     def stages(self) -> tuple[Stage, ...]:
         kernels, rates = MovableKernels(), self.kernels.rates()
-        first = growing_stage(self, self.stage1_iterations, self.densify.events(), kernels, rates, name="kernels")
+        events = self.densify.events(self.budget_cap(kernels.num_floats((), 1)))
+        first = growing_stage(self, self.stage1_iterations, events, kernels, rates, name="kernels")
         return continued(self, first, self.stage2_iterations)
 
     @classmethod

@@ -5,6 +5,7 @@ from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Textured, TextureOptions
 from a2tg_jax.systems.stage1 import (
+    FLOATS_PER_TEXEL,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -47,7 +48,8 @@ class TexturedGaussians(System):
         if not 1 <= side <= 16:
             raise ValueError(f"texture.side must lie in 1..16; got {side}")
         textured = Textured((side, side), self.texture.lookup)
-        first = growing_stage(self, self.stage1_iterations, self.densify.events())
+        events = self.densify.events(self.budget_cap(FLOATS_PER_TEXEL * side * side))
+        first = growing_stage(self, self.stage1_iterations, events)
         return first, later_stage(self, "textures", textured, (), self.stage2_iterations, self.texture.rate)
 
     @classmethod

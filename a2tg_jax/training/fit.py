@@ -1,7 +1,9 @@
 """Training from photographs: every stage of a system, one from the result of the other."""
 
 import dataclasses
+import warnings
 
+from a2tg_jax.budget import LARGEST_SHORTFALL
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.model import Model
 from a2tg_jax.origin import BLACK, WHITE, Color, Origin
@@ -135,4 +137,21 @@ def fit_stage(
     run = StageRun(scene, system, index, start, resume)
     run.train(on_checkpoint, checkpoint_every, progress, title)
     model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
+    if index == len(system.stages()) - 1:
+        warn_of_budget(system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)
+
+
+def warn_of_budget(system: System, model: Model) -> None:
+    """Warns where a finished model is not what its memory budget asks for."""
+    budget, used = system.budget_bytes, model.num_bytes
+    if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
+        return
+    if used > budget:
+        advice = f"compose the stages of {type(system).__name__} with System.budget_cap"
+    elif used + used / model.num > budget:
+        advice = f"there is no room for another Gaussian of {used / model.num:,.0f} bytes: raise memory_budget"
+    else:
+        advice = "raise stage1_iterations or initial_gaussians"
+    share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
+    warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=3)

@@ -133,7 +133,7 @@ class StageRun:
         for event, times in zip(self.stage.events, self.clock.times, strict=True):
             if isinstance(event, HostEvent):
                 due += event.iterations(count)
-            elif times is not None and event.statistic and times.last < count:
+            elif times is not None and event.observes and times.last < count:
                 due.append(times.last)
         return due
 
@@ -204,7 +204,7 @@ class StageRun:
                 change = event.apply(due.index(iteration) + 1, len(due), self.state.model, self.state.moments, state)
                 self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
                 self._keep(place, None if iteration == due[-1] else change.state)
-            elif times is not None and event.statistic and iteration == times.last:
+            elif times is not None and event.observes and iteration == times.last:
                 self._keep(place, None)
 
     def _keep(self, place: int, gathered) -> None:
@@ -214,7 +214,7 @@ class StageRun:
 
     def _settings(self, size: tuple[int, int]) -> RenderSettings:
         """Render settings with the capacity for views of a size, planned before the first of them."""
-        settings = RenderSettings(tile_size=self.system.tile_size, sh_degree=self.system.sh_degree)
+        settings = RenderSettings(tile_size=self.system.tile_size)
         if size not in self.capacities:
             views = [view for view in self.views if view.image.shape[:2] == size]
             live, dtype = self.model, self.scene_scale.dtype

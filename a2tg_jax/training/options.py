@@ -5,6 +5,7 @@ import math
 import typing
 from typing import Any, ClassVar, Literal, Self
 
+from a2tg_jax.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.stage import LearningRates, Stage
@@ -52,6 +53,9 @@ class System:
     """Gaussians to start from; None: all the points, at most the cap."""
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from."""
+    memory_budget: float | str | None = None
+    """Bytes that the model never exceeds, and takes all but half a percent of in the end: 1.5MB, 800kB, 2GB, or a
+    number of MB (10^6 bytes). It says how many Gaussians and texels there are, in place of densify.cap."""
     background: Literal["black", "white", "random"] = "black"
     """Behind everything, where photographs are transparent too."""
     sh_degree: int = 3
@@ -64,6 +68,39 @@ class System:
 
     name: ClassVar[str] = ""
     """What the command line calls the system."""
+
+    def __post_init__(self) -> None:
+        """A budget is kept as a number of MB, however it was written."""
+        object.__setattr__(self, "memory_budget", megabytes_of(self.memory_budget))
+
+    @property
+    def budget_bytes(self) -> int | None:
+        """The memory budget in bytes; None where there is none."""
+        megabytes = megabytes_of(self.memory_budget)
+        return None if megabytes is None else bytes_of(megabytes)
+
+    def budget_cap(self, floats: float = 0) -> int | None:
+        """How many Gaussians the memory budget has room for; None where there is none.
+
+        Args:
+          floats: what each of them shows besides its own floats, in the end.
+
+        Raises:
+          ValueError: if they are fewer than 2, or than training is to start from.
+        """
+        if self.budget_bytes is None:
+            return None
+        needed = bytes_per_gaussian(self.sh_degree, floats)
+        cap = int(self.budget_bytes // needed)
+        has_room = f"memory_budget of {self.memory_budget} MB has room for {cap:,} Gaussians of {needed:,.0f} bytes"
+        if cap < 2:
+            raise ValueError(f"{has_room}, and there must be 2: raise memory_budget")
+        if self.initial_gaussians is not None and self.initial_gaussians > cap:
+            raise ValueError(
+                f"{has_room}, fewer than training starts from: raise memory_budget, or lower initial_gaussians, "
+                f"which is {self.initial_gaussians:,}"
+            )
+        return cap
 
     def stages(self) -> tuple[Stage, ...]:
         """What is trained, one stage after the other.

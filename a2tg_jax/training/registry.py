@@ -79,7 +79,8 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     Raises:
       ValueError: if the class is not known, or an option is missing, unknown or of another type.
     """
-    name, options = data["name"], data["options"]
+    # Files of before there were budgets know of none.
+    name, options = data["name"], {"memory_budget": None, **data["options"]}
     if kind is None and name in SYSTEMS:
         kind = type(find_system(name))
     if kind is None:

@@ -18,10 +18,30 @@ KEY_OF_PARAMETERS = 0x7E8E1
 
 def initial_model(scene: Scene, system: System) -> Model:
     """Gaussians at the scene's points, as many as the first stage has room for."""
+    num = _initial_number(scene, system)
+    return Model(
+        init_from_points(
+            scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=system.sh_degree
+        )
+    )
+
+
+def check_start(scene: Scene, system: System) -> None:
+    """Refuses a first stage whose events cannot do what they are to do with as many Gaussians as there are at first.
+
+    Raises:
+      ValueError: naming the options to change.
+    """
+    first, num = system.stages()[0], min(_initial_number(scene, system), len(scene.points))
+    for event in first.events:
+        event.num_rows(num, first.iterations)
+
+
+def _initial_number(scene: Scene, system: System) -> int:
+    """How many points the first stage has room for, of those that are asked for."""
     num = system.initial_gaussians or len(scene.points)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
-    num = min(num, *caps) if caps else num
-    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=system.sh_degree))
+    return min(num, *caps) if caps else num
 
 
 def padded(model: Model, stage: Stage, system: System) -> Model:

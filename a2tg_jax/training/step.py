@@ -15,7 +15,7 @@ from jax import Array
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.gaussians import SH_C0, Gaussians
 from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState, adam_init, adam_update
@@ -187,32 +187,37 @@ def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
     return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
 
 
-def _seen(stage: Stage, batch: Photographs, found: _ViewGradients) -> Seen | None:
-    """What events observe; None where nothing is gathered."""
-    if found.statistic is None:
-        return None
+def _seen(stage: Stage, batch: Photographs, found: _ViewGradients) -> Seen:
+    """What events observe."""
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
-    return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height))
+    colors = found.grads[0].sh[:, :, 0] / SH_C0
+    if found.statistic is None:
+        nothing = jnp.zeros_like(colors)
+        return Seen(cameras, nothing, jnp.zeros(colors.shape[:2], bool), colors)
+    return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height), colors)
 
 
 def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
     """Model and moments after Adam, with the parameters projected to where they belong."""
     model = state.model
-    rates = stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree), stage.appearance.rates(stage.params_rate, model.params)
+    rates = (
+        stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree),
+        stage.appearance.rates(stage.params_rate, model.params),
+    )
     step = adam_update((model.gaussians, model.params), grads, state.moments, rates)
     gaussians, params = step.params
     return dataclasses.replace(model, gaussians=gaussians, params=stage.appearance.project(params)), step.state
 
 
-def _events(stage: Stage, clock: Clock, now: Now, seen: Seen | None, model: Model, moments: AdamState, states):
+def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState, states):
     """What the events gather, and what those inside the step do."""
     infos, left, at = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)), [], 0
     for event, times, state in zip(stage.events, clock.times, states, strict=True):
-        if state is not None and event.statistic and seen is not None:
+        if state is not None and event.observes:
             state = event.observe(state, model, seen)
         if isinstance(event, StepEvent):
-            own = now._replace(keys=now.keys[at : at + event.num_keys])
+            own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
             at += event.num_keys
             model, moments, state, info = _at_its_times(event, times, own, model, moments, state)
             possible = infos.is_possible & info.is_possible

@@ -57,8 +57,11 @@ class Cell:
 
     scene: SceneAt
     gaussians: int
+    """0 where a budget says how many there are."""
     seed: int
     iterations: tuple[int, int]
+    budget: float | None = None
+    """Bytes that every method fills, in MB (10^6 bytes)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,9 +113,8 @@ class Grid:
     def _job(self, method: Method, cell: Cell, num: int) -> Job:
         first, second = cell.iterations
         system = type(a2tg.find_system(method.system)).preset(self.preset)
-        basis = {
-            "seed": cell.seed, "densify": {"cap": num}, "stage1_iterations": first, "stage2_iterations": second,
-        }  # fmt: skip
+        size = {"densify": {"cap": num}} if cell.budget is None else {"memory_budget": cell.budget}
+        basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
         for changes in (basis, cell.scene.options, method.options):
             system = with_changes(system, changes, f"{self.name}: {method.label}")
         return Job(cell.scene.path, cell.scene.downscale, system, len(system.stages()) - 1)
@@ -174,10 +176,14 @@ def _methods(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Method]:
 
 
 def _cells(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[Cell]:
-    """Every number of Gaussians, seed and length of a block, on every scene."""
+    """Every number of Gaussians, or every budget, and every seed of a block, on every scene."""
     first, second = block["iterations"]
-    pairs = itertools.product(block["gaussians"], block["seeds"], _scenes(block, wanted, held_out, name))
-    return [Cell(scene, num, seed, (first, second)) for num, seed, scene in pairs]
+    scenes = _scenes(block, wanted, held_out, name)
+    sizes = (
+        [(0, budget) for budget in block["budgets"]] if "budgets" in block else [(n, None) for n in block["gaussians"]]
+    )
+    pairs = itertools.product(sizes, block["seeds"], scenes)
+    return [Cell(scene, num, seed, (first, second), budget) for (num, budget), seed, scene in pairs]
 
 
 def _read(name: str) -> dict[str, Any]:

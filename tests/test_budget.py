@@ -1,0 +1,324 @@
+"""Memory budgets: how they are written, what they lead to on the host, and that no training exceeds or misses one."""
+
+import dataclasses
+import itertools
+import json
+import tomllib
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import a2tg_jax as a2tg
+from a2tg_jax import cli
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance import Textured
+from a2tg_jax.budget import bytes_per_gaussian, megabytes_of, number_to_reach
+from a2tg_jax.densify import FillingDensity
+from a2tg_jax.events import Now, Times
+from a2tg_jax.gaussians import init_from_points, logit
+from a2tg_jax.gradient_statistics import GradientStatistics
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.mcmc import FillingMcmc
+from a2tg_jax.model import Model
+from a2tg_jax.optim import adam_init
+from a2tg_jax.results.plan import fingerprint, plan_run
+from a2tg_jax.results.summary import budget_lines
+from a2tg_jax.training.fit import warn_of_budget
+from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict, with_changes
+from a2tg_jax.training.start import check_start
+
+SHORT = {"stage1_iterations": 60, "initial_gaussians": None}
+BUDGETS = {
+    "a2tg": ("30kB", "61kB"),
+    "gaussians-2d": ("46.6kB", "0.065"),
+    "gaussians-2d-mcmc": ("58.2kB", "0.12"),
+    "textured-gaussians": ("150kB",),
+    "supergaussians": ("0.1MB",),
+    "bbsplat": ("300kB",),
+}
+"""Small, and such that what is less than one more Gaussian is less than half a percent."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=120)
+
+
+def smoke(name: str, **changes):
+    preset = type(a2tg.find_system(name)).preset("smoke")
+    textured = {"stage2_iterations": 6} if preset.stage2_iterations else {}
+    return with_changes(preset, {**SHORT, **textured, **changes}, "test")
+
+
+def filling(system: a2tg.System) -> FillingMcmc | FillingDensity:
+    """The event that brings the Gaussians to their number."""
+    (found,) = [event for event in system.stages()[0].events if isinstance(event, FillingMcmc | FillingDensity)]
+    return found
+
+
+@pytest.mark.parametrize(
+    "text, megabytes",
+    [
+        ("1.5MB", 1.5), ("1.5", 1.5), (1.5, 1.5), (2, 2.0), ("800kB", 0.8), ("800 KB", 0.8), ("2GB", 2000.0),
+        ("1e2 mb", 100.0), ("0.1kB", 1e-4), (None, None), ("None", None), (" .5MB ", 0.5), (1e-05, 1e-5),
+    ],
+)  # fmt: skip
+def test_how_a_budget_is_written(text, megabytes):
+    assert megabytes_of(text) == megabytes
+    assert megabytes_of(megabytes) == megabytes
+
+
+@pytest.mark.parametrize("text", ["", "much", "1.5MiB", "1,5MB", "MB", "1.2.3MB", "-1MB", -1.0, True, "nan"])
+def test_what_is_no_budget_is_named(text):
+    with pytest.raises(ValueError, match=r"memory_budget must be a number of MB .* such as 1.5MB, 800kB or 2GB; got"):
+        megabytes_of(text)
+
+
+@pytest.mark.parametrize("text", ["0", 0.0, "0kB", "1e999"])
+def test_a_budget_is_positive_and_finite(text):
+    with pytest.raises(ValueError, match="memory_budget must be positive and finite; got"):
+        a2tg.A2tg(memory_budget=text)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_budget_is_one_value_however_it_comes(name, tmp_path):
+    """By flag, from TOML as text and as number, from JSON, and from files of before there were budgets."""
+    kind = type(a2tg.find_system(name))
+    wanted = kind(memory_budget=1.5)
+    assert wanted == kind(memory_budget="1500kB") and wanted.budget_bytes == 1_500_000
+    run = ["--system", name, "--out", str(tmp_path)]
+    assert cli._parse("train", ["synthetic", *run, "--memory-budget", "1.5MB"]).options == wanted
+    assert cli._parse("train", ["synthetic", *run, "--memory-budget", "1.5"]).options == wanted
+    for number in ('"1.5MB"', "1.5", '"1500 kB"'):
+        table = tomllib.loads(f"memory_budget = {number}")
+        assert with_changes(kind(), table, "file") == wanted
+    assert config_from_dict(kind, json.loads(json.dumps(config_to_dict(wanted)))) == wanted
+    assert system_from_dict(system_to_dict(wanted), "file") == wanted
+    old = system_to_dict(kind())
+    del old["options"]["memory_budget"]
+    assert system_from_dict(old, "file") == kind()
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_fingerprints_know_of_a_budget_only_where_there_is_one(name):
+    kind = type(a2tg.find_system(name))
+    free, bound, equal, other = (kind(memory_budget=budget) for budget in (None, "90MB", 90, "91MB"))
+    assert "Filling" not in fingerprint(free, 0)
+    assert fingerprint(bound, 0) == fingerprint(equal, 0)
+    assert len({fingerprint(one, 0) for one in (free, bound, other)}) == 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_events_double_at_most_and_the_last_leaves_the_cap(seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(40):
+        count, start = int(rng.integers(1, 60)), int(rng.integers(2, 200_000))
+        cap = int(min(start * rng.uniform(1, 2) ** count, 3e6))
+        num = start
+        for left in range(count, 0, -1):
+            before, num = num, int(number_to_reach(jnp.asarray(num, jnp.int32), cap, left))
+            assert before <= num <= min(2 * before, cap)
+        assert num == cap
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("num_iterations, count", [(60, 5), (200, 16)])
+def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
+    """From few Gaussians, at the times that a stage of so many iterations has."""
+    model = random_model(0, 300, 4, np.tile([0.5, 0.003], 150))
+    model = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, model)
+    event, moments = FillingMcmc(300), adam_init((model.gaussians, ()))
+    times = event.times(num_iterations)
+    apply = jax.jit(lambda iteration, *rest: event.apply(now(iteration, num_iterations, times, 2), *rest, ()))
+    counts = [4]
+    for iteration in range(1, num_iterations + 1):
+        if times.is_due(iteration):
+            model, moments, *_ = apply(jnp.asarray(iteration, jnp.int32), model, moments)
+            counts.append(int(model.num_live))
+    factors = np.divide(counts[1:], counts[:-1])
+    assert len(factors) == times.num_times == count and counts[-1] == 300
+    assert abs(np.log(factors[1:]) - np.log(75) / count).max() < 0.2, "by one factor, rounded up"
+    assert model.gaussians.means.dtype == dtype
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_caps_use_up_every_budget(name):
+    """But for less than one Gaussian, of whatever degree; for A²TG textures make up the rest."""
+    floats = {"textured-gaussians": 64, "supergaussians": 27, "bbsplat": 4 * 256 - 1, "a2tg": 20}
+    rng = np.random.default_rng(0)
+    for budget, sh_degree in itertools.product(np.exp(rng.uniform(-4, 6, 50)), range(4)):
+        system = dataclasses.replace(a2tg.find_system(name), memory_budget=float(budget), sh_degree=sh_degree)
+        needed = bytes_per_gaussian(sh_degree, floats.get(name, 0))
+        assert needed * filling(system).cap <= system.budget_bytes < needed * (filling(system).cap + 1)
+
+
+ROUND, WIDE, TALL = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05)
+SHAPES = {"round": (ROUND, ROUND), "thin": (WIDE, TALL), "mixed": (WIDE, ROUND)}
+
+
+@pytest.mark.parametrize("texture_cap, rounds", [(1, 1), (2, 1), (2, 3), (4, 1), (4, 3), (16, 4)])
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("budget", ["60.1kB", 0.1234])
+def test_textures_take_what_gaussians_leave(budget, shape, texture_cap, rounds):
+    """Also where all Gaussians are so thin that they want fewer texels than there are bytes for."""
+    texture = {"cap": texture_cap, "upscale_at": [0.1 * (index + 1) for index in range(rounds)]}
+    system = smoke("a2tg", memory_budget=budget, texture=texture)
+    (upscale,) = [event for event in system.stages()[1].events if isinstance(event, Upscale)]
+    rng = np.random.default_rng(texture_cap)
+    num = filling(system).cap
+    gaussians = init_from_points(rng.normal(size=(num, 3)), np.full((num, 3), 0.5))
+    scales = np.asarray(SHAPES[shape], np.float32)[np.arange(num) % 2]
+    gaussians = dataclasses.replace(gaussians, log_scales=jnp.log(jnp.asarray(scales)))
+    model = Model(gaussians, *Textured().allocate(jax.random.key(0), gaussians), appearance=Textured())
+    moments = adam_init((gaussians, model.params))
+    for index in range(rounds):
+        assert model.num_bytes <= system.budget_bytes
+        sums = jnp.asarray(rng.exponential(size=num) * rng.integers(0, 2, num), jnp.float32)
+        state = GradientStatistics(sums, jnp.ones(num, jnp.int32))
+        change = upscale.apply(index + 1, rounds, model, moments, state)
+        model, moments = change.model, change.moments
+    assert 0.995 * system.budget_bytes <= model.num_bytes <= system.budget_bytes
+    if texture_cap > 2:
+        assert system.budget_bytes - model.num_bytes < 16 * (4 * 4 - 2 * 2), "less than what one texture would cost"
+
+
+def random_model(seed: int, num: int, num_live: int, opacities) -> Model:
+    rng = np.random.default_rng(seed)
+    gaussians = init_from_points(rng.normal(size=(num, 3)), np.full((num, 3), 0.5), seed=seed)
+    gaussians = dataclasses.replace(gaussians, logit_opacities=logit(jnp.asarray(opacities, jnp.float32)))
+    return Model(gaussians, num_live=jnp.asarray(num_live, jnp.int32))
+
+
+def now(iteration, num_iterations: int, times: Times, num_keys: int = 1) -> Now:
+    whole = lambda number: jnp.asarray(number, jnp.int32)  # noqa: E731
+    key, rate, scale = jax.random.split(jax.random.key(0), num_keys), jnp.float32(1e-4), jnp.float32(1.0)
+    return Now(key, whole(iteration), rate, whole(num_iterations), scale, times)
+
+
+@pytest.mark.parametrize("faint", [0.0, 0.3, 0.9])
+def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
+    """Row by row: those that stay, those that are doubled, and their number after every event."""
+    num, num_live, num_iterations = 100, 30, 100
+    event = FillingDensity(num, threshold=0.5)
+    times = event.times(num_iterations)
+    plan = jax.jit(lambda iteration, *seen: event.plan(now(iteration, num_iterations, times), *seen))
+    rng = np.random.default_rng(1)
+    due = [iteration for iteration in range(1, num_iterations) if times.is_due(iteration)]
+    assert len(due) == times.num_times == 4
+    for left, iteration in zip(range(len(due), 0, -1), due, strict=True):
+        opacities = np.where(rng.uniform(size=num) < faint, 1, 10) * rng.uniform(0.01, 0.04, num) + 0.01
+        opacities[0] = 0.9
+        model = random_model(iteration, num, num_live, opacities)
+        gradients = np.round(rng.exponential(size=num), 1).astype(np.float32)
+        edit, num_refused = plan(jnp.asarray(iteration, jnp.int32), model, jnp.asarray(gradients))
+        kept, doubled = (np.flatnonzero(mask) for mask in (edit.is_kept, edit.is_cloned | edit.is_split))
+        wanted = int(number_to_reach(jnp.asarray(num_live, jnp.int32), num, left))
+        opaque = np.flatnonzero((opacities >= 0.05) & (np.arange(num) < num_live))
+        assert set(opaque) <= set(kept) and kept.max() < num_live and int(num_refused) == 0
+        assert len(kept) == max(len(opaque), (wanted + 1) // 2)
+        spared, gone = np.setdiff1d(kept, opaque), np.setdiff1d(np.arange(num_live), kept)
+        assert not (len(spared) and len(gone)) or opacities[spared].min() >= opacities[gone].max()
+        assert set(doubled) <= set(kept)
+        rest = np.setdiff1d(kept, doubled)
+        assert not (len(rest) and len(doubled)) or gradients[doubled].min() >= gradients[rest].max()
+        num_live = len(kept) + len(doubled)
+        assert num_live == wanted
+    assert num_live == num
+
+
+@pytest.mark.parametrize("name, budget", [(name, budget) for name, some in BUDGETS.items() for budget in some])
+def test_a_trained_model_takes_its_budget_and_never_more(scene, name, budget):
+    system = smoke(name, memory_budget=budget)
+    result = a2tg.fit(scene, system, progress=False)
+    assert result.history.megabytes.max() <= system.memory_budget
+    assert 0.995 * system.budget_bytes <= result.model.num_bytes <= system.budget_bytes
+
+
+@pytest.mark.parametrize(
+    "num, budget, message",
+    [
+        (25, "6kB", r"takes 5,800 bytes, 96\.7% of the memory_budget of 6,000: there is no room for another Gaussian"),
+        (20, "6kB", r"takes 4,640 bytes, 77\.3% .*: raise stage1_iterations or initial_gaussians"),
+        (26, "6kB", r"takes 6,032 bytes, 100\.5% .*: compose the stages of Gaussians2dMcmc with System\.budget_cap"),
+    ],
+)
+def test_what_misses_its_budget_is_warned_of(num, budget, message):
+    model = random_model(0, num, num, np.full(num, 0.5)).live
+    with pytest.warns(UserWarning, match=message):
+        warn_of_budget(a2tg.Gaussians2dMcmc(memory_budget=budget), model)
+    warn_of_budget(a2tg.Gaussians2dMcmc(memory_budget=model.num_bytes / 1e6), model)
+    warn_of_budget(a2tg.Gaussians2dMcmc(), model)
+
+
+def test_the_summary_tells_budgets():
+    systems = {"a2tg": a2tg.A2tg(memory_budget="1.5MB"), "free": a2tg.Gaussians2dMcmc()}
+    measured = types.SimpleNamespace(num_bytes=1_499_000)
+    models = dict.fromkeys(("a2tg-gaussians", "a2tg-textures", "free-gaussians"), measured)
+    found = budget_lines(types.SimpleNamespace(plan=plan_run(systems), models=models))
+    assert found == ["a2tg-textures takes 1,499,000 bytes of its budget of 1,500,000 (99.93 %)"]
+
+
+@pytest.mark.parametrize(
+    "name, changes, message",
+    [
+        ("gaussians-2d-mcmc", {"memory_budget": "463B"}, "must be a number of MB"),
+        ("gaussians-2d-mcmc", {"memory_budget": "0.463kB"}, "has room for 1 Gaussians of 232 bytes, and there must be"),
+        ("bbsplat", {"memory_budget": "1kB"}, "has room for 0 Gaussians of 1,252 bytes"),
+        (
+            "textured-gaussians", {"memory_budget": "0.1MB", "initial_gaussians": 800},
+            "0.1 MB has room for 204 Gaussians of 488 bytes, fewer than .* lower initial_gaussians, which is 800",
+        ),
+        ("a2tg", {"memory_budget": 1.5, "texture": {"budget_mb": 1.5}}, "texture.budget_mb both say .* give one"),
+        ("a2tg", {"memory_budget": 1.5, "densify": {"is_enabled": False}}, "densify.is_enabled is off"),
+    ],
+)  # fmt: skip
+def test_budgets_that_cannot_be_kept_are_refused(name, changes, message):
+    with pytest.raises(ValueError, match=message):
+        smoke(name, **changes).check()
+
+
+@pytest.mark.parametrize(
+    "name, changes, message",
+    [
+        ("gaussians-2d", {"memory_budget": "1MB"}, "120 Gaussians that double at most in each of the 2 densifications"),
+        ("a2tg", {"memory_budget": "1MB", "stage1_iterations": 10}, "in 10 iterations there is no growth from 120"),
+    ],
+)
+def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name, changes, message):
+    system = smoke(name, **changes)
+    for start in (check_start, lambda *it: a2tg.fit(*it, progress=False)):
+        with pytest.raises(ValueError, match=f"{message}.* of memory_budget: raise stage1_iterations or initial_gau"):
+            start(scene, system)
+    check_start(scene, smoke(name, memory_budget="60kB"))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
+def test_presets_reach_ordinary_budgets(scene, name, preset):
+    """From 1,000 points, fewer than most scenes have."""
+    scene = dataclasses.replace(scene, points=np.zeros((1_000, 3)))
+    for budget in ("1.5MB", "20MB", "80MB"):
+        system = dataclasses.replace(type(a2tg.find_system(name)).preset(preset), memory_budget=budget)
+        system.check()
+        check_start(scene, system)
+
+
+def test_the_command_line_tells_budgets(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    flags = [
+        "--system",
+        "gaussians-2d",
+        "--preset",
+        "smoke",
+        "--stage1-iterations",
+        "20",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    assert cli.main(["train", "synthetic", *flags, "--memory-budget", "300MB"]) == 2
+    assert "memory_budget: raise stage1_iterations" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert cli.main(["train", "synthetic", *flags, "--memory-budget", "lots"]) == 2
+    assert "memory_budget must be a number of MB" in capsys.readouterr().err
