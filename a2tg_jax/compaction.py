@@ -159,7 +159,8 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
     """The smallest file that loses so much at most by the first measure, found by greed (host).
 
     From the finest choices on, the step that saves most bytes for what it loses is taken, as long as the losses of all
-    groups together, as measured apart, stay within; then the last steps are taken back until the file itself does.
+    groups together, as measured apart, stay within; then the last steps are taken back until the file itself does, and
+    at last single steps are tried that may still be there.
 
     Args:
       model: the model.
@@ -178,8 +179,27 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
     for chosen in [*reversed(_descent(by_size, max_loss)), finest]:
         found = try_choices(model, finest_choices().keeping(chosen), losses)
         if found.losses[0] <= max_loss:
-            return found
+            return _with_single_steps(model, losses, max_loss, by_size, found)
     raise ValueError(f"max_loss must be {found.losses[0]:.4f} dB or more: the finest choices lose that; got {max_loss}")
+
+
+def _with_single_steps(
+    model: Model, losses: Sequence[Loss], max_loss: float, by_size: Mapping[str, Sequence[Trial]], found: Trial
+) -> Trial:
+    """The file with each group a step smaller, where it loses no more than it may: those that save most first."""
+
+    def next_step(group: str) -> tuple[int, Precision]:
+        """What the next smaller step of a group saves, and its precision; nothing where there is none."""
+        own = by_size[group]
+        at = [trial.precision for trial in own].index(getattr(found.choices, group))
+        return own[at].num_bytes - own[max(at - 1, 0)].num_bytes, own[max(at - 1, 0)].precision
+
+    for group in sorted(by_size, key=lambda group: -next_step(group)[0]):
+        saved, precision = next_step(group)
+        if saved:
+            tried = try_choices(model, found.choices.keeping({group: precision}), losses)
+            found = tried if tried.losses[0] <= max_loss and tried.num_bytes < found.num_bytes else found
+    return found
 
 
 def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[dict[str, Precision]]:

@@ -173,7 +173,8 @@ def _panels(found: Sequence[tuple[tables.Result, dict]]) -> list[tuple[str, dict
             (best["bytes"] / 1e6, figures["psnr"][0] - best["test_loss"])
             for best in {best["bytes"]: best for best in figures["best"].values()}.values()
         ]
-        label = f"{result.label}, {result.run.cell.gaussians:,}"
+        cell = result.run.cell
+        label = f"{result.label}, " + (f"{cell.gaussians:,}" if cell.budget is None else f"{cell.budget:g} MB")
         panels.setdefault(result.run.cell.scene.label, {})[label] = curve
     return [(scene, curves, "MB on disk", "test PSNR, dB") for scene, curves in panels.items()]
 

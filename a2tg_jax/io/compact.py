@@ -43,20 +43,23 @@ ORIGIN_DTYPES = {
 
 @dataclasses.dataclass(frozen=True)
 class CompactChoices:
-    """How finely numbers are kept: in 1 to 16 bits, evenly from the smallest to the largest, or as floats."""
+    """How finely numbers are kept: in 1 to 16 bits, evenly from the smallest to the largest, or as floats.
+
+    The defaults cost a few hundredths of a decibel.
+    """
 
     means: Precision = 14
     """Each axis; as bits, in steps that grow with the distance from the middle."""
     log_scales: Precision = 8
     quats: Precision = 8
     """Each of three numbers."""
-    opacities: Precision = 8
+    opacities: Precision = 6
     """As bits, of the opacities; as floats, of their logits."""
     sh_0: Precision = 8
     """Spherical harmonics of degree 0."""
-    sh_rest: Precision = 7
+    sh_rest: Precision = 5
     """Of the higher degrees, each with ends of its own."""
-    texels: Precision = 6
+    texels: Precision = 7
     """RGB and alpha, each with ends of its own."""
     coder: Choice = "smallest"
     """lzma, of Python's own library; zstd; webp, as lossless images; none; or for each part the smallest of them."""
