@@ -25,6 +25,7 @@ from a2tg_jax.io.quantise import Precision, check_precision, with_w
 from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
 from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
 from a2tg_jax.sh_bands import MAX_DEGREE
 from a2tg_jax.texture import MAX_SIDE
 
@@ -197,14 +198,7 @@ def _decoded(data: bytes) -> Model:
     check_kind(appearance)
     reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
     rows = _rows_of(reader, header, choices)
-    origin = None
-    if "origin" in header:
-        num = len(header["origin"]["names"])
-        shapes = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2), "is_test": (num,)}
-        shapes |= {"scale": (), "rotation": (3, 3), "translation": (3,)}
-        arrays = {name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()}
-        arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
-        origin = origin_of(header["origin"], arrays)
+    origin = _origin_of(reader, header["origin"]) if "origin" in header else None
     reader.end()
     return model_of(rows, header["base_degree"], appearance, origin)
 
@@ -257,6 +251,16 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices)
         sizes, texels = _textures_of(reader, header["sizes"], num, choices)
     logits = _logits(opacities) if isinstance(choices.opacities, int) else opacities
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels)
+
+
+def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:
+    """Where the model was trained, as it was."""
+    num = len(data["names"])
+    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
+    shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+    arrays = {name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()}
+    arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
+    return origin_of(data, arrays)
 
 
 def _textures_of(reader: Reader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
