@@ -166,17 +166,17 @@ def _choices(found: Sequence[tuple[tables.Result, dict]]) -> str:
 
 
 def _panels(found: Sequence[tuple[tables.Result, dict]]) -> list[tuple[str, dict[str, list[plots.Point]], str, str]]:
-    """PSNR on test views against MB on disk, a chart for each scene and a curve for each model."""
+    """PSNR on test views against kB on disk, a chart for each scene and a curve for each model."""
     panels: dict[str, dict[str, list[plots.Point]]] = {}
     for result, figures in found:
         curve = [
-            (best["bytes"] / 1e6, figures["psnr"][0] - best["test_loss"])
+            (best["bytes"] / 1e3, figures["psnr"][0] - best["test_loss"])
             for best in {best["bytes"]: best for best in figures["best"].values()}.values()
         ]
         cell = result.run.cell
         label = f"{result.label}, " + (f"{cell.gaussians:,}" if cell.budget is None else f"{cell.budget:g} MB")
         panels.setdefault(result.run.cell.scene.label, {})[label] = curve
-    return [(scene, curves, "MB on disk", "test PSNR, dB") for scene, curves in panels.items()]
+    return [(scene, curves, "kB on disk", "test PSNR, dB") for scene, curves in panels.items()]
 
 
 EXPERIMENT = Experiment("on_disk", ("on_disk",), present)
