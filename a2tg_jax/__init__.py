@@ -14,6 +14,10 @@ from a2tg_jax.appearance import TexturedRule as TexturedRule
 from a2tg_jax.appearance import TextureOptions as TextureOptions
 from a2tg_jax.cameras import Camera as Camera
 from a2tg_jax.cameras import resize_camera as resize_camera
+from a2tg_jax.compaction import loss_beside_renders as loss_beside_renders
+from a2tg_jax.compaction import loss_on_views as loss_on_views
+from a2tg_jax.compaction import measure_choices as measure_choices
+from a2tg_jax.compaction import smallest_within as smallest_within
 from a2tg_jax.cores import set_num_threads as set_num_threads
 from a2tg_jax.data import Scene as Scene
 from a2tg_jax.data import View as View
@@ -38,6 +42,9 @@ from a2tg_jax.gaussians import init_from_points as init_from_points
 from a2tg_jax.gradient_statistics import GradientStatistics as GradientStatistics
 from a2tg_jax.gradients import ViewGradients as ViewGradients
 from a2tg_jax.gradients import view_gradients as view_gradients
+from a2tg_jax.io.compact import CompactChoices as CompactChoices
+from a2tg_jax.io.compact import load_compact as load_compact
+from a2tg_jax.io.compact import save_compact as save_compact
 from a2tg_jax.io.model import load_model as load_model
 from a2tg_jax.io.model import save_model as save_model
 from a2tg_jax.io.ply import load_ply as load_ply

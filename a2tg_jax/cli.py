@@ -1,4 +1,4 @@
-"""The command line `a2tg`: demo, train, eval, render, info, sfm."""
+"""The command line `a2tg`: demo, train, eval, render, compress, info, sfm."""
 
 import dataclasses
 import inspect
@@ -16,6 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.data import Scene, run_sfm
 from a2tg_jax.metrics import load_lpips
+from a2tg_jax.results.compress import compress, compression_text
 from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
@@ -57,6 +58,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg train scene/ --out runs/scene   train a scene, evaluate, write a report
   a2tg eval runs/scene                 measure a run again
   a2tg render runs/scene               frames and a video of a flight, or the test views
+  a2tg compress runs/scene             a small file of the model that it left
   a2tg info runs/scene                 what a run folder holds
 
 a2tg COMMAND --help explains a command, a2tg train --system NAME --help the options of a system; a2tg --version tells
@@ -210,6 +212,31 @@ class Render:
 
 
 @dataclasses.dataclass(frozen=True)
+class Compress:
+    """Write the smallest file of a model whose PSNR on the training views is about that of the model.
+
+    A table tells what each choice of bits costs. Where the photographs are not there, losses are those of a model of
+    30 dB, as its renders tell them.
+
+    Examples:
+      a2tg compress runs/fox
+      a2tg compress scene.npz --out scene.a2tgz --max-loss 0.02
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    """Run folder, whose last model is taken, or a model, *.npz."""
+    out: Path | None = None
+    """The file (default: beside the model, NAME.a2tgz)."""
+    max_loss: float = 0.05
+    """How many dB of PSNR may be lost."""
+
+    def run(self) -> None:
+        result = compress(self.source, self.out, max_loss=self.max_loss)
+        print(compression_text(result))
+        print(f"file: {result.path}")
+
+
+@dataclasses.dataclass(frozen=True)
 class Info:
     """Print what a run folder holds: scene, progress of each stage, models, metrics."""
 
@@ -239,8 +266,10 @@ class Sfm:
         print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
 
 
-Command = Demo | Train | Eval | Render | Info | Sfm
-COMMANDS: dict[str, type] = {"demo": Demo, "train": Train, "eval": Eval, "render": Render, "info": Info, "sfm": Sfm}
+Command = Demo | Train | Eval | Render | Compress | Info | Sfm
+COMMANDS: dict[str, type] = {
+    "demo": Demo, "train": Train, "eval": Eval, "render": Render, "compress": Compress, "info": Info, "sfm": Sfm,
+}  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:

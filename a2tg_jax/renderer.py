@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -49,6 +49,7 @@ class Renderer:
         rule: AppearanceRule | None = None,
         *,
         cameras: Iterable[Camera] = (),
+        capacities: Mapping[Size, int] | None = None,
         background: Any = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
         has_geometry: bool = True,
@@ -59,6 +60,7 @@ class Renderer:
           model: a model; or Gaussians, of which all rows show.
           rule: what the Gaussians show; None is plain 2DGS. A model says it itself.
           cameras: room is made for these at once; others may come.
+          capacities: room to begin with, such as that of a renderer of a model like this one.
           background: [3] colour; None is the model's own, or black.
           settings: all but the capacity, which is found.
           has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
@@ -78,7 +80,7 @@ class Renderer:
         self._settings, self._has_geometry = settings, has_geometry
         own = [] if model.origin is None else model.origin.cameras
         self._known = own[:: -(-len(own) // PLANNED_CAMERAS) or 1]
-        self.capacities: dict[Size, int] = {}
+        self.capacities: dict[Size, int] = dict(capacities or {})
         """Room for (splat, tile) pairs by image size, (width, height)."""
         self._plan(list(cameras))
 

@@ -13,7 +13,11 @@ import pytest
 from PIL import Image
 
 from a2tg_jax import cli, startup
+from a2tg_jax.compaction import measure_choices
+from a2tg_jax.io.compact import load_compact
+from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import load_ply
+from a2tg_jax.results import compress as compress_module
 from a2tg_jax.results import train_run as train_run_module
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.record import SceneSource, read_record
@@ -399,6 +403,27 @@ def test_render(tiny_run, tmp_path, monkeypatch, capsys):
     assert len(list((tmp_path / "test").glob("*.png"))) == len(list(run.test.glob("*.png")))
     capsys.readouterr()
     assert "the run has the models a2tg-gaussians, " in fails(capsys, "render", run.path, "--model", "stage2")
+
+
+def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
+    """By the run's photographs; and without them, by renders."""
+    ladder = {"means": (8, 14), "sh_rest": (3, 8)}
+    monkeypatch.setattr(compress_module, "measure_choices", lambda *a: measure_choices(*a, ladder))
+    run, *_ = tiny_run
+    assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
+    text = capsys.readouterr().out
+    path = run.model("a2tg-textures").with_suffix(".a2tgz")
+    assert "dB lost, training views  dB lost, test views" in text and f"file: {path}" in text
+    assert load_compact(path).num_bytes == load_model(run.model("a2tg-textures")).num_bytes > 2 * path.stat().st_size
+    assert path.relative_to(run.path).as_posix() in run.written()
+
+    def gone(self):
+        raise FileNotFoundError("no photographs")
+
+    monkeypatch.setattr(SceneSource, "load", gone)
+    out = tmp_path / "other.a2tgz"
+    assert cli.main(["compress", str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
+    assert "dB lost, if 30 dB" in capsys.readouterr().out and load_compact(out).num == 60
 
 
 def test_render_without_ffmpeg_says_so(tiny_run, tmp_path, monkeypatch, capsys):

@@ -30,7 +30,7 @@ LAYERS = (
     {"adapt", "mcmc", "densify", "view_dependence"},
     {"splitting"},
     {"training"},
-    {"systems", "evaluation"},
+    {"systems", "evaluation", "compaction"},
     {"results"},
     {"cli"},
 )

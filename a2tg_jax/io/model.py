@@ -48,10 +48,10 @@ def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] 
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
     shown = model.appearance.arrays(model.params, model.layout)
     arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}
-    described = {**(header or {}), "appearance": _appearance_to_dict(model.appearance)}
+    described = {**(header or {}), "appearance": appearance_to_dict(model.appearance)}
     if model.origin is not None:
-        described["origin"] = {"names": list(model.origin.names), "background": list(model.origin.background)}
-        arrays |= {ORIGIN + name: array for name, array in _origin_arrays(model.origin).items()}
+        described["origin"] = origin_to_dict(model.origin)
+        arrays |= {ORIGIN + name: array for name, array in origin_arrays(model.origin).items()}
     write_archive(path, described, arrays, format=FORMAT)
 
 
@@ -85,17 +85,18 @@ def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appea
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
     if "appearance" in header:
-        appearance = _appearance_from_dict(header["appearance"], appearances)
+        appearance = appearance_from_dict(header["appearance"], appearances)
     else:
         shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
         appearance = Textured() if shown else Plain()
     params, layout = appearance.from_arrays(shown)
-    _check_rows(appearance, params, layout, gaussians.num)
-    origin = _origin_of(header["origin"], arrays) if "origin" in header else None
+    check_rows(appearance, params, layout, gaussians.num)
+    of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
+    origin = origin_of(header["origin"], of_origin) if "origin" in header else None
     return Model(gaussians, params, layout, appearance=appearance, origin=origin)
 
 
-def _check_rows(appearance: Appearance, params: Any, layout: Any, num: int) -> None:
+def check_rows(appearance: Appearance, params: Any, layout: Any, num: int) -> None:
     """Raises ValueError unless floats are shown, by as many rows as there are Gaussians."""
     for leaf in jax.tree.leaves(params):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -109,13 +110,13 @@ def _check_rows(appearance: Appearance, params: Any, layout: Any, num: int) -> N
 # Appearances
 
 
-def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
+def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     """Class and options; of an appearance that holds others, theirs too."""
     kind = type(appearance)
     held = _held_appearances(appearance)
     described: dict[str, Any] = {"module": kind.__module__, "name": kind.__qualname__}
     if held:
-        described["held"] = {name: _appearance_to_dict(inner) for name, inner in held.items()}
+        described["held"] = {name: appearance_to_dict(inner) for name, inner in held.items()}
     options = {name: value for name, value in config_to_dict(appearance).items() if name not in held}
     try:
         back = config_from_dict(kind, json.loads(json.dumps(options, allow_nan=False)), given=held)
@@ -131,9 +132,10 @@ def _held_appearances(appearance: Appearance) -> dict[str, Appearance]:
     return {name: value for name, value in values.items() if isinstance(value, Appearance)}
 
 
-def _appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
+def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
+    """The appearance that `appearance_to_dict` was given. ValueError: its class is not known here."""
     kind = _known_class(data["module"], data["name"], appearances)
-    held = {name: _appearance_from_dict(inner, appearances) for name, inner in data.get("held", {}).items()}
+    held = {name: appearance_from_dict(inner, appearances) for name, inner in data.get("held", {}).items()}
     return config_from_dict(kind, data["options"], f"options of {kind.__name__}", given=held)
 
 
@@ -156,7 +158,13 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
 # Origins
 
 
-def _origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
+def origin_to_dict(origin: Origin) -> dict[str, Any]:
+    """What of an origin is not numbers."""
+    return {"names": list(origin.names), "background": list(origin.background)}
+
+
+def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
+    """The numbers of an origin."""
     world = origin.transform
     return {
         "viewmats": origin.viewmats,
@@ -169,14 +177,15 @@ def _origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
     }
 
 
-def _origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
+def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
+    """The origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape is wrong."""
     names, (red, green, blue) = data["names"], data["background"]
     num = len(names)
     shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
     shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
     for name, shape in shapes.items():
-        check_shape(ORIGIN + name, arrays[ORIGIN + name], shape)
-    viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[ORIGIN + name] for name in shapes)
+        check_shape(ORIGIN + name, arrays[name], shape)
+    viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[name] for name in shapes)
     return Origin(
         viewmats=viewmats,
         Ks=Ks,

@@ -139,7 +139,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
     names, *columns = zip(titles, *rows, strict=True)
     lines: list[str] = []
     for block in _blocks(names, columns, width or shutil.get_terminal_size().columns):
-        lines += ["", *_aligned([names, *block])] if lines else _aligned([names, *block])
+        lines += ["", *aligned([names, *block])] if lines else aligned([names, *block])
     if result.lpips_network:
         lines.append(f"LPIPS with {result.lpips_network}")
     lines += budget_lines(result)
@@ -162,13 +162,13 @@ def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: i
     """Columns in groups, each of which fits beside the names; one column at least."""
     blocks: list[list[tuple[str, ...]]] = [[]]
     for column in columns:
-        if blocks[-1] and max(map(len, _aligned([names, *blocks[-1], column]))) > width:
+        if blocks[-1] and max(map(len, aligned([names, *blocks[-1], column]))) > width:
             blocks.append([])
         blocks[-1].append(column)
     return blocks
 
 
-def _aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
+def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
     """The lines of a table: the first column to the left, the others to the right; no line without a figure."""
     name_width, *widths = (max(map(len, column)) for column in columns)
     lines = []

@@ -1,0 +1,280 @@
+"""Compact scene files, *.a2tgz: a model in few bytes, its numbers rounded to as many bits as are chosen.
+
+docs/formats.md describes the file. The rows of a model come back in another order, that of a Z curve through the means,
+with quaternions of unit length; what it shows is the same up to rounding.
+"""
+
+import dataclasses
+import json
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from a2tg_jax.appearance import Banded
+from a2tg_jax.gaussians import check_gaussians
+from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.coders import Choice, decode, encode
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.model import appearance_from_dict, appearance_to_dict, origin_arrays, origin_of, origin_to_dict
+from a2tg_jax.io.quantise import Precision, check_precision, with_w
+from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
+from a2tg_jax.io.streams import Layout, Reader, Writer
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.sh_bands import MAX_DEGREE
+from a2tg_jax.texture import MAX_SIDE
+
+MAGIC = b"a2tgz\r\n\x1a"
+VERSION = 1
+HEAD = struct.Struct("<8sHIII")
+"""Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
+LARGEST_RATIO = 64
+FREE_ROOM = 1 << 20
+"""What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
+LEAST_OPACITY = 1e-7
+ORIGIN_DTYPES = {
+    "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class CompactChoices:
+    """How finely numbers are kept: in 1 to 16 bits, evenly from the smallest to the largest, or as floats.
+
+    The defaults cost a few hundredths of a decibel.
+    """
+
+    means: Precision = 14
+    """Each axis; as bits, in steps that grow with the distance from the middle."""
+    log_scales: Precision = 8
+    quats: Precision = 8
+    """Each of three numbers."""
+    opacities: Precision = 6
+    """As bits, of the opacities; as floats, of their logits."""
+    sh_0: Precision = 8
+    """Spherical harmonics of degree 0."""
+    sh_rest: Precision = 5
+    """Of the higher degrees, each with ends of its own."""
+    texels: Precision = 7
+    """RGB and alpha, each with ends of its own."""
+    coder: Choice = "smallest"
+    """lzma, of Python's own library; zstd; webp, as lossless images; none; or for each part the smallest of them."""
+
+    def keeping(self, others: Mapping[str, Any]) -> Self:
+        """The choices with others, by name."""
+        return dataclasses.replace(self, **dict(others))  # type: ignore[arg-type]
+
+    def check(self) -> Self:
+        """Raises ValueError, naming the choice, if one cannot be."""
+        for field in dataclasses.fields(self):
+            if field.name != "coder":
+                check_precision(f"choices.{field.name}", getattr(self, field.name))
+        config_from_dict(type(self), config_to_dict(self), "choices")
+        return self
+
+
+GROUPS = tuple(field.name for field in dataclasses.fields(CompactChoices) if field.name != "coder")
+
+
+DEFAULT_CHOICES = CompactChoices()
+
+
+def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoices = DEFAULT_CHOICES) -> None:
+    """Writes the rows of a model that exist, with its appearance and its origin, in few bytes.
+
+    Args:
+      path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
+      model: one that shows Plain, Textured, or Banded of these.
+      choices: how finely its numbers are kept.
+
+    Raises:
+      ValueError: if the model shows anything else, has a number that is not finite, or a choice cannot be.
+    """
+    data = encode_model(model, choices)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def load_compact(path: str | os.PathLike) -> Model:
+    """The model of a compact file, float32, its rows in the order of the file.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not a compact scene, is damaged, or is of another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such compact scene")
+    return decode_model(path.read_bytes(), str(path))
+
+
+def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> bytes:
+    """The bytes of `save_compact`. Raises as it does."""
+    choices.check()
+    check_gaussians(model.gaussians, "model.gaussians")
+    check_kind(model.appearance)
+    data, num_unpacked = _encoded(model.live, choices)
+    if num_unpacked > _room(data):  # So alike are its numbers that the file would be taken for a bomb.
+        data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"))
+    return data
+
+
+def decode_model(data: bytes, where: str = "the compact scene") -> Model:
+    """The model of the bytes of a file; errors call it `where`. Raises as `load_compact` does."""
+    try:
+        return _decoded(data)
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{where}: the compact scene is damaged or of another version ({error!r})") from error
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def bytes_by_part(data: bytes) -> dict[str, int]:
+    """How many bytes each part of a whole file takes, the header included."""
+    header, body = _unframed(data)
+    return {"header": len(data) - len(body), **header["lengths"]}
+
+
+# From a model to bytes
+
+
+def _encoded(model: Model, choices: CompactChoices) -> tuple[bytes, int]:
+    """The file, and how many bytes it unpacks to."""
+    writer, rows = Writer(choices.coder), rows_of(model)
+    rows = ordered(rows, writer.means("means", rows.means.T, choices.means))
+    writer.numbers("log_scales", rows.log_scales.T, choices.log_scales)
+    writer.numbers("quats", rows.quats[:, 1:].T, choices.quats)
+    is_bits = isinstance(choices.opacities, int)
+    writer.numbers("opacities", _opacities(rows.logit_opacities, is_bits)[None], choices.opacities)
+    degrees = np.unique(rows.degrees)
+    writer.indices("degrees", np.searchsorted(degrees, rows.degrees), len(degrees))
+    for degree, band in enumerate(rows.bands):
+        precision = choices.sh_0 if degree == 0 else choices.sh_rest
+        writer.numbers(f"sh_{degree}", band.transpose(2, 1, 0).reshape(3, -1), precision, is_color=True)
+    header: dict[str, Any] = {
+        "num": len(rows.means),
+        "base_degree": model.gaussians.sh_degree,
+        "degrees": degrees.tolist(),
+        "choices": config_to_dict(choices),
+        "appearance": appearance_to_dict(model.appearance),
+    }
+    if rows.sizes is not None and rows.texels is not None:
+        sizes, indices = np.unique(rows.sizes, axis=0, return_inverse=True)
+        header["sizes"] = sizes.tolist()
+        writer.indices("sizes", indices.reshape(-1), len(sizes))
+        writer.numbers("texel_colors", rows.texels[:, :3].T, choices.texels, is_color=True)
+        writer.numbers("texel_alphas", rows.texels[:, 3:].T, choices.texels)
+    if model.origin is not None:
+        header["origin"] = origin_to_dict(model.origin)
+        for name, array in origin_arrays(model.origin).items():
+            writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
+    header |= dataclasses.asdict(writer.layout)
+    return _framed(header, writer.body), writer.num_unpacked
+
+
+def _framed(header: Mapping[str, Any], body: bytes) -> bytes:
+    text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
+    coded = encode("zstd", np.frombuffer(text, np.uint8)[None])
+    rest = coded + body
+    return HEAD.pack(MAGIC, VERSION, len(coded), len(text), zlib.crc32(rest)) + rest
+
+
+def _opacities(logits: np.ndarray, is_bits: bool) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80))) if is_bits else logits
+
+
+# From bytes to a model
+
+
+def _decoded(data: bytes) -> Model:
+    header, body = _unframed(data)
+    choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
+    appearance = appearance_from_dict(header["appearance"], ())
+    check_kind(appearance)
+    reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
+    rows = _rows_of(reader, header, choices)
+    origin = _origin_of(reader, header["origin"]) if "origin" in header else None
+    reader.end()
+    return model_of(rows, header["base_degree"], appearance, origin)
+
+
+def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The header and the body of a whole file."""
+    if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
+        raise ValueError("is not a compact scene of a2tg-jax")
+    _, version, num_coded, num_text, checksum = HEAD.unpack_from(data)
+    if version != VERSION:
+        raise ValueError(f"is a compact scene of version {version}; this program reads version {VERSION}")
+    rest = data[HEAD.size :]
+    if zlib.crc32(rest) != checksum:
+        raise ValueError("is damaged or cut off")
+    if num_coded > len(rest) or num_text > _room(data):
+        raise ValueError(f"announces a header of {num_coded} bytes, {num_text} unpacked")
+    header = json.loads(decode("zstd", rest[:num_coded], 1, num_text).tobytes())
+    if not isinstance(header, dict):
+        raise ValueError("has no header")
+    return header, rest[num_coded:]
+
+
+def _room(data: bytes) -> int:
+    """How many bytes a file may unpack to."""
+    return FREE_ROOM + LARGEST_RATIO * len(data)
+
+
+def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices) -> Rows:
+    """The tables of a file, of no more rows than it can hold."""
+    num, base, table = header["num"], header["base_degree"], header["degrees"]
+    if type(num) is not int or num < 0 or type(base) is not int or not 0 <= base <= MAX_DEGREE:
+        raise ValueError(f"must be of a number of rows, and of a base degree in 0..3; got {num!r}, {base!r}")
+    means = reader.means("means", num, choices.means).T
+    log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
+    quats = with_w(reader.numbers("quats", 3, num, choices.quats))
+    opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
+    is_banded = header["appearance"]["name"] == Banded.__name__
+    highest = MAX_DEGREE if is_banded else base
+    if not set(table) <= set(range(base, highest + 1)):
+        raise ValueError(f"degrees must lie in {base}..{highest}; got {table}")
+    degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
+    bands = []
+    for degree in range(highest + 1):
+        count = int(np.count_nonzero(degrees >= degree))
+        precision = choices.sh_0 if degree == 0 else choices.sh_rest
+        columns = reader.numbers(f"sh_{degree}", 3, (2 * degree + 1) * count, precision, is_color=True)
+        bands.append(columns.reshape(3, 2 * degree + 1, count).transpose(2, 1, 0))
+    sizes, texels = None, None
+    if "sizes" in header:
+        sizes, texels = _textures_of(reader, header["sizes"], num, choices)
+    logits = _logits(opacities) if isinstance(choices.opacities, int) else opacities
+    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels)
+
+
+def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:
+    """Where the model was trained, as it was."""
+    num = len(data["names"])
+    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
+    shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+    arrays = {name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()}
+    arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
+    return origin_of(data, arrays)
+
+
+def _textures_of(reader: Reader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes [N, 2] and texels [T, 4]."""
+    if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in table for side in size):
+        raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {table}")
+    if any(len(size) != 2 for size in table):
+        raise ValueError(f"texture sides must be pairs; got {table}")
+    sizes = np.asarray(table, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(table))]
+    count = int(sizes.prod(axis=1).sum())
+    colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
+    return sizes, np.concatenate([colors, reader.numbers("texel_alphas", 1, count, choices.texels)]).T
+
+
+def _logits(opacities: np.ndarray) -> np.ndarray:
+    inside = np.clip(opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
+    return np.log(inside) - np.log1p(-inside)

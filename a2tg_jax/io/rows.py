@@ -1,0 +1,142 @@
+"""A model as plain tables of numbers, in the order of a Z curve, and the model again.
+
+Splats that are near each other stand near each other, so that what they show is alike. Each is turned by half about one
+of its own axes where that makes its rotation smaller, and its texture is mirrored along: it looks the same.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.appearance import Appearance, Banded, Plain, Textured
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.io.quantise import nearest_half_turn
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.sh import NUM_BASES
+
+U_MIRRORED, V_MIRRORED = (2, 3), (1, 3)
+"""The axes of half-turns that mirror a texture's columns, and its rows."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """N splats; T texels in all. On the host."""
+
+    means: np.ndarray
+    """[N, 3]."""
+    quats: np.ndarray
+    """[N, 4] unit, w largest."""
+    log_scales: np.ndarray
+    """[N, 2]."""
+    logit_opacities: np.ndarray
+    """[N]."""
+    degrees: np.ndarray
+    """[N] of their spherical harmonics."""
+    bands: tuple[np.ndarray, ...]
+    """Band l is [M, 2l + 1, 3], of the M splats of degree l or more, in their order."""
+    sizes: np.ndarray | None
+    """[N, 2] of their textures, (Tv, Tu); None without textures."""
+    texels: np.ndarray | None
+    """[T, 4], one texture after the other, each row by row."""
+
+
+def check_kind(appearance: Appearance) -> None:
+    """Raises ValueError unless a compact file can hold what splats show."""
+    if type(_inner(appearance)) not in (Plain, Textured) or type(appearance) not in (Plain, Textured, Banded):
+        raise ValueError(
+            f"model shows {type(_inner(appearance)).__name__}: a compact file holds Plain, Textured and Banded of "
+            "these; save_model keeps any model"
+        )
+
+
+def _inner(appearance: Appearance) -> Appearance:
+    return appearance.inner if isinstance(appearance, Banded) else appearance
+
+
+def rows_of(model: Model) -> Rows:
+    """The tables of a model of which all rows exist, in the model's order; finite, or ValueError names the field."""
+    gaussians = model.gaussians
+    fields = {field.name: np.asarray(getattr(gaussians, field.name)) for field in dataclasses.fields(gaussians)}
+    shown = model.appearance.arrays(model.params, model.layout)
+    for name, values in (*fields.items(), *shown.items()):
+        if not np.isfinite(values).all():
+            raise ValueError(f"model.{name} must be finite; some are NaN or infinite")
+    sh = fields["sh"]
+    bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
+    degrees = np.full(gaussians.num, gaussians.sh_degree)
+    if isinstance(model.appearance, Banded):
+        degrees = np.asarray(shown["degrees"], np.int64)
+        bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
+        shown = {name.removeprefix("inner."): array for name, array in shown.items()}
+    return Rows(
+        fields["means"], fields["quats"], fields["log_scales"], fields["logit_opacities"], degrees, tuple(bands),
+        shown.get("sizes"), shown.get("texels"),
+    )  # fmt: skip
+
+
+def ordered(rows: Rows, order: np.ndarray) -> Rows:
+    """The splats order[0], order[1], …, turned by half where that makes their rotations smaller."""
+    quats, axis = nearest_half_turn(rows.quats[order])
+    return Rows(
+        means=rows.means[order],
+        quats=quats,
+        log_scales=rows.log_scales[order],
+        logit_opacities=rows.logit_opacities[order],
+        degrees=rows.degrees[order],
+        bands=tuple(band[_owned(rows.degrees, order, degree)] for degree, band in enumerate(rows.bands)),
+        sizes=None if rows.sizes is None else rows.sizes[order],
+        texels=None if rows.texels is None or rows.sizes is None else rows.texels[_texels(rows.sizes, order, axis)],
+    )
+
+
+def _owned(degrees: np.ndarray, order: np.ndarray, degree: int) -> np.ndarray:
+    """The rows of a band, in the order of their splats."""
+    places = np.cumsum(degrees >= degree) - 1
+    return places[order[degrees[order] >= degree]]
+
+
+def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Where the texels of splats in another order, and mirrored, stood."""
+    areas = sizes.prod(axis=1)
+    starts = (np.cumsum(areas) - areas)[order]
+    areas = areas[order]
+    within = np.arange(areas.sum()) - np.repeat(np.cumsum(areas) - areas, areas)
+    heights, widths = (np.repeat(side, areas) for side in sizes[order].T)
+    row, column = np.divmod(within, np.maximum(widths, 1))
+    row = np.where(np.repeat(np.isin(axis, V_MIRRORED), areas), heights - 1 - row, row)
+    column = np.where(np.repeat(np.isin(axis, U_MIRRORED), areas), widths - 1 - column, column)
+    return np.repeat(starts, areas) + row * widths + column
+
+
+def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None) -> Model:
+    """The model of tables, float32.
+
+    Args:
+      rows: the tables.
+      base_degree: of the spherical harmonics that all Gaussians have.
+      appearance: what they show.
+      origin: where it was trained.
+
+    Raises:
+      ValueError: if tables disagree.
+    """
+    as_float = lambda x: jnp.asarray(np.asarray(x, np.float32))  # noqa: E731
+    gaussians = Gaussians(
+        means=as_float(rows.means),
+        quats=as_float(rows.quats),
+        log_scales=as_float(rows.log_scales),
+        logit_opacities=as_float(rows.logit_opacities),
+        sh=as_float(np.concatenate(rows.bands[: base_degree + 1], axis=1)),
+    )
+    arrays: dict[str, np.ndarray] = {}
+    if rows.sizes is not None and rows.texels is not None:
+        arrays = {"sizes": rows.sizes, "texels": np.asarray(rows.texels, np.float32)}
+    if isinstance(appearance, Banded):
+        arrays = {f"inner.{name}": array for name, array in arrays.items()}
+        arrays |= {"degrees": rows.degrees, "base_degree": np.asarray(base_degree)}
+        for degree, band in enumerate(rows.bands[base_degree + 1 :], base_degree + 1):
+            arrays[f"band_{degree}"] = np.asarray(band, np.float32)
+    params, layout = appearance.from_arrays(arrays)
+    return Model(gaussians, params, layout, appearance=appearance, origin=origin)

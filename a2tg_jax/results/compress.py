@@ -1,0 +1,127 @@
+"""A compact file of a run's model, or of any: the smallest that loses little, and a table of what was tried."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from a2tg_jax.compaction import (
+    ASSUMED_PSNR,
+    Loss,
+    Trial,
+    loss_beside_renders,
+    loss_on_views,
+    measure_choices,
+    smallest_within,
+)
+from a2tg_jax.data import Scene
+from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.compact import GROUPS, encode_model
+from a2tg_jax.io.model import load_model
+from a2tg_jax.io.rows import check_kind
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings
+from a2tg_jax.results.evaluate_run import settings_of
+from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.record import read_record
+from a2tg_jax.results.summary import aligned
+
+SUFFIX = ".a2tgz"
+MOST_VIEWS = 16
+"""So many training views are measured, evenly chosen."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Compressed:
+    """A file that was written, and how it was chosen."""
+
+    path: Path
+    model: Model
+    """What it was made from."""
+    trials: Sequence[Trial]
+    """Each group at each of its steps."""
+    chosen: Trial
+    measures: tuple[str, ...]
+    """What the losses of the trials are."""
+
+
+def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -> Compressed:
+    """Writes the smallest compact file of a model that loses so much at most.
+
+    Losses are those of PSNR on the training views of a run. Where the photographs are not there, or a model's file is
+    given, they are guessed from renders, for a model that would have `ASSUMED_PSNR`.
+
+    Args:
+      source: a run folder, of which the last model is taken; or a model, *.npz.
+      out: the file; None is beside the model.
+      max_loss: in dB.
+
+    Raises:
+      FileNotFoundError: if there is no such model.
+      ValueError: if a compact file cannot hold it, or nothing loses so little.
+    """
+    run = open_run(source) if source.is_dir() else None
+    path, settings = (source, RenderSettings()) if run is None else _last_model(run)
+    model = load_model(path)
+    check_kind(model.appearance)
+    losses = _losses(model, None if run is None else _scene_of(run), settings)
+    trials = measure_choices(model, list(losses.values()))
+    chosen = smallest_within(model, list(losses.values()), max_loss, trials)
+    out = path.with_suffix(SUFFIX) if out is None else out
+    if run is not None and out == path.with_suffix(SUFFIX):
+        run.own(out)
+    with replacing(out) as temporary:
+        temporary.write_bytes(encode_model(model, chosen.choices))
+    return Compressed(out, model, trials, chosen, tuple(losses))
+
+
+def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
+    """Of the main system, and how it is rendered."""
+    plan = read_record(run).plan
+    planned = plan[plan.main[-1]]
+    path = run.model(planned.name)
+    if not path.is_file():
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+    return path, settings_of(planned.system)
+
+
+def _scene_of(run: RunFolder) -> Scene | None:
+    """None where the photographs are gone."""
+    try:
+        return read_record(run).scene.load()
+    except FileNotFoundError:
+        return None
+
+
+def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
+    """Measures by name; the first decides."""
+    if scene is not None:
+        train = scene.train[:: -(-len(scene.train) // MOST_VIEWS)]
+        losses = {"training views": loss_on_views(model, train, settings=settings)}
+        return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
+    if model.origin is None:
+        raise ValueError("the model does not know where it was trained, so there are no cameras to measure a loss with")
+    pairs = zip(model.origin.cameras, model.origin.is_test, strict=True)
+    cameras = [camera for camera, is_test in pairs if not is_test]
+    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS) or 1]
+    return {f"if {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}
+
+
+def compression_text(result: Compressed) -> str:
+    """A table of all that was tried, and what was written."""
+    chosen, model = result.chosen, result.model
+    groups = dict.fromkeys(trial.group for trial in result.trials)
+    rows = [[f"{trial.group} {trial.precision}", *_figures(trial)] for trial in result.trials]
+    columns = zip(
+        ["kept as", "bytes", *(f"dB lost, {measure}" for measure in result.measures)],
+        *rows,
+        ["chosen", *_figures(chosen)],
+        strict=True,
+    )
+    kept = ", ".join(f"{group} {getattr(chosen.choices, group)}" for group in GROUPS if group in groups)
+    sizes = f"{model.num_bytes:,} bytes of numbers, {chosen.num_bytes:,} on disk"
+    ratio = f"1/{model.num_bytes / chosen.num_bytes:.1f}"
+    return "\n".join([*aligned(list(columns)), f"chosen: {kept}", f"{model.num:,} Gaussians, {sizes}: {ratio}"])
+
+
+def _figures(trial: Trial) -> list[str]:
+    return [f"{trial.num_bytes:,}", *(f"{loss:+.3f}" for loss in trial.losses)]

@@ -1,0 +1,117 @@
+"""Which bits are kept: losses measured, a ladder of choices, the smallest file within a loss, and the command."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_values import some_gaussians
+
+from a2tg_jax import cli, compaction
+from a2tg_jax.compaction import Trial, loss_beside_renders, loss_on_views, measure_choices, smallest_within
+from a2tg_jax.data import synthetic_scene
+from a2tg_jax.evaluation import evaluate
+from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.io.compact import CompactChoices, encode_model, load_compact
+from a2tg_jax.io.model import save_model
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.results import compress as compress_module
+
+SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
+SMALL = {"means": (4, 8, 16), "opacities": (2, 10), "sh_0": (3, 8), "sh_rest": (3, 8), "texels": (3, 8)}
+
+
+@pytest.fixture(autouse=True)
+def untouched_jax(monkeypatch):
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+
+
+def a_model() -> Model:
+    gaussians = init_from_points(SCENE.points, SCENE.colors, opacity=0.8, sh_degree=0)
+    rng = np.random.default_rng(0)
+    logits = jnp.asarray(rng.normal(size=gaussians.num) + 1, jnp.float32)
+    return Model(dataclasses.replace(gaussians, logit_opacities=logits), origin=Origin.of_scene(SCENE))
+
+
+def test_a_loss_is_the_difference_of_what_evaluate_tells():
+    model = a_model()
+    spoiled = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=model.gaussians.sh + 0.3))
+    wanted = evaluate(SCENE.train, model).psnr - evaluate(SCENE.train, spoiled).psnr
+    loss = loss_on_views(model, SCENE.train)
+    assert loss(spoiled) == pytest.approx(wanted, abs=1e-3) and abs(wanted) > 0.05
+    assert loss(model) == 0
+    with pytest.raises(ValueError, match="there are no views"):
+        loss_on_views(model, [])
+
+
+def test_a_guessed_loss_is_that_of_errors_which_add_up():
+    model = a_model()
+    cameras = model.origin.cameras[:2]
+    loss = loss_beside_renders(model, cameras, assumed_psnr=20.0)
+    assert loss(model) == 0
+    spoiled = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=model.gaussians.sh + 0.3))
+    pairs = [[np.clip(m.render(camera).color, 0, 1) for m in (model, spoiled)] for camera in cameras]
+    errors = [float(np.mean((a - b) ** 2)) for a, b in pairs]
+    assert loss(spoiled) == pytest.approx(np.mean([10 * np.log10(1 + error / 0.01) for error in errors]), rel=1e-4)
+
+
+def test_the_table_has_the_groups_that_a_model_has():
+    model = a_model()
+    trials = measure_choices(model, [loss_on_views(model, SCENE.train)], SMALL)
+    assert [(trial.group, trial.precision) for trial in trials] == [
+        ("means", 4), ("means", 8), ("means", 16), ("opacities", 2), ("opacities", 10), ("sh_0", 3), ("sh_0", 8),
+    ]  # fmt: skip
+    assert all(trial.num_bytes == len(encode_model(model, trial.choices)) for trial in trials)
+    assert trials[0].num_bytes < trials[2].num_bytes and trials[0].losses[0] > trials[2].losses[0]
+
+
+def test_the_smallest_file_loses_no_more_than_it_may():
+    model = a_model()
+    loss = loss_on_views(model, SCENE.train)
+    trials = measure_choices(model, [loss], SMALL)
+    found = [smallest_within(model, [loss], most, trials) for most in (0.02, 0.2, 5.0)]
+    assert all(trial.losses[0] <= most for trial, most in zip(found, (0.02, 0.2, 5.0), strict=True))
+    sizes = [trial.num_bytes for trial in found]
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < sizes[0]
+    with pytest.raises(ValueError, match=r"max_loss must be .* dB or more"):
+        smallest_within(model, [lambda _: 1.0], 0.5, trials)
+
+
+def test_greed_takes_what_saves_most_for_its_loss_and_stays_within():
+    def trial(num_bytes, loss, **kept):
+        ((group, _),) = kept.items()
+        return Trial(CompactChoices().keeping(kept), num_bytes, (loss,), group)
+
+    means = [trial(80, 0.5, means=4), trial(90, 0.02, means=8), trial(100, 0.0, means=12)]
+    quats = [trial(50, 0.06, quats=4), trial(95, -0.01, quats=8), trial(100, 0.0, quats=10)]
+    path = compaction._descent({"means": means, "quats": quats}, 0.07)
+    assert path == [{"means": 12, "quats": 8}, {"means": 12, "quats": 4}]
+    assert compaction._descent({"means": means, "quats": quats}, 0.09)[-1] == {"means": 8, "quats": 4}
+
+
+def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(compress_module, "measure_choices", lambda *a: measure_choices(*a, SMALL))
+    save_model(tmp_path / "scene.npz", a_model())
+    assert cli.main(["compress", str(tmp_path / "scene.npz"), "--max-loss", "0.3"]) == 0
+    text = capsys.readouterr().out
+    size = (tmp_path / "scene.a2tgz").stat().st_size
+    assert load_compact(tmp_path / "scene.a2tgz").num == a_model().num
+    assert f"{a_model().num_bytes:,} bytes of numbers, {size:,} on disk: 1/" in text
+    assert "dB lost, if 30 dB" in text and "opacities 2 " in text and "texels" not in text
+    assert f"file: {tmp_path / 'scene.a2tgz'}" in text
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (Model(some_gaussians()), "does not know where it was trained"),
+        (None, "no such"),
+    ],
+)
+def test_the_command_refuses_what_it_cannot_measure(model, words, tmp_path, capsys):
+    if model is not None:
+        save_model(tmp_path / "scene.npz", model)
+    assert cli.main(["compress", str(tmp_path / "scene.npz")]) == 2
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.a2tgz"))
