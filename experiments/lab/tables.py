@@ -83,17 +83,19 @@ def quality(results: Sequence[Result]) -> str:
 
 
 def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
-    """For each number of Gaussians, the methods, and in each column quality and MB, means where it is of several."""
+    """For each number of Gaussians, or budget, the methods, and in each column quality and MB, means where it is of
+    several."""
     columns = {column: {r.run.cell.scene for r in own} for column, own in _grouped(results, lambda r: r.column)}
     parts = []
-    for num, block in _grouped(results, lambda result: result.run.cell.gaussians):
+    for (num, budget), block in _grouped(results, lambda result: (result.run.cell.gaussians, result.run.cell.budget)):
         rows = []
         for label, own in _grouped(block, lambda result: result.label):
             by_column = {column: [result for result in own if result.column == column] for column in columns}
             shown = [_quality_and_size(found, columns[column]) for column, found in by_column.items()]
             rows.append([label, _iterations(own), _splats(own), *shown, _mean_of_columns(by_column)])
         header = ["method", "iterations", "splats", *(f"{column}: PSNR / SSIM / LPIPS · MB" for column in columns)]
-        parts.append(f"**{num:,} Gaussians** of {grid.reference.label}\n\n" + markdown([*header, "mean PSNR"], rows))
+        size = f"**{num:,} Gaussians** of {grid.reference.label}" if budget is None else f"**{budget:g} MB**"
+        parts.append(f"{size}\n\n" + markdown([*header, "mean PSNR"], rows))
     return "\n".join(parts)
 
 
