@@ -1,0 +1,106 @@
+"""Densification that splits where the image is wrong: who is split, into what, and how many there are."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_mcmc import random_gaussians
+
+from a2tg_jax.events import Now, Times
+from a2tg_jax.gaussians import rotation_matrices
+from a2tg_jax.gradient_statistics import GradientStatistics
+from a2tg_jax.mcmc import plan_growth, plan_relocation
+from a2tg_jax.model import Model
+from a2tg_jax.optim import AdamState, adam_init
+from a2tg_jax.splitting import SplitByGradient, draw_weights, split_rows
+
+NUM, LIVE = 400, 300
+KEY = jax.random.key(0)
+
+
+def some_state(seed: int = 0) -> tuple[Model, AdamState, GradientStatistics]:
+    """A model with 100 rows to spare, moments of ones, and statistics that differ."""
+    rng = np.random.default_rng(seed)
+    opacities = np.where(np.arange(NUM) % 10 == 3, 0.001, rng.uniform(0.1, 0.9, NUM))
+    model = Model(random_gaussians(NUM, seed, opacities), num_live=jnp.int32(LIVE))
+    moments = adam_init((model.gaussians, model.params))
+    moments = dataclasses.replace(moments, mu=jax.tree.map(jnp.ones_like, moments.mu))
+    statistics = GradientStatistics(jnp.asarray(rng.uniform(0, 3, NUM), jnp.float32), jnp.full(NUM, 3, jnp.int32))
+    return model, moments, statistics
+
+
+def test_hosts_are_drawn_by_gradient_and_size():
+    model, _, statistics = some_state()
+    scales = np.asarray(model.gaussians.scales)
+    wanted = np.asarray(statistics.total) / 3 * np.sqrt(scales[:, 0] * scales[:, 1])
+    np.testing.assert_allclose(draw_weights(model, statistics), wanted, rtol=1e-5)
+    # The frequencies are those of the weights, whatever the opacities.
+    counts = np.zeros(NUM)
+    grown = jax.jit(
+        lambda key: plan_growth(key, model.gaussians.opacities, jnp.int32(LIVE), NUM, NUM, jnp.asarray(wanted))
+    )
+    for key in jax.random.split(KEY, 400):
+        rows = np.asarray(grown(key).rows)[LIVE:]
+        counts += np.bincount(rows, minlength=NUM)
+    can_host = (np.arange(NUM) < LIVE) & (np.asarray(model.gaussians.opacities) > 0.005)
+    expected = np.where(can_host, wanted, 0)
+    expected *= counts.sum() / expected.sum()
+    assert np.abs(counts - expected).max() < 6 * np.sqrt(expected.max())
+    assert not counts[~can_host].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_hosts_and_copies_become_halves(seed):
+    model, moments, statistics = some_state(seed)
+    weights = draw_weights(model, statistics)
+    moves = plan_growth(KEY, model.gaussians.opacities, model.num_live, NUM, 330, weights)
+    after, new_moments, new_statistics = split_rows(jax.random.key(1), moves, model, moments, statistics)
+    assert int(after.num_live) == 330
+    rows = np.asarray(moves.rows)
+    is_split = np.isin(np.arange(NUM), rows[LIVE:330]) | ((np.arange(NUM) >= LIVE) & (np.arange(NUM) < 330))
+    before = model.gaussians[rows]
+    shrunk = np.where(is_split, np.log(1.6), 0)
+    np.testing.assert_allclose(after.gaussians.log_scales, before.log_scales - shrunk[:, None], atol=1e-6)
+    for field in ("quats", "logit_opacities", "sh"):
+        np.testing.assert_array_equal(getattr(after.gaussians, field), getattr(before, field))
+    # They stay in the plane of their host, a few of its standard deviations away, and others stay where they are.
+    axes = np.asarray(rotation_matrices(before.quats))
+    moved = np.einsum("nij,ni->nj", axes, np.asarray(after.gaussians.means - before.means))
+    np.testing.assert_array_equal(moved[~is_split], 0)
+    assert np.abs(moved[:, 2]).max() < 1e-5
+    steps = moved[is_split, :2] / np.asarray(before.scales)[is_split]
+    assert 0.5 < steps.std() < 1.6 and np.abs(steps).max() < 6
+    # Adam forgets both, and both share what was seen of the host.
+    np.testing.assert_array_equal(np.asarray(new_moments.mu[0].means)[:330, 0], np.where(is_split, 0, 1)[:330])
+    shares = np.bincount(rows[:330], minlength=NUM)
+    np.testing.assert_allclose(
+        new_statistics.total[:330], (np.asarray(statistics.total) / np.maximum(shares, 1))[rows[:330]], rtol=1e-5
+    )
+
+
+def test_the_dead_are_moved_onto_halves():
+    model, moments, statistics = some_state()
+    is_dead = (np.asarray(model.gaussians.opacities) < 0.005) & (np.arange(NUM) < LIVE)
+    moves = plan_relocation(KEY, model.gaussians.opacities, model.num_live, hosts=draw_weights(model, statistics))
+    after, _, _ = split_rows(jax.random.key(1), moves, model, moments, statistics)
+    assert int(after.num_live) == LIVE and is_dead.sum() == 30
+    assert np.asarray(after.gaussians.opacities)[:LIVE].min() > 0.05
+    hosts = np.asarray(moves.rows)[:LIVE][is_dead[:LIVE]]
+    scales = np.asarray(model.gaussians.log_scales)[hosts] - np.log(1.6)
+    np.testing.assert_allclose(np.asarray(after.gaussians.log_scales)[:LIVE][is_dead[:LIVE]], scales, atol=1e-6)
+
+
+def test_the_last_event_leaves_the_cap():
+    model, moments, statistics = some_state()
+    event, times = SplitByGradient(390), Times(10, 40, 10)
+    counts = []
+    for iteration in (10, 20, 30, 40):
+        now = Now(
+            jax.random.split(KEY, 2), jnp.int32(iteration), jnp.float32(1e-3), jnp.int32(50), jnp.float32(1), times
+        )
+        change = event.apply(now, model, moments, statistics)
+        model, moments, statistics = change.model, change.moments, change.state
+        counts.append(int(model.num_live))
+    assert counts == sorted(counts) and counts[-1] == 390 and counts[0] > LIVE
