@@ -1,7 +1,6 @@
 """Adaptive anisotropic textured Gaussians as a functional JAX library: the public names."""
 
 from a2tg_jax.adapt import Upscale as Upscale
-from a2tg_jax.adapt import event_budget as event_budget
 from a2tg_jax.adapt import next_sizes as next_sizes
 from a2tg_jax.adapt import reallocate as reallocate
 from a2tg_jax.adapt import select as select
@@ -77,6 +76,7 @@ from a2tg_jax.startup import configure_cpu as configure_cpu
 from a2tg_jax.systems.a2tg import A2tg as A2tg
 from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig
 from a2tg_jax.systems.bbsplat import BBSplat as BBSplat
+from a2tg_jax.systems.bytewise import Bytewise as Bytewise
 from a2tg_jax.systems.gaussians_2d import Gaussians2d as Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc as Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import DensityConfig as DensityConfig

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.adapt import Upscale, event_budget, next_sizes, reallocate, select
+from a2tg_jax.adapt import Upscale, next_sizes, reallocate, select
 from a2tg_jax.appearance import Textured
+from a2tg_jax.budget import event_budget
 from a2tg_jax.gaussians import init_from_points
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
@@ -278,3 +279,33 @@ def test_statistics_average_over_the_views_that_saw_it():
     stats = accumulate(stats, jnp.asarray([3.0, 7.0, 0.0]), jnp.asarray([True, False, False]))
     np.testing.assert_array_equal(stats.average(), [2.0, 5.0, 0.0])
     np.testing.assert_array_equal(stats.views, [2, 1, 0])
+
+
+@pytest.mark.parametrize("new", [(1, 1), (2, 1), (2, 4)])
+def test_an_empty_texture_takes_no_bytes_and_grows_from_nothing(new):
+    sizes = np.array([[0, 0], [2, 2], [0, 0], [1, 1]])
+    textures, layout = allocate_textures(sizes)
+    assert layout.num_texels == 5
+    textures = jax.tree.map(lambda bucket: bucket + 0.25, textures)
+    sizes[0] = new
+    moments = jax.tree.map(jnp.ones_like, textures)
+    grown = reallocate(textures, layout, sizes, moments)
+    first, kept, empty, _ = texture_arrays(grown.textures, grown.layout)
+    np.testing.assert_array_equal(first, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*new, 4)))
+    np.testing.assert_array_equal(kept, np.full((2, 2, 4), [0.25, 0.25, 0.25, 1.25]))
+    assert empty.size == 0
+    assert not texture_arrays(grown.moments, grown.layout)[0].any()
+
+
+def test_an_empty_texture_grows_as_one_texel_does():
+    scales = [(1.0, 1.0), (1.0, 0.005), (0.005, 1.0)]
+    common = {"k_a": 4.0, "k_s": 0.01, "cap": 4}
+    found = next_sizes(np.zeros((3, 2), int), scales, **common)
+    np.testing.assert_array_equal(found, next_sizes(np.ones((3, 2), int), scales, **common))
+    np.testing.assert_array_equal(found, [(2, 2), (1, 2), (2, 1)])
+
+
+@pytest.mark.parametrize("size", [(0, 1), (1, 0), (17, 1), (-1, -1)])
+def test_a_side_out_of_range_is_named(size):
+    with pytest.raises(ValueError, match="texture sides must lie in 1..16, or both be 0"):
+        allocate_textures(np.array([size]))
