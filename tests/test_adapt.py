@@ -307,5 +307,5 @@ def test_an_empty_texture_grows_as_one_texel_does():
 
 @pytest.mark.parametrize("size", [(0, 1), (1, 0), (17, 1), (-1, -1)])
 def test_a_side_out_of_range_is_named(size):
-    with pytest.raises(ValueError, match="texture sides must lie in 1..16, or both be 0"):
+    with pytest.raises(ValueError, match=r"texture sides must lie in 1\.\.16, or both be 0"):
         allocate_textures(np.array([size]))
