@@ -4,7 +4,6 @@ The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select`
 `reallocate`. All but the statistic runs on the host, on whole arrays.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -92,7 +91,9 @@ class Upscale(HostEvent):
         return state.observe_views(seen.gradients, seen.is_visible)
 
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
-        textures, layout = model.appearance.textures(model.params, model.layout)
+        if model.textures is None:
+            raise ValueError(f"{type(model.appearance).__name__} has no textures that could grow; Textured has")
+        textures, layout = model.textures
         num = model.num
         new_sizes, scales, averages = layout.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
@@ -111,8 +112,7 @@ class Upscale(HostEvent):
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
         rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
         _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
-        shown = model.appearance.with_textures(model.params, model.layout, rebuilt.textures, rebuilt.layout)
-        model = dataclasses.replace(model, params=shown[0], layout=shown[1])
+        model = model.with_textures(rebuilt.textures, rebuilt.layout)
         return Change(model, rebuilt.moments, self.init(model))
 
     def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.origin import BLACK, Origin
 from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
+from a2tg_jax.texture import AtlasLayout, Textures
 from a2tg_jax.transform import transform_gaussians
 
 
@@ -77,6 +78,16 @@ class Model:
         """Bytes that exist in the buffers only (host)."""
         allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.params))
         return int(allocated) + BYTES_PER_FLOAT * self.gaussians.floats_per_row * self.num - self.num_bytes
+
+    @property
+    def textures(self) -> tuple[Textures, AtlasLayout] | None:
+        """Textures and their layout; None where splats show none."""
+        return self.appearance.textures(self.params, self.layout)
+
+    def with_textures(self, textures: Textures, layout: AtlasLayout) -> "Model":
+        """The same model with other textures."""
+        params, layout = self.appearance.with_textures(self.params, self.layout, textures, layout)
+        return dataclasses.replace(self, params=params, layout=layout)
 
     @property
     def background(self) -> tuple[float, float, float]:

@@ -160,7 +160,7 @@ class Banded(Appearance):
         bands, _ = split_sh(sh, layout.bands.degrees, layout.bands.base_degree)
         return params._replace(bands=bands)
 
-    def textures(self, params: BandedParams, layout: BandedLayout) -> tuple[Textures, AtlasLayout]:
+    def textures(self, params: BandedParams, layout: BandedLayout) -> tuple[Textures, AtlasLayout] | None:
         return self.inner.textures(params.inner, layout.inner)
 
     def with_textures(self, params: BandedParams, layout: BandedLayout, textures: Textures, atlas: AtlasLayout):

@@ -88,13 +88,9 @@ class Appearance:
         """The parameters with other coefficients, as `sh` gives them; those of the Gaussians are not its (host)."""
         return params
 
-    def textures(self, params: Any, layout: Any) -> tuple[Textures, AtlasLayout]:
-        """Its textures and their layout.
-
-        Raises:
-          ValueError: if it has none.
-        """
-        raise ValueError(f"{type(self).__name__} has no textures that could grow: a stage of Textured is wanted")
+    def textures(self, params: Any, layout: Any) -> tuple[Textures, AtlasLayout] | None:
+        """Its textures and their layout; None where it has none."""
+        return None
 
     def with_textures(self, params: Any, layout: Any, textures: Textures, atlas: AtlasLayout) -> tuple[Any, Any]:
         """Parameters and layout with other textures."""

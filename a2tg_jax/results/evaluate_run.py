@@ -1,9 +1,8 @@
 """Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
 
-import dataclasses
 import os
 
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Billboards
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.evaluation import evaluate
 from a2tg_jax.io.model import load_model
@@ -29,7 +28,6 @@ from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
-from a2tg_jax.texture import AtlasLayout
 from a2tg_jax.training import System
 
 REPORTED_VIEWS = 4
@@ -63,7 +61,7 @@ def evaluate_run(
     write_json(run.own(run.per_view), per_view_json(result))
     main = models[result.main]
     _write_curves(run, plan, list(models))
-    if isinstance(main.appearance, Textured):
+    if main.textures is not None and not isinstance(main.appearance, Billboards):
         _write_texture_figures(run, main, plan[result.main].system, scene)
     save_ply(run.own(run.point_cloud), main)
     _write_pictures(run, result, scene.test or scene.train, main.background)
@@ -92,7 +90,7 @@ def _measure(model: Model, scene: Scene, system: System, seconds: float, lpips_w
         train=found[len(scene.test) :],
         test=found[: len(scene.test)] if scene.test else None,
         num_gaussians=model.num,
-        num_texels=model.layout.num_texels if isinstance(model.layout, AtlasLayout) else 0,
+        num_texels=model.textures[1].num_texels if model.textures else 0,
         num_bytes=model.num_bytes,
         num_published_bytes=model.num_published_bytes,
         num_padding_bytes=model.num_padding_bytes,
@@ -109,12 +107,13 @@ def _write_curves(run: RunFolder, plan: RunPlan, names: list[str]) -> None:
 
 def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
     """figures/sizes.png and figures/resolutions.png, of the first view."""
-    save_figure(run.own(run.figures / "sizes.png"), sizes_figure(model.layout.sizes))
-    gaussians, textures, _ = colored_by_resolution(model.gaussians, model.params, model.layout)
-    colored = dataclasses.replace(model, gaussians=gaussians, params=textures)
+    assert model.textures is not None
+    _, layout = model.textures
+    save_figure(run.own(run.figures / "sizes.png"), sizes_figure(layout.sizes))
+    colored = colored_by_resolution(model)
     camera = (*scene.test, *scene.train)[0].camera
     picture = to_uint8(Renderer(colored, settings=settings_of(system), has_geometry=False)(camera).color)
-    num_levels = int(texel_levels(model.layout).max()) + 1
+    num_levels = int(texel_levels(layout).max()) + 1
     save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels))
 
 

@@ -88,7 +88,9 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
     axes.set_yticks(range(len(sides)), [str(side) for side in sides])
     axes.set_xlabel("Tu (texels along u)")
     axes.set_ylabel("Tv (texels along v)")
-    axes.set_title(f"Textures of {len(sizes):,} Gaussians", fontsize=10)
+    num_empty = int(np.sum((sizes == 0).all(axis=1)))
+    without = f", {num_empty:,} of them without" if num_empty else ""
+    axes.set_title(f"Textures of {len(sizes):,} Gaussians{without}", fontsize=10)
     return figure
 
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from a2tg_jax.appearance import Banded
 from a2tg_jax.io.model import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, read_json
 from a2tg_jax.results.record import read_record, repeating_command
-from a2tg_jax.texture import AtlasLayout
 
 
 def describe_run(run: RunFolder) -> str:
@@ -36,8 +36,11 @@ def _describe_stage(run: RunFolder, name: str, measured: dict | None) -> str:
         return _progress(run.checkpoints(name))
     model = load_model(run.model(name))
     parts = [f"{model.num:,} Gaussians", f"{model.num_bytes / 1e6:.2f} MB"]
-    if isinstance(model.layout, AtlasLayout):
-        sizes, counts = np.unique(model.layout.sizes, axis=0, return_counts=True)
+    if isinstance(model.appearance, Banded):
+        counts = np.bincount(model.layout.bands.degrees)
+        parts.append("degrees " + ", ".join(f"{degree}: {n:,}" for degree, n in enumerate(counts)))
+    if model.textures is not None:
+        sizes, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
         parts.append("textures " + ", ".join(f"{tv}×{tu}: {n:,}" for (tv, tu), n in zip(sizes, counts, strict=True)))
     if measured:
         splits = [split for split in ("test", "train") if split in measured]

@@ -18,9 +18,10 @@ from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
-from a2tg_jax.gaussians import SH_C0, Gaussians
+from a2tg_jax.gaussians import SH_C0
 from a2tg_jax.io.atomic import replacing
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.model import Model
+from a2tg_jax.texture import AtlasLayout
 
 ERROR_GAIN = 4
 MARGIN, CAPTION_HEIGHT = 6, 22
@@ -115,19 +116,30 @@ def resolution_colors(num_levels: int) -> np.ndarray:
 
 
 def texel_levels(layout: AtlasLayout) -> np.ndarray:
-    """[N] integers log₂(Tu·Tv), rounded."""
-    return np.rint(np.log2(layout.sizes.prod(axis=1))).astype(int)
+    """[N] integers log₂(Tu·Tv), rounded; 0 where a texture is empty."""
+    return np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
 
 
-def colored_by_resolution(
-    gaussians: Gaussians, textures: Textures, layout: AtlasLayout
-) -> tuple[Gaussians, Textures, AtlasLayout]:
-    """The model with every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
+def colored_by_resolution(model: Model) -> Model:
+    """A model with textures, every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
 
-    Alpha textures stay, RGB residuals go.
+    Alpha textures stay, RGB residuals and view dependence go.
     """
+    assert model.textures is not None
+    textures, layout = model.textures
     levels = texel_levels(layout)
-    sh = np.zeros(gaussians.sh.shape)
-    sh[:, 0] = (resolution_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
-    plain = jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures)
-    return dataclasses.replace(gaussians, sh=jnp.asarray(sh, gaussians.sh.dtype)), plain, layout
+    colors = (resolution_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
+    flat = model.with_textures(jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures), layout)
+    return with_colors(flat, np.ones(model.gaussians.num, bool), colors)
+
+
+def with_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
+    """A model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
+    sh = np.where(is_chosen[:, None, None], 0, model.appearance.sh(model.gaussians, model.params, model.layout))
+    sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
+    own = jnp.asarray(sh[:, : model.gaussians.sh.shape[1]], model.gaussians.sh.dtype)
+    return dataclasses.replace(
+        model,
+        gaussians=dataclasses.replace(model.gaussians, sh=own),
+        params=model.appearance.with_sh(sh, model.params, model.layout),
+    )

@@ -162,9 +162,9 @@ def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:
     """Splats by the size of their texture, "2x4" being two rows (v) and four columns (u); nothing without textures."""
-    if not isinstance(model.appearance, a2tg.Textured):
+    if model.textures is None or isinstance(model.appearance, a2tg.Billboards):
         return {}
-    pairs, counts = np.unique(np.asarray(model.layout.sizes), axis=0, return_counts=True)
+    pairs, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
     return {f"{rows}x{columns}": int(count) for (rows, columns), count in zip(pairs, counts, strict=True)}
 
 

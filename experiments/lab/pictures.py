@@ -1,6 +1,5 @@
 """Models changed so that a rendering shows something of them: what textures do, and where they are large."""
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -10,7 +9,7 @@ from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.gaussians import SH_C0
-from a2tg_jax.results.pictures import side_by_side
+from a2tg_jax.results.pictures import side_by_side, with_colors
 
 LEAST_WIDTH = 300
 """Of an image in a sheet, in pixels."""
@@ -31,27 +30,28 @@ def enlarged(image: np.ndarray, zoom: int) -> np.ndarray:
 
 def without_textures(model: a2tg.Model) -> a2tg.Model:
     """RGB textures 0, alpha textures 1: what spherical harmonics show."""
-    neutral = jax.tree.map(lambda bucket: jnp.zeros_like(bucket).at[..., 3].set(1.0), model.params)
-    return dataclasses.replace(model, params=neutral)
+    assert model.textures is not None
+    textures, layout = model.textures
+    neutral = jax.tree.map(lambda bucket: jnp.zeros_like(bucket).at[..., 3].set(1.0), textures)
+    return model.with_textures(neutral, layout)
 
 
 def without_sh(model: a2tg.Model) -> a2tg.Model:
     """The Gaussians' own colour 0: what textures show."""
-    black = jnp.zeros_like(model.gaussians.sh).at[:, 0].set(-0.5 / SH_C0)
-    return dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=black))
+    return with_colors(model, np.ones(model.gaussians.num, bool), np.full(3, -0.5 / SH_C0))
 
 
 def colored_by_shape(model: a2tg.Model) -> a2tg.Model:
     """Gaussians with larger square textures in blue, with others in red, the rest as they are."""
-    rows, columns = model.layout.sizes.T
-    sh = np.array(model.gaussians.sh)
-    for is_chosen, color in (((rows == columns) & (rows > 1), SQUARE), (rows != columns, OBLONG)):
-        sh[is_chosen] = 0
-        sh[is_chosen, 0] = (np.asarray(color) - 0.5) / SH_C0
-    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(sh))
-    buckets = zip(model.params.buckets, model.layout.resolutions, strict=True)
+    assert model.textures is not None
+    textures, layout = model.textures
+    rows, columns = layout.sizes.T
+    buckets = zip(textures.buckets, layout.resolutions, strict=True)
     flat = [bucket if size == (1, 1) else bucket.at[..., :3].set(0.0) for bucket, size in buckets]
-    return dataclasses.replace(model, gaussians=gaussians, params=a2tg.Textures(tuple(flat)))
+    model = model.with_textures(a2tg.Textures(tuple(flat)), layout)
+    for is_chosen, color in (((rows == columns) & (rows > 1), SQUARE), (rows != columns, OBLONG)):
+        model = with_colors(model, is_chosen, (np.asarray(color) - 0.5) / SH_C0)
+    return model
 
 
 def learned_textures(model: a2tg.Model, size: tuple[int, int], num: int) -> np.ndarray:
@@ -65,8 +65,9 @@ def learned_textures(model: a2tg.Model, size: tuple[int, int], num: int) -> np.n
     Returns:
       uint8 [2·rows + 1, num·(columns + 1) − 1, 3], white between them; without columns where there are none.
     """
-    chosen = np.flatnonzero((model.layout.sizes == size).all(axis=1))
-    textures = a2tg.texture_arrays(model.params, model.layout)
+    assert model.textures is not None
+    chosen = np.flatnonzero((model.textures[1].sizes == size).all(axis=1))
+    textures = a2tg.texture_arrays(*model.textures)
     varied = sorted(chosen, key=lambda index: -float(np.std(textures[index][..., :3], axis=(0, 1)).sum()))[:num]
     rows, columns = size
     sheet = np.ones((2 * rows + 1, max(0, len(varied) * (columns + 1) - 1), 3))
