@@ -19,15 +19,18 @@ from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
 
+EXTENT = 3.0
+"""Half the side of a texture, in standard deviations."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TextureOptions:
     """How textures are read. The defaults are the paper's text; `official()` is the authors' program."""
 
     uv: Literal["texel-centre", "align-corners"] = "texel-centre"
-    """Texel centres at half-texel offsets over the texture's extent, or the outer ones at its edge exactly."""
+    """Texel centres at half-texel offsets over ±3σ, or the outer ones at ±3σ exactly."""
     outside: Literal["clamp", "identity"] = "clamp"
-    """Beyond its extent: the edge texel goes on, or the texture shows nothing (RGB 0, alpha 1)."""
+    """Beyond ±3σ: the edge texel goes on, or the texture shows nothing (RGB 0, alpha 1)."""
     rgb: Literal["signed", "unit"] = "signed"
     """RGB residuals of either sign, or clipped to [0, 1]."""
     uv_gradient: bool = True
@@ -39,8 +42,6 @@ class TextureOptions:
     textures and clipped to [0, 1]."""
     max_alpha: float = 0.99
     """Alpha of a splat never exceeds it."""
-    extent: float = 3.0
-    """Half the side of a texture, in standard deviations."""
 
     @staticmethod
     def official() -> "TextureOptions":
@@ -69,13 +70,12 @@ class TexturedRule(AppearanceRule):
         if not self.options.uv_gradient:
             u, v = jax.lax.stop_gradient((u, v))
         width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
-        uv, extent = self.options.uv, self.options.extent
-        return texel_coordinates(u, width, uv, extent), texel_coordinates(v, height, uv, extent)
+        return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
 
     def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
         red, green, blue, alpha = values
         if self.options.outside == "identity":
-            is_inside = (jnp.abs(u) <= self.options.extent) & (jnp.abs(v) <= self.options.extent)
+            is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
             red, green, blue = (jnp.where(is_inside, channel, 0.0) for channel in (red, green, blue))
             alpha = jnp.where(is_inside, alpha, 1.0)
         return (red, green, blue), alpha
@@ -150,9 +150,9 @@ def _padded_peaks(bucket: Array, length: int) -> Array:
     return jnp.pad(peaks, (0, length - peaks.shape[0]))
 
 
-def texel_coordinates(u: Array, size: Array, convention: str, extent: float) -> Array:
+def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
     """Where u, in standard deviations, lies among the `size` texels of its axis, clamped to [0, size − 1]."""
-    unit = (u * (1 / extent) + 1) * 0.5
+    unit = (u * (1 / EXTENT) + 1) * 0.5
     x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
     return jnp.clip(x, 0.0, size - 1)
 
