@@ -223,7 +223,6 @@ def head(**values) -> str:
         (edit(lambda header, _: header["appearance"].update(name="jax.numpy")), "not known here"),
         (edit(lambda header, _: header["appearance"].update(module="os", name="system")), "not known here"),
         (edit(lambda header, _: header["appearance"]["options"].update(start="big")), r"Textured\.start must be"),
-        (edit(lambda header, _: header["appearance"]["options"].pop("start")), r"Textured\.start is missing"),
         (changed("origin/Ks", lambda x: x[1:]), r"origin/Ks must be \[3, 3, 3\]"),
         (edit(lambda header, _: header["origin"].update(background=[0, 1])), "bad.npz: .*unpack"),
         (edit(lambda header, _: header["origin"].update(background="red")), "bad.npz: .*float"),

@@ -24,7 +24,7 @@ def config_from_dict(
 
     Args:
       kind: the dataclass.
-      data: one entry per field.
+      data: an entry per field. A field that has a default may be missing, as those are that an older version lacked.
       where: what the errors call this place, such as the name of the file.
       given: values of fields that are not among the data.
 
@@ -39,11 +39,17 @@ def config_from_dict(
     for name in data:
         if name not in names:
             raise ValueError(f"{_within(where, name)} is not a field of {kind.__name__}; {_instead(name, names)}")
+    optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
-        if name not in data:
+        if name not in data and name not in optional:
             raise ValueError(f"{_within(where, name)} is missing; it was written by another version")
-    values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names}
+    values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names if name in data}
     return kind(**values, **given)
+
+
+def has_default(field: dataclasses.Field) -> bool:
+    """Whether a field of a dataclass need not be given."""
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _within(where: str, name: str) -> str:

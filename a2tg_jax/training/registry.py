@@ -80,8 +80,7 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     Raises:
       ValueError: if the class is not known, or an option is missing, unknown or of another type.
     """
-    # Files of before there were budgets know of none.
-    name, options = data["name"], {"memory_budget": None, **data["options"]}
+    name, options = data["name"], data["options"]
     if kind is None and name in SYSTEMS:
         kind = type(find_system(name))
     if kind is None:
