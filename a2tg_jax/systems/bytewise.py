@@ -31,7 +31,7 @@ class CapConfig:
 class ViewDependenceConfig:
     """Spherical harmonics above the Gaussians' own degree."""
 
-    share: float = 0.05
+    share: float = 0.1
     """Of the memory budget; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
