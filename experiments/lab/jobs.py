@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.appearance import Billboards
 from a2tg_jax.origin import WHITE
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.plan import fingerprint, is_same_so_far
@@ -162,7 +163,7 @@ def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:
     """Splats by the size of their texture, "2x4" being two rows (v) and four columns (u); nothing without textures."""
-    if model.textures is None or isinstance(model.appearance, a2tg.Billboards):
+    if model.textures is None or isinstance(model.appearance, Billboards):
         return {}
     pairs, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
     return {f"{rows}x{columns}": int(count) for (rows, columns), count in zip(pairs, counts, strict=True)}
