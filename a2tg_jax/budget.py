@@ -86,7 +86,7 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
       ValueError: if the budget is negative.
     """
     if not budget >= 0:
-        raise ValueError(f"budget_bytes must be at least 0; got {budget}")
+        raise ValueError(f"budget must be at least 0; got {budget}")
     candidates = np.flatnonzero(can_grow & (statistic >= 0))
     gain = statistic[candidates].astype(np.float64) / cost[candidates]
     queue = candidates[np.argsort(-gain, kind="stable")]

@@ -326,8 +326,8 @@ class FillingMcmc(Mcmc):
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations).num_times:
             raise ValueError(
-                f"in {num_iterations} iterations there is no growth from {num:,} Gaussians to the {self.cap:,} of "
-                "memory_budget: raise stage1_iterations or initial_gaussians"
+                f"in {num_iterations} iterations there is no growth from {num:,} Gaussians to the {self.cap:,} that "
+                "there shall be: raise stage1_iterations or initial_gaussians"
             )
         return max(num, self.cap)
 

@@ -175,7 +175,7 @@ def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, d
       center: [3] camera centre in the world.
       degree: highest degree used; may be traced.
     """
-    total = jnp.zeros_like(means)
+    total = jnp.zeros(means.shape, jnp.result_type(means, center, *bands.tables))
     for table, owners, band in zip(bands.tables, layout.owners, layout.bands, strict=True):
         if not table.shape[0]:
             continue

@@ -1,8 +1,8 @@
 """Where spherical harmonics go: a degree per Gaussian, raised where the gradient asks for it, lowered where it is idle.
 
 The image is linear in the coefficients, so that the gradient at a coefficient which a Gaussian does not have yet is
-known: Σ over views of ∂L/∂colour · Y(direction), with Y zero for no view in particular. What residuals of many views
-have in common adds up in it, what they have not cancels.
+known: Σ over views of ∂L/∂colour · Y(direction). What residuals of many views have in common adds up in it, what they
+have not cancels.
 """
 
 import dataclasses
@@ -12,15 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.budget import bytes_of, event_budget, within_budget
+from a2tg_jax.appearance import Banded
+from a2tg_jax.budget import BYTES_PER_FLOAT, bytes_of, event_budget, within_budget
 from a2tg_jax.events import Change, HostEvent, Seen, event, iterations_at, static
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import normalize
 from a2tg_jax.optim import AdamState
 from a2tg_jax.sh import NUM_BASES, sh_basis
 from a2tg_jax.sh_bands import MAX_DEGREE, BandLayout, Bands, floats_of_band, reallocate_bands
-
-BYTES_PER_FLOAT = 4
 
 
 @jax.tree_util.register_dataclass
@@ -70,15 +69,17 @@ class AdaptDegrees(HostEvent):
 
     budget_mb: float = 0.0
     """Reported memory never exceeds this many MB (10^6 bytes)."""
-    at: tuple[float, ...] = static(default=(0.05, 0.1, 0.15))
+    at: tuple[float, ...] = static(default=(0.05, 0.1))
     """Fractions of the stage at which it happens. Each time an equal part of what is left of the budget is spent."""
+    highest: int = static(default=MAX_DEGREE)
+    """No degree rises above it."""
     idle: float = 0.0
     """Bands that change a colour by less than this (root mean square over all directions) are given up."""
 
     observes = True
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations)
+        return iterations_at(self.at, num_iterations, "view_dependence.at")
 
     def init(self, model: Model) -> ViewDependence:
         return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
@@ -88,11 +89,13 @@ class AdaptDegrees(HostEvent):
         return state.observe(model.gaussians.means, centers, seen.colors)
 
     def apply(self, index: int, count: int, model: Model, moments: AdamState, state: ViewDependence) -> Change:
+        if not isinstance(model.appearance, Banded):
+            raise ValueError(f"{type(model.appearance).__name__} has no degrees that could rise; Banded has")
         bands, layout, num = model.params.bands, model.layout.bands, model.num
         degrees = without_idle(bands, layout, self.idle)
         used = model.num_bytes - saved_bytes(layout, degrees, num)
         budget = event_budget(bytes_of(self.budget_mb), used, index, count)
-        degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget)
+        degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget, self.highest)
         bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
         model = dataclasses.replace(
             model, params=model.params._replace(bands=bands), layout=model.layout._replace(bands=layout)
@@ -122,16 +125,17 @@ def saved_bytes(layout: BandLayout, degrees: np.ndarray, num: int) -> int:
     return BYTES_PER_FLOAT * int((floats[layout.degrees[:num]] - floats[degrees[:num]]).sum())
 
 
-def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float) -> np.ndarray:
+def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
     """[N] degrees, one more for as many as the budget allows, in descending order of gradient per added byte (host).
 
     Args:
       degrees: [N] 0 to 3.
       strengths: [N, 3] of the bands of degree 1, 2 and 3.
       budget: bytes.
+      highest: no degree rises above it.
     """
     following = np.minimum(degrees, MAX_DEGREE - 1)
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]
     strength = np.take_along_axis(strengths, following[:, None], axis=1)[:, 0]
-    is_candidate = (degrees < MAX_DEGREE) & (strength > 0)
+    is_candidate = (degrees < highest) & (strength > 0)
     return degrees + within_budget(strength, is_candidate, cost, budget)

@@ -63,7 +63,8 @@ def _told(pairs: Sequence[tuple[tables.Result, tables.Result]]) -> str:
     if not pairs:
         return tables.MISSING
     decibels, distance = (np.mean([a[figure] - b[figure] for a, b in pairs]) for figure in ("psnr", "lpips"))
-    return f"{decibels:+.2f} · {distance:+.3f} ({len(pairs)})"
+    lpips = tables.MISSING if np.isnan(distance) else f"{distance:+.3f}"
+    return f"{decibels:+.2f} · {lpips} ({len(pairs)})"
 
 
 def speeds(results: Sequence[tables.Result]) -> str:

@@ -151,7 +151,8 @@ def test_caps_use_up_every_budget(name):
     floats = {"textured-gaussians": 64, "supergaussians": 27, "bbsplat": 4 * 256 - 1, "a2tg": 20}
     rng = np.random.default_rng(0)
     for budget, sh_degree in itertools.product(np.exp(rng.uniform(-4, 6, 50)), range(4)):
-        system = dataclasses.replace(a2tg.find_system(name), memory_budget=float(budget), sh_degree=sh_degree)
+        degree = "base_degree" if name == "bytewise" else "sh_degree"
+        system = dataclasses.replace(a2tg.find_system(name), memory_budget=float(budget), **{degree: sh_degree})
         # Bytewise leaves 15 % of the bytes to degrees and textures.
         more = floats_per_gaussian(sh_degree) * 0.15 / 0.85 if name == "bytewise" else floats.get(name, 0)
         needed = bytes_per_gaussian(sh_degree, more)

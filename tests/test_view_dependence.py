@@ -11,13 +11,17 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax import Model, load_model, load_ply, plan_render, save_model, save_ply
-from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Textured
+from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels, Plain, Textured
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.budget import within_budget
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.events import Seen
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.optim import adam_init
 from a2tg_jax.sh_bands import allocate_bands, dense_sh, gather_bands, reallocate_bands, split_sh
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.training import LearningRates, Stage
+from a2tg_jax.training.start import padded
 from a2tg_jax.view_dependence import AdaptDegrees, ViewDependence, raised, without_idle
 
 NUM = 40
@@ -199,7 +203,7 @@ def test_idle_bands_are_given_up():
 @pytest.mark.parametrize("budget_mb", [0.0025, 0.0031])
 def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
     model, _, camera = banded(6, inner=Textured((0, 0)))
-    event = AdaptDegrees(budget_mb, at=(0.5,), shares=(1.0,))
+    event = AdaptDegrees(budget_mb, at=(0.5,))
     cameras = jax.tree.map(lambda x: x[None], camera)
     colors = jnp.asarray(np.random.default_rng(0).normal(size=(1, NUM, 3)), jnp.float32)
     nothing = jnp.zeros_like(colors)
@@ -210,6 +214,42 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
     after = event.apply(1, 1, base, adam_init((base.gaussians, base.params)), state).model
     assert 1e6 * budget_mb - 36 < after.num_bytes <= 1e6 * budget_mb
     np.testing.assert_allclose(after.render(camera).color, base.render(camera).color, atol=1e-6)
+
+
+@pytest.mark.parametrize("damage", ["bands", "inner", "degree"])
+def test_a_file_whose_parts_disagree_is_refused(tmp_path, damage):
+    model, _, _ = banded(3, inner=Textured((2, 1)))
+    other, _, _ = banded(4, base=1, inner=Textured((2, 1)))
+    if damage == "degree":
+        model = dataclasses.replace(model, gaussians=other.gaussians)
+    else:
+        part = Banded(Textured((2, 1))).first_rows(model.params, model.layout, 20)
+        layout = model.layout._replace(**{damage: getattr(part[1], damage)})
+        params = model.params._replace(**{damage: getattr(part[0], damage)})
+        model = dataclasses.replace(model, params=params, layout=layout)
+    save_model(tmp_path / "m.npz", model)
+    with pytest.raises(ValueError, match=r"m\.npz: .*(Banded|Textured) is of"):
+        load_model(tmp_path / "m.npz")
+
+
+def test_degrees_that_have_risen_are_not_lost_where_gaussians_are_added():
+    model, _, _ = banded(5)
+    stage = Stage("more", model.appearance, (Mcmc(2 * NUM),), (), LearningRates(), 100, BandedRates(0.0))
+    with pytest.raises(ValueError, match="textures or degrees have grown already"):
+        padded(model, stage, Gaussians2dMcmc())
+
+
+def test_degrees_rise_in_banded_models_only():
+    model = Model(as_gaussians(draw_scene(1, num=NUM), "float32"))
+    event = AdaptDegrees(1.0)
+    with pytest.raises(ValueError, match="Plain has no degrees that could rise; Banded has"):
+        event.apply(1, 1, model, adam_init((model.gaussians, ())), event.init(model))
+
+
+def test_a_ply_file_of_nothing(tmp_path):
+    gaussians = as_gaussians(draw_scene(1, num=NUM), "float32")[:0]
+    save_ply(tmp_path / "m.ply", gaussians)
+    assert load_ply(tmp_path / "m.ply").num == 0
 
 
 def test_nothing_is_bought_with_nothing():

@@ -170,7 +170,8 @@ class Banded(Appearance):
     # Files.
 
     def arrays(self, params: BandedParams, layout: BandedLayout) -> dict[str, np.ndarray]:
-        """`degrees` [N] and, of each band above the Gaussians' own, `band_l` [M, 2l + 1, 3] in the Gaussians' order."""
+        """`degrees` [N], `base_degree`, of each band above that `band_l` [M, 2l + 1, 3] in the Gaussians' order, and
+        what else is shown, as `inner.NAME`."""
         arrays = {"degrees": layout.bands.degrees.astype(np.uint8)}
         arrays["base_degree"] = np.asarray(layout.bands.base_degree, np.uint8)
         tables = zip(layout.bands.bands, params.bands.tables, layout.bands.owners, strict=True)

@@ -11,6 +11,7 @@ from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.texture import (
+    MAX_SIDE,
     AtlasLayout,
     Textures,
     first_textures,
@@ -52,7 +53,10 @@ class Bucketed(Appearance):
         if missing:
             raise ValueError(f"the array {missing[0]} of textures is missing")
         sizes, texels = arrays["sizes"], arrays["texels"]
-        if sizes.ndim != 2 or sizes.shape[1] != 2 or texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
+        is_size = sizes.ndim == 2 and sizes.shape[1] == 2 and np.issubdtype(sizes.dtype, np.integer)
+        if not is_size or (sizes.size and not 0 <= sizes.min() <= sizes.max() <= MAX_SIDE):
+            raise ValueError(f"sizes must be integers [N, 2] in 0..{MAX_SIDE}; got {sizes.dtype} {sizes.shape}")
+        if texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
             raise ValueError(f"sizes [N, 2] and texels [M, 4] disagree; got {sizes.shape} and {texels.shape}")
         pieces = np.split(texels, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
         return textures_from_arrays([piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)])

@@ -135,8 +135,9 @@ def _without_empty(textures: Textures) -> Textures:
 
 
 def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
-    """The largest alpha of all texels, buckets' padding left out; where several are, they share its gradient."""
-    alphas = []
+    """The largest alpha of all texels, buckets' padding left out; where several are, they share its gradient. 1 where
+    all textures are empty."""
+    alphas = [jnp.ones(1, textures.buckets[0].dtype)] if not any(bucket.size for bucket in textures.buckets) else []
     for index, bucket in enumerate(textures.buckets):
         num_used = jnp.sum(layout.bucket == index, dtype=jnp.int32)
         is_used = jnp.arange(bucket.shape[0], dtype=jnp.int32) < num_used

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import appearance as built_in
-from a2tg_jax.appearance import Appearance, Plain, Textured
+from a2tg_jax.appearance import Appearance, Banded, Plain, Textured
 from a2tg_jax.checks import check_shape
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians, check_gaussians
@@ -90,14 +90,23 @@ def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appea
         shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
         appearance = Textured() if shown else Plain()
     params, layout = appearance.from_arrays(shown)
-    check_rows(appearance, params, layout, gaussians.num)
+    check_rows(appearance, params, layout, gaussians)
     of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
     origin = origin_of(header["origin"], of_origin) if "origin" in header else None
     return Model(gaussians, params, layout, appearance=appearance, origin=origin)
 
 
-def check_rows(appearance: Appearance, params: Any, layout: Any, num: int) -> None:
-    """Raises ValueError unless floats are shown, by as many rows as there are Gaussians."""
+def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaussians) -> None:
+    """Raises ValueError unless floats are shown, by as many rows as there are Gaussians, with bands above their own."""
+    if isinstance(appearance, Banded):
+        own, base = gaussians.sh_degree, layout.bands.base_degree
+        if own != base:
+            raise ValueError(f"Banded is of bands above degree {base}, but the Gaussians have degree {own}")
+        if layout.bands.num != gaussians.num:
+            raise ValueError(f"Banded is of {layout.bands.num} degrees, but there are {gaussians.num} Gaussians")
+        check_rows(appearance.inner, params.inner, layout.inner, gaussians)
+        return
+    num = gaussians.num
     for leaf in jax.tree.leaves(params):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(f"the parameters of {type(appearance).__name__} must be floats; got {leaf.dtype}")

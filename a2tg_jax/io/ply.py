@@ -72,7 +72,7 @@ def save_ply(
     if transform is not None:
         gaussians = transform_gaussians(gaussians, transform.inverse())
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, -1)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, 3 * (sh.shape[1] - 1))
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
     if third_scale:
         names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
@@ -178,7 +178,7 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     sh = np.zeros((len(vertices), 1 + len(rest) // 3, 3), np.float32)
     sh[:, 0] = columns(SH_DEGREE0)
     if rest:
-        per_channel = columns(rest).reshape(len(vertices), 3, -1)
+        per_channel = columns(rest).reshape(len(vertices), 3, len(rest) // 3)
         sh[:, 1:] = per_channel.transpose(0, 2, 1)
     quats, log_scales = columns(QUATS), columns(SCALES)
     if THIRD_SCALE in names:

@@ -99,7 +99,10 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
         losses = {"training views": loss_on_views(model, train, settings=settings)}
         return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
     if model.origin is None:
-        raise ValueError("the model does not know where it was trained, so there are no cameras to measure a loss with")
+        raise ValueError(
+            "the model does not know where it was trained, so there are no cameras to measure a loss "
+            "with: save_compact in Python, with choices of your own, needs none"
+        )
     pairs = zip(model.origin.cameras, model.origin.is_test, strict=True)
     cameras = [camera for camera, is_test in pairs if not is_test]
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS) or 1]

@@ -106,7 +106,9 @@ def resolutions_figure(picture: np.ndarray, num_levels: int) -> Figure:
     axes = figure.add_subplot()
     axes.imshow(picture)
     axes.set_axis_off()
-    handles = [Patch(color=color, label=str(2**i)) for i, color in enumerate(resolution_colors(num_levels))]
+    names = ["1 or none", *(str(2**level) for level in range(1, num_levels))]
+    colors = zip(resolution_colors(num_levels), names, strict=True)
+    handles = [Patch(color=color, label=name) for color, name in colors]
     figure.legend(
         handles=handles, title="texels per Gaussian", loc="outside lower center", ncols=num_levels, fontsize=9
     )

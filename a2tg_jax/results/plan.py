@@ -124,8 +124,7 @@ def _is_equal(a: Stage, b: Stage) -> bool:
 def fingerprint(system: System, index: int) -> str:
     """A text that two systems share where they make the same of a stage's start, in this process or another.
 
-    It tells classes and functions apart by module and name. What has its default is left out, so that an option that
-    is new changes nothing of what was trained before there was one.
+    It tells classes and functions apart by module and name, and is another one for another version's options.
 
     Raises:
       ValueError: if a stage holds a function without such a name, or a value that nothing is known of.
@@ -138,8 +137,8 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        described = ((field, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return _name_of(type(value)), tuple((field.name, x) for field, x in described if x != _default_of(field))
+        fields = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
+        return _name_of(type(value)), fields
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
     if isinstance(value, Mapping):
@@ -149,13 +148,6 @@ def _described(value: Any) -> Any:
     if isinstance(value, type) or callable(value):
         return _name_of(value)
     raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
-
-
-def _default_of(field: dataclasses.Field) -> Any:
-    """What is described of a field's default; something that nothing equals where it has none."""
-    if field.default is not dataclasses.MISSING:
-        return _described(field.default)
-    return object() if field.default_factory is dataclasses.MISSING else _described(field.default_factory())
 
 
 def _name_of(value: Any) -> str:

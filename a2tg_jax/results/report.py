@@ -95,10 +95,10 @@ def _summary(result: RunResult) -> str:
     titles, rows = summary_table(result)
     network = f" LPIPS with {result.lpips_network}." if result.lpips_network else ""
     note = (
-        "PSNR in dB, means over the views, images clipped to [0, 1]. MB (10⁶ bytes) counts all trained floats: 232 "
-        "bytes a Gaussian and what it shows, such as 16 bytes a texel; what a method's authors count, where that is "
-        "something else, and padding of the buffers stand beside it. Training is the time of each stage "
-        f"alone.{network}"
+        "PSNR in dB, means over the views, images clipped to [0, 1]. MB (10⁶ bytes) counts all trained floats: 52 to "
+        "232 bytes a Gaussian, by its degree, and what it shows, such as 16 bytes a texel; what a method's authors "
+        "count, where that is something else, and padding of the buffers stand beside it. Training is the time of each "
+        f"stage alone.{network}"
     )
     return f'<div class="cards">{tiles}</div>{_table(titles, rows)}<p class="soft">{escape(note)}</p>'
 

@@ -7,11 +7,12 @@ from typing import Any, ClassVar, Self
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured, TextureOptions
 from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
-from a2tg_jax.events import Event
+from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.gaussians import floats_per_gaussian
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.stage1 import QUICK, QUICK_TEXELS, SMOKE, growing_stage, later_stage
+from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.view_dependence import AdaptDegrees
@@ -63,13 +64,17 @@ class Bytewise(System):
 
     stage1_iterations: int = 30_000
     stage2_iterations: int = 30_000
-    sh_degree: int = 0
-    """Degree of spherical harmonics that all Gaussians have, 0 to 3; those that need it get more."""
+    base_degree: int = 0
+    """Degree of spherical harmonics that all Gaussians have; those that need it get more, up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
     view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
     texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
 
     name: ClassVar[str] = "bytewise"
+
+    @property
+    def initial_sh_degree(self) -> int:
+        return self.base_degree
 
     def stages(self) -> tuple[Stage, ...]:
         shown, rates = self._appearance()
@@ -80,12 +85,12 @@ class Bytewise(System):
     def _num_gaussians(self) -> int:
         """As many as there is room for beside degrees and texels."""
         share = self.view_dependence.share + self.texture.share
-        num = self.budget_cap(floats_per_gaussian(self.sh_degree) * share / (1 - share))
+        num = self.budget_cap(floats_per_gaussian(self.base_degree) * share / (1 - share))
         return math.floor(self.densify.cap * (1 - share)) if num is None else num
 
     def _num_bytes(self) -> int:
         """Of all that there is in the end."""
-        own = int(bytes_per_gaussian(self.sh_degree))
+        own = int(bytes_per_gaussian(self.base_degree))
         return self.densify.cap * own if self.budget_bytes is None else self.budget_bytes
 
     def _appearance(self) -> tuple[Banded, BandedRates]:
@@ -101,7 +106,8 @@ class Bytewise(System):
         view, texture = self.view_dependence, self.texture
         events: list[Event] = []
         if view.share:
-            events.append(AdaptDegrees(megabytes * (1 - texture.share), at=view.at, idle=view.idle))
+            most = megabytes * (1 - texture.share)
+            events.append(AdaptDegrees(most, at=view.at, highest=self.sh_degree, idle=view.idle))
         if texture.share:
             events.append(Upscale("budget", budget_mb=megabytes, cap=texture.cap, at=texture.at))
         return tuple(events)
@@ -116,21 +122,45 @@ class Bytewise(System):
         }
 
     def check(self) -> None:
+        self._check_numbers()
+        view, texture = self.view_dependence, self.texture
+        ranges = {
+            "base_degree": (self.base_degree, 0, self.sh_degree),
+            "view_dependence.share": (view.share, 0, 1),
+            "view_dependence.rate": (view.rate, 0, math.inf),
+            "view_dependence.idle": (view.idle, 0, math.inf),
+            "texture.share": (texture.share, 0, 1),
+            "texture.rate": (texture.rate, 0, math.inf),
+            "texture.cap": (texture.cap, 1, MAX_SIDE),
+        }
+        for name, (value, least, most) in ranges.items():
+            if not least <= value <= most:
+                raise ValueError(f"{name} must lie in {least}..{most}; got {value}")
+        if view.share + texture.share >= 1:
+            raise ValueError(
+                "view_dependence.share and texture.share must leave bytes for Gaussians, adding up to less than 1; "
+                f"got {view.share} and {texture.share}"
+            )
+        if view.share and self.base_degree == self.sh_degree:
+            raise ValueError(
+                f"view_dependence.share must be 0 where all Gaussians have the highest degree, {self.sh_degree}, "
+                f"already: set it so, or lower base_degree; got {view.share}"
+            )
+        self._check_times()
         if self._num_gaussians() < 2:
             raise ValueError(f"densify.cap must leave room for 2 Gaussians; got {self.densify.cap}")
-        for name, share in (
-            ("view_dependence.share", self.view_dependence.share),
-            ("texture.share", self.texture.share),
-        ):
-            if not 0 <= share < 1:
-                raise ValueError(f"{name} must lie in [0, 1); got {share}")
-        if self.view_dependence.share + self.texture.share >= 1:
-            raise ValueError(
-                "view_dependence.share and texture.share must leave bytes for Gaussians: their sum is 1 or more"
-            )
-        if self.texture.share and self.view_dependence.at[-1:] > self.texture.at[:1]:
+        super().check()
+
+    def _check_times(self) -> None:
+        """Refuses times that do not exist, or at which degrees find the bytes taken by textures."""
+        view, texture = self.view_dependence, self.texture
+        asked = {"view_dependence.at": (view.share, view.at), "texture.at": (texture.share, texture.at)}
+        times = {name: iterations_at(at, self.stage2_iterations, name) for name, (share, at) in asked.items() if share}
+        for name, found in times.items():
+            if not found:
+                raise ValueError(f"{name} must say when its share of the bytes is spent; it is empty")
+        if len(times) == 2 and times["view_dependence.at"][-1] > times["texture.at"][0]:
             raise ValueError(
                 "view_dependence.at must be over when textures begin to take the rest of the bytes, at "
-                f"texture.at {self.texture.at}; got {self.view_dependence.at}"
+                f"texture.at {texture.at}; got {view.at}"
             )
-        super().check()

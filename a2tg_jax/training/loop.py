@@ -247,3 +247,9 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
     if resume.system != system:
         raise ValueError("the checkpoint was made with another configuration: resume with checkpoint.system")
+    found, wanted = resume.state.model.gaussians.sh_degree, system.initial_sh_degree
+    if found != wanted:
+        raise ValueError(
+            f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
+            "version, so train anew"
+        )

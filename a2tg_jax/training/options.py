@@ -74,6 +74,11 @@ class System:
         object.__setattr__(self, "memory_budget", megabytes_of(self.memory_budget))
 
     @property
+    def initial_sh_degree(self) -> int:
+        """Degree of spherical harmonics of the Gaussians that training starts from."""
+        return self.sh_degree
+
+    @property
     def budget_bytes(self) -> int | None:
         """The memory budget in bytes; None where there is none."""
         megabytes = megabytes_of(self.memory_budget)
@@ -90,7 +95,7 @@ class System:
         """
         if self.budget_bytes is None:
             return None
-        needed = bytes_per_gaussian(self.sh_degree, floats)
+        needed = bytes_per_gaussian(self.initial_sh_degree, floats)
         cap = int(self.budget_bytes // needed)
         has_room = f"memory_budget of {self.memory_budget} MB has room for {cap:,} Gaussians of {needed:,.0f} bytes"
         if cap < 2:

@@ -19,11 +19,8 @@ KEY_OF_PARAMETERS = 0x7E8E1
 def initial_model(scene: Scene, system: System) -> Model:
     """Gaussians at the scene's points, as many as the first stage has room for."""
     num = _initial_number(scene, system)
-    return Model(
-        init_from_points(
-            scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=system.sh_degree
-        )
-    )
+    opacity, sh_degree = system.initial_opacity, system.initial_sh_degree
+    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=opacity, sh_degree=sh_degree))
 
 
 def check_start(scene: Scene, system: System) -> None:
@@ -60,8 +57,11 @@ def padded(model: Model, stage: Stage, system: System) -> Model:
         key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS)
         params, layout = stage.appearance.allocate(key, gaussians)
     if model.appearance == stage.appearance and room > num:
-        if _rows_of(params) != _rows_of(model.params):
-            raise ValueError(f"stage {stage.name!r} would add Gaussians to a model whose textures have grown already")
+        leaves = zip(jax.tree.leaves(params), jax.tree.leaves(model.params), strict=False)
+        if _rows_of(params) != _rows_of(model.params) or any(len(new) < len(old) for new, old in leaves):
+            raise ValueError(
+                f"stage {stage.name!r} would add Gaussians to a model whose textures or degrees have grown already"
+            )
         params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
     return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
 

@@ -252,6 +252,8 @@ def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool 
 
 def estimated_bytes(job: Job) -> float:
     """About what a job takes, so that no more are run at once than fit."""
+    if job.system.budget_bytes is not None:
+        return BASE_BYTES + COPIES * job.system.budget_bytes
     densify = getattr(job.system, "densify", None)
     texture = getattr(job.system, "texture", None)
     side = getattr(texture, "side", None) or getattr(texture, "cap", None) or 1

@@ -1,0 +1,96 @@
+"""The system that spends bytes where they pay: what its options lead to, and which it refuses before training."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import a2tg_jax as a2tg
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.results.record import compared_system
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.training.registry import with_changes
+from a2tg_jax.view_dependence import AdaptDegrees
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=120)
+
+
+def smoke(**changes) -> Bytewise:
+    short = {"stage1_iterations": 60, "stage2_iterations": 20, "memory_budget": "40kB", "initial_gaussians": None}
+    return with_changes(Bytewise.preset("smoke"), {**short, **changes}, "test")
+
+
+@pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
+def test_presets_can_be_trained(preset):
+    Bytewise.preset(preset).check()
+
+
+@pytest.mark.parametrize(
+    "base_degree, shares", [(0, (0.1, 0.05)), (1, (0.1, 0.05)), (0, (0.2, 0.0)), (2, (0.0, 0.1)), (0, (0.0, 0.0))]
+)
+def test_every_mix_fills_its_bytes(scene, base_degree, shares):
+    view, texture = shares
+    system = smoke(base_degree=base_degree, view_dependence={"share": view}, texture={"share": texture})
+    result = a2tg.fit(scene, system, progress=False)
+    model = result.model
+    assert result.history.megabytes.max() <= 0.04
+    assert 0.995 * 40_000 <= model.num_bytes <= 40_000
+    degrees = model.layout.bands.degrees
+    assert degrees.min() == base_degree and (degrees.max() > base_degree) == (view > 0)
+    assert (model.textures is not None) == (texture > 0)
+    if texture:
+        assert 0 < (model.textures[1].sizes > 0).any(axis=1).sum() < model.num
+
+
+def test_the_highest_degree_is_kept(scene):
+    model = a2tg.fit(scene, smoke(sh_degree=1, view_dependence={"share": 0.2}), progress=False).model
+    assert set(np.unique(model.layout.bands.degrees)) == {0, 1}
+
+
+def test_without_a_budget_the_cap_says_how_many_bytes():
+    system = dataclasses.replace(Bytewise.preset("quick"), memory_budget=None)
+    degrees, textures = system.stages()[1].events
+    assert isinstance(degrees, AdaptDegrees) and isinstance(textures, Upscale)
+    assert textures.budget_mb == pytest.approx(52e-6 * system.densify.cap)
+    assert degrees.budget_mb == pytest.approx(0.95 * textures.budget_mb)
+
+
+def test_beside_another_system_it_stays_what_it_is():
+    other = a2tg.A2tg.preset("quick")
+    beside = compared_system("bytewise", other, "quick")
+    assert beside.initial_sh_degree == 0 and beside.sh_degree == 3
+    assert compared_system("gaussians-2d-mcmc", Bytewise.preset("quick"), "quick").initial_sh_degree == 3
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"texture": {"share": 0.5}, "view_dependence": {"share": 0.5}}, "must leave bytes for Gaussians"),
+        ({"texture": {"share": 1.5}}, "texture.share must lie in 0..1; got 1.5"),
+        ({"view_dependence": {"share": -0.1}}, "view_dependence.share must lie in 0..1; got -0.1"),
+        ({"texture": {"rate": -1.0}}, "texture.rate must lie in 0..inf"),
+        ({"texture": {"cap": 32}}, "texture.cap must lie in 1..16; got 32"),
+        ({"view_dependence": {"idle": -1.0}}, "view_dependence.idle must lie in 0..inf"),
+        ({"sh_degree": 4}, "sh_degree must lie in 0..3"),
+        ({"base_degree": 2, "sh_degree": 1}, "base_degree must lie in 0..1; got 2"),
+        ({"base_degree": 3}, "view_dependence.share must be 0 where all Gaussians have the highest degree, 3"),
+        ({"texture": {"at": [0.5, 0.2]}}, "texture.at must be ascending"),
+        ({"texture": {"at": []}}, "texture.at must say when"),
+        ({"view_dependence": {"at": [0.5]}}, "view_dependence.at must be over when textures begin"),
+        ({"memory_budget": None, "densify": {"cap": 2}}, "densify.cap must leave room for 2 Gaussians"),
+        ({"memory_budget": "0.06kB"}, "has room for 0 Gaussians"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        smoke(**changes).check()
+
+
+def test_the_authors_alpha_can_be_had_without_any_texture(scene):
+    """All textures are empty at first, and the largest alpha is that of none."""
+    lookup = {"alpha": "global-maximum", "rgb": "unit"}
+    model = a2tg.fit(scene, smoke(texture={"lookup": lookup}), progress=False).model
+    assert np.isfinite(model.render(scene.test[0].camera).color).all()
