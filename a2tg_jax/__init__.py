@@ -48,6 +48,7 @@ from a2tg_jax.io.model import load_model as load_model
 from a2tg_jax.io.model import save_model as save_model
 from a2tg_jax.io.ply import load_ply as load_ply
 from a2tg_jax.io.ply import save_ply as save_ply
+from a2tg_jax.least_squares import polish as polish
 from a2tg_jax.losses import normal_consistency as normal_consistency
 from a2tg_jax.losses import photometric_loss as photometric_loss
 from a2tg_jax.mcmc import FillingMcmc as FillingMcmc

@@ -45,8 +45,8 @@ def degree_mask(degree) -> Array:
     return degrees <= jnp.asarray(degree, jnp.int32)
 
 
-def sh_colors(sh: Array, means: Array, center: Array, degree) -> Array:
-    """View-dependent colours [N, 3], max(Σ Y_l·sh_l + 0.5, 0).
+def sh_sum(sh: Array, means: Array, center: Array, degree) -> Array:
+    """View-dependent sums [N, 3], Σ Y_l·sh_l; colours are max(sum + 0.5, 0).
 
     Args:
       sh: [N, K, 3] coefficients, K being 1, 4, 9 or 16.
@@ -54,11 +54,6 @@ def sh_colors(sh: Array, means: Array, center: Array, degree) -> Array:
       center: [3] camera centre in the world.
       degree: highest degree used, 0 to 3, an int or a traced integer.
     """
-    return jnp.maximum(sh_sum(sh, means, center, degree) + 0.5, 0.0)
-
-
-def sh_sum(sh: Array, means: Array, center: Array, degree) -> Array:
-    """[N, 3] Σ Y_l·sh_l, of either sign; arguments as `sh_colors`."""
     directions = normalize(means - center[None, :])
     basis = jnp.where(degree_mask(degree)[None, :], sh_basis(directions), 0.0)[:, : sh.shape[1]]
     # A sum, which CPUs do several times faster than many small matrix products.

@@ -29,6 +29,7 @@ LAYERS = (
     {"events"},
     {"adapt", "mcmc", "densify", "view_dependence"},
     {"splitting"},
+    {"least_squares"},
     {"training"},
     {"systems", "evaluation", "compaction"},
     {"results"},

@@ -15,6 +15,7 @@ from a2tg_jax.appearance.movable_kernels import MovableKernelsRule as MovableKer
 from a2tg_jax.appearance.plain import Plain as Plain
 from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
 from a2tg_jax.appearance.rule import PlainRule as PlainRule
+from a2tg_jax.appearance.rule import RuleAround as RuleAround
 from a2tg_jax.appearance.rule import StaticRule as StaticRule
 from a2tg_jax.appearance.rule import gaussian_cutoff as gaussian_cutoff
 from a2tg_jax.appearance.textured import TexelRates as TexelRates

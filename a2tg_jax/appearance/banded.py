@@ -10,11 +10,9 @@ from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.plain import Plain
-from a2tg_jax.appearance.rule import AppearanceRule
-from a2tg_jax.bilinear import TextureRegion
+from a2tg_jax.appearance.rule import RuleAround
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.sh import sh_sum
 from a2tg_jax.sh_bands import (
     BandLayout,
     Bands,
@@ -57,51 +55,15 @@ class BandedRates(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class BandedRule(AppearanceRule):
+class BandedRule(RuleAround):
     """Another rule, with colours of more spherical harmonics for some Gaussians."""
 
-    inner: AppearanceRule
     bands: Bands
     layout: BandLayout
 
-    @property
-    def max_alpha(self) -> float:  # type: ignore[override]
-        return self.inner.max_alpha
-
-    @property
-    def has_low_pass(self) -> bool:  # type: ignore[override]
-        return self.inner.has_low_pass
-
-    @property
-    def texels(self) -> Array:  # type: ignore[override]
-        return self.inner.texels
-
-    @property
-    def regions(self) -> TextureRegion | None:  # type: ignore[override]
-        return self.inner.regions
-
-    def colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        own = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
-        added = band_colors(self.bands, self.layout, gaussians.means, camera.center, degree)
-        return jnp.maximum(own + added + 0.5, 0.0)
-
-    def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
-        return self.inner.numbers(gaussians, camera)
-
-    def opacities(self, gaussians: Gaussians) -> Array:
-        return self.inner.opacities(gaussians)
-
-    def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
-        return self.inner.texel_position(region, u, v)
-
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
-        return self.inner.shade(numbers, values, u, v)
-
-    def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
-        return self.inner.falloff(numbers, rho)
-
-    def cutoff(self, opacities: Array) -> Array:
-        return self.inner.cutoff(opacities)
+    def color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        own = self.inner.color_sums(gaussians, camera, degree)
+        return own + band_colors(self.bands, self.layout, gaussians.means, camera.center, degree)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import classes_of
 from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.sh import sh_colors
+from a2tg_jax.sh import sh_sum
 
 Residual = tuple[Array, Array, Array] | None
 """Added to red, green and blue; None stands for 0."""
@@ -58,7 +58,11 @@ class AppearanceRule:
 
     def colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
         """[N, 3] colours in this view, of spherical harmonics up to `degree`, which may be traced."""
-        return sh_colors(gaussians.sh, gaussians.means, camera.center, degree)
+        return jnp.maximum(self.color_sums(gaussians, camera, degree) + 0.5, 0.0)
+
+    def color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        """[N, 3] the spherical harmonics' sums, of either sign, from which `colors` makes colours; linear in them."""
+        return sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         """(x, y) where a texture is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""
@@ -96,6 +100,51 @@ class PlainRule(AppearanceRule):
     @property
     def regions(self) -> None:  # type: ignore[override]
         return None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RuleAround(AppearanceRule):
+    """Shows what another rule shows; what derives from it changes some of that."""
+
+    inner: AppearanceRule
+
+    @property
+    def max_alpha(self) -> float:  # type: ignore[override]
+        return self.inner.max_alpha
+
+    @property
+    def has_low_pass(self) -> bool:  # type: ignore[override]
+        return self.inner.has_low_pass
+
+    @property
+    def texels(self) -> Array:  # type: ignore[override]
+        return self.inner.texels
+
+    @property
+    def regions(self) -> TextureRegion | None:  # type: ignore[override]
+        return self.inner.regions
+
+    def color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        return self.inner.color_sums(gaussians, camera, degree)
+
+    def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
+        return self.inner.numbers(gaussians, camera)
+
+    def opacities(self, gaussians: Gaussians) -> Array:
+        return self.inner.opacities(gaussians)
+
+    def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
+        return self.inner.texel_position(region, u, v)
+
+    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+        return self.inner.shade(numbers, values, u, v)
+
+    def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
+        return self.inner.falloff(numbers, rho)
+
+    def cutoff(self, opacities: Array) -> Array:
+        return self.inner.cutoff(opacities)
 
 
 @dataclasses.dataclass(frozen=True)

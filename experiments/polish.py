@@ -1,0 +1,83 @@
+"""What least squares on colours and texels, shapes being held, brings to models that are trained: no byte more.
+
+    python experiments/polish.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
+
+What was measured is kept in polish.json.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from lab import tables
+from lab.cli import Experiment, Lab, main
+from lab.grid import Grid
+from lab.jobs import MOST_TRAIN_VIEWS, background_of
+
+import a2tg_jax as a2tg
+from a2tg_jax.results.folder import read_json, write_json
+
+NUM_STEPS = (2, 5, 10)
+METHODS = ("Bytewise", "2DGS*-MCMC", "2DGS*-MCMC, degree 0", "A²TG, as quick has it")
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """A table of the models that are there, each measured once."""
+    path = lab.out / f"{EXPERIMENT.name}.json"
+    measured = read_json(path) if path.is_file() else {}
+    rows, gains = [], []
+    for result in tables.results_of(grids[0], lab.records):
+        key = result.run.job.key
+        is_wanted = result.label in METHODS and key not in measured and not lab.args.tables_only
+        model = lab.model(result) if is_wanted else None
+        if model is not None:
+            measured[key] = _measure(lab, result, model)
+            lab.out.mkdir(parents=True, exist_ok=True)
+            write_json(path, measured)
+        if key in measured:
+            found = measured[key]
+            shown = [_told(found[str(steps)], found["0"]) for steps in NUM_STEPS]
+            gains.append([found[str(steps)]["psnr"] - found["0"]["psnr"] for steps in NUM_STEPS])
+            size = f"{result.run.cell.budget:g} MB"
+            rows.append([result.run.cell.scene.label, size, result.label, f"{found['0']['psnr']:.2f}", *shown])
+    if gains:
+        means = [f"{gain:+.2f}" for gain in np.mean(gains, axis=0)]
+        rows.append(["*mean*", "", "", "", *means])
+    header = [
+        "scene",
+        "bytes",
+        "method",
+        "test PSNR",
+        *(f"{steps} steps: dB · LPIPS · train dB" for steps in NUM_STEPS),
+    ]
+    lab.write(EXPERIMENT.name, f"# The least squares of colours\n\n{tables.markdown(header, rows)}")
+
+
+def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, dict[str, float]]:
+    """Quality before, and after so many steps."""
+    scene = lab.folders.load_scene(result.run.job)
+    background = background_of(scene)
+    found = {"0": _quality(lab, scene, model, background)}
+    for steps in NUM_STEPS:
+        start = time.perf_counter()
+        polished = a2tg.polish(model, scene.train, num_steps=steps, background=background)
+        found[str(steps)] = {"seconds": time.perf_counter() - start, **_quality(lab, scene, polished, background)}
+    return found
+
+
+def _quality(lab: Lab, scene: a2tg.Scene, model: a2tg.Model, background) -> dict[str, float]:
+    train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
+    test = a2tg.evaluate(scene.test, model, background=background, lpips_weights=lab.folders.lpips_weights)
+    lpips = float("nan") if test.lpips is None else test.lpips
+    return {"psnr": test.psnr, "lpips": lpips, "train": a2tg.evaluate(train, model, background=background).psnr}
+
+
+def _told(after: Mapping[str, float], before: Mapping[str, float]) -> str:
+    psnr, lpips, train = (after[figure] - before[figure] for figure in ("psnr", "lpips", "train"))
+    return f"{psnr:+.2f} · {tables.MISSING if np.isnan(lpips) else f'{lpips:+.3f}'} · {train:+.2f}"
+
+
+EXPERIMENT = Experiment("polish", ("equal_bytes",), present)
+
+if __name__ == "__main__":
+    main([EXPERIMENT], __doc__)

@@ -1,0 +1,97 @@
+"""Least squares on colours: linear where it says so, and at the optimum that dense linear algebra finds."""
+
+import dataclasses
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_view_dependence import banded
+
+import a2tg_jax as a2tg
+from a2tg_jax.appearance import Billboards, Plain, Textured
+from a2tg_jax.data import View
+from a2tg_jax.least_squares import colors_of, draw_change, polish, with_colors
+from a2tg_jax.render import plan_render
+
+
+def some_views(model, camera, seed: int = 0, num: int = 3) -> list[View]:
+    """Photographs that the model does not show, from cameras around."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for index in range(num):
+        viewmat = camera.viewmat.at[:3, 3].add(jnp.asarray(rng.normal(size=3) * 0.1, camera.viewmat.dtype))
+        image = rng.integers(0, 256, (camera.height, camera.width, 3), np.uint8)
+        views.append(View(f"{index}.png", dataclasses.replace(camera, viewmat=viewmat), image))
+    return views
+
+
+def total_error(model, views) -> float:
+    images = [np.asarray(view.image, np.float64) / 255 for view in views]
+    return sum(
+        float(np.square(np.asarray(model.render(v.camera).color) - i).sum()) for v, i in zip(views, images, strict=True)
+    )
+
+
+@pytest.mark.parametrize("inner", [Plain(), Textured((2, 1)), Textured((0, 0))])
+def test_a_change_adds_what_it_draws(inner):
+    model, _, camera = banded(1, inner=inner)
+    rng = np.random.default_rng(0)
+    change = jax.tree.map(lambda x: jnp.asarray(1e-3 * rng.normal(size=x.shape), x.dtype), colors_of(model))
+    settings = plan_render(model.gaussians, camera, rule=model.rule)
+    after = with_colors(model, jax.tree.map(jnp.add, colors_of(model), change))
+    drawn = draw_change(model, change, camera, settings)
+    before, later = (one.render(camera, background=(0.2, 0.1, 0.3)).color for one in (model, after))
+    assert np.abs(drawn).max() > 1e-4
+    np.testing.assert_allclose(later - before, drawn, atol=2e-6)
+
+
+@pytest.mark.usefixtures("x64")
+def test_many_steps_are_at_the_least_error():
+    """That of a dense matrix, column by column, solved by numpy."""
+    model, _, camera = banded(2, base=1, dtype="float64", inner=Textured((1, 2)))
+    model = dataclasses.replace(model, gaussians=model.gaussians, num_live=jnp.int32(4)).live
+    # Half a grey above zero, no colour is cut off before or after.
+    model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=0.1 * model.gaussians.sh))
+    views = some_views(model, camera, num=2)
+    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    flat, unflatten = jax.flatten_util.ravel_pytree(colors_of(model))
+    columns = [
+        np.concatenate([np.ravel(draw_change(model, unflatten(unit), view.camera, settings)) for view in views])
+        for unit in np.eye(len(flat))
+    ]
+    J, ridge = np.stack(columns, axis=1), 0.5
+    residual = np.concatenate([np.ravel(v.image / 255 - model.render(v.camera).color) for v in views])
+    expected = np.linalg.solve(J.T @ J + ridge * np.eye(len(flat)), J.T @ residual)
+    found, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=200, ridge=ridge)))
+    np.testing.assert_allclose(found - flat, expected, atol=1e-4)
+
+
+def test_a_few_steps_lower_the_error_and_leave_the_rest():
+    model, _, camera = banded(3, inner=Textured((2, 2)))
+    views = some_views(model, camera)
+    errors = [total_error(model, views), *(total_error(polish(model, views, num_steps=n), views) for n in (1, 5))]
+    assert errors[0] > errors[1] > errors[2]
+    after = polish(model, views)
+    for field in ("means", "quats", "log_scales", "logit_opacities"):
+        np.testing.assert_array_equal(getattr(after.gaussians, field), getattr(model.gaussians, field))
+    assert after.num_bytes == model.num_bytes
+    alphas = [[bucket[..., 3] for bucket in m.textures[0].buckets] for m in (model, after)]
+    jax.tree.map(np.testing.assert_array_equal, *alphas)
+
+
+def test_plain_models_of_every_degree_are_polished():
+    for base in range(4):
+        _, plain, camera = banded(1, base)
+        views = some_views(plain, camera)
+        assert total_error(polish(plain, views, num_steps=2), views) < total_error(plain, views)
+
+
+def test_what_is_not_linear_is_refused():
+    model, _, camera = banded(1)
+    with pytest.raises(ValueError, match="views must hold at least one view"):
+        polish(model, [])
+    other = a2tg.Model(model.gaussians, *Billboards(3).allocate(None, model.gaussians), appearance=Billboards(3))
+    with pytest.raises(ValueError, match="not linear in what Billboards shows"):
+        polish(other, some_views(model, camera))
