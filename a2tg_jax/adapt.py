@@ -18,9 +18,8 @@ from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, iteration
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
-from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
+from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
 
-BYTES_PER_TEXEL = 16
 PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 """Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and what short stages need, where

@@ -16,12 +16,11 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax import losses
+from a2tg_jax.budget import BYTES_PER_FLOAT
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.numerics import safe_norm
-from a2tg_jax.texture import AtlasLayout
+from a2tg_jax.texture import BYTES_PER_TEXEL, AtlasLayout
 
-BYTES_PER_FLOAT = 4
-BYTES_PER_TEXEL = 16
 LPIPS_MIN_SIDE = 32
 LPIPS_LINEAR_LAYERS = {"alex": 5, "squeeze": 7}
 

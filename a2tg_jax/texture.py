@@ -19,6 +19,7 @@ from jax import Array
 from a2tg_jax.checks import check_floats, check_shape, short_repr
 
 MAX_SIDE = 16
+BYTES_PER_TEXEL = 16
 NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)
 KNOWN_SLACK = 1.25
 

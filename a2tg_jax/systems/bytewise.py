@@ -33,7 +33,7 @@ class ViewDependenceConfig:
     """Spherical harmonics above the Gaussians' own degree."""
 
     share: float = 0.1
-    """Of the memory budget; 0: none."""
+    """Of the bytes; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
     idle: float = 0.0
@@ -47,7 +47,7 @@ class DetailTextureConfig:
     """Textures of the Gaussians that get one."""
 
     share: float = 0.05
-    """Of the memory budget; 0: none."""
+    """Of the bytes; 0: none."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     cap: int = 4

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
+from a2tg_jax.budget import BYTES_PER_FLOAT
 from a2tg_jax.training.registry import merged, with_changes
 from lab.jobs import Job, Record
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
-BYTES_PER_FLOAT = 4
 
 
 @dataclasses.dataclass(frozen=True)
