@@ -18,7 +18,6 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.folder import read_json, write_json
 
 NUM_STEPS = (2, 5, 10)
-METHODS = ("Bytewise", "2DGS*-MCMC", "2DGS*-MCMC, degree 0", "A²TG, as quick has it")
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -28,8 +27,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     rows, gains = [], []
     for result in tables.results_of(grids[0], lab.records):
         key = result.run.job.key
-        is_wanted = result.label in METHODS and key not in measured and not lab.args.tables_only
-        model = lab.model(result) if is_wanted else None
+        model = None if key in measured or lab.args.tables_only else lab.model(result)
         if model is not None:
             measured[key] = _measure(lab, result, model)
             lab.out.mkdir(parents=True, exist_ok=True)
@@ -50,7 +48,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         "test PSNR",
         *(f"{steps} steps: dB · LPIPS · train dB" for steps in NUM_STEPS),
     ]
-    lab.write(EXPERIMENT.name, f"# The least squares of colours\n\n{tables.markdown(header, rows)}")
+    lab.write(EXPERIMENT.name, f"# {grids[0].title}\n\n{tables.markdown(header, rows)}")
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, dict[str, float]]:
@@ -77,7 +75,7 @@ def _told(after: Mapping[str, float], before: Mapping[str, float]) -> str:
     return f"{psnr:+.2f} · {tables.MISSING if np.isnan(lpips) else f'{lpips:+.3f}'} · {train:+.2f}"
 
 
-EXPERIMENT = Experiment("polish", ("equal_bytes",), present)
+EXPERIMENT = Experiment("polish", ("polish",), present)
 
 if __name__ == "__main__":
     main([EXPERIMENT], __doc__)
