@@ -11,7 +11,7 @@ COLORS = {
     "A²TG": "#cc3311", "2DGS*-MCMC": "#4477aa", "Textured Gaussians*": "#228833", "SuperGaussians": "#aa3377",
     "BBSplat": "#ccaa33", "2DGS*": "#66ccee", "A²TG, as quick has it": "#ee7733",
     "Bytewise": "#000000", "Bytewise, untextured": "#888888", "2DGS*-MCMC, degree 0": "#88ccee",
-    "2DGS*-MCMC, degree 1": "#44aa99", "2DGS*-MCMC, degree 2": "#117733",
+    "2DGS*-MCMC, degree 1": "#44aa99", "2DGS*-MCMC, degree 2": "#ddaa33",
 }  # fmt: skip
 OTHER_COLOR = "#777777"
 Point = tuple[float, float]
