@@ -71,7 +71,7 @@ def number_to_reach(num: Array, cap: int, num_left: Any) -> Array:
     return jnp.where(num_left > 1, jnp.clip(wanted.astype(jnp.int32), num, cap), cap)
 
 
-def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget: float) -> np.ndarray:
+def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget_bytes: float) -> np.ndarray:
     """[N] who is chosen: in descending order of statistic per byte each that still fits into the budget.
 
     What stays unspent is less than the cheapest candidate that was not chosen.
@@ -80,13 +80,14 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
       statistic: [N] of what is gained, at least 0.
       can_grow: [N] the candidates.
       cost: [N] bytes, positive for candidates.
-      budget: bytes.
+      budget_bytes: what may be spent.
 
     Raises:
       ValueError: if the budget is negative.
     """
-    if not budget >= 0:
-        raise ValueError(f"budget must be at least 0; got {budget}")
+    if not budget_bytes >= 0:
+        raise ValueError(f"budget_bytes must be at least 0; got {budget_bytes}")
+    budget = budget_bytes
     candidates = np.flatnonzero(can_grow & (statistic >= 0))
     gain = statistic[candidates].astype(np.float64) / cost[candidates]
     queue = candidates[np.argsort(-gain, kind="stable")]
