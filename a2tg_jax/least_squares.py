@@ -47,7 +47,7 @@ class GivenColors(RuleAround):
     given: Array
     """[N, 3]."""
 
-    def colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
         return self.given
 
 
@@ -124,9 +124,9 @@ def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSett
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
     """[H, W, 3] what a change of the colours adds to a picture; linear in it."""
-    is_shown = model.rule.color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
+    is_shown = model.rule.own_color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
-    sums = changed.rule.color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
+    sums = changed.rule.own_color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
     rule = GivenColors(changed.rule, jnp.where(is_shown, sums, 0.0))
     black = jnp.zeros(3, model.gaussians.means.dtype)
     output, _ = render_traced(model.gaussians, camera, rule, black, settings, has_geometry=False)

@@ -83,7 +83,7 @@ def project_gaussians(
     M, normals = homographies(gaussians, camera)
     opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
     _check_rule(rule, opacities, numbers, gaussians.num)
-    colors = rule.colors(gaussians, camera, sh_degree)
+    colors = rule.own_colors(gaussians, camera, sh_degree)
     # Not >=: a depth that is no number is not behind the camera.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:

@@ -61,8 +61,8 @@ class BandedRule(RuleAround):
     bands: Bands
     layout: BandLayout
 
-    def color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        own = self.inner.color_sums(gaussians, camera, degree)
+    def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        own = self.inner.own_color_sums(gaussians, camera, degree)
         return own + band_colors(self.bands, self.layout, gaussians.means, camera.center, degree)
 
 

@@ -56,12 +56,12 @@ class AppearanceRule:
         """[N] peak opacities."""
         return gaussians.opacities
 
-    def colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
         """[N, 3] colours in this view, of spherical harmonics up to `degree`, which may be traced."""
-        return jnp.maximum(self.color_sums(gaussians, camera, degree) + 0.5, 0.0)
+        return jnp.maximum(self.own_color_sums(gaussians, camera, degree) + 0.5, 0.0)
 
-    def color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        """[N, 3] the spherical harmonics' sums, of either sign, from which `colors` makes colours; linear in them."""
+    def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        """[N, 3] the sums of spherical harmonics, of either sign, that `own_colors` makes colours of; linear in them."""
         return sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
@@ -125,8 +125,8 @@ class RuleAround(AppearanceRule):
     def regions(self) -> TextureRegion | None:  # type: ignore[override]
         return self.inner.regions
 
-    def color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        return self.inner.color_sums(gaussians, camera, degree)
+    def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        return self.inner.own_color_sums(gaussians, camera, degree)
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
         return self.inner.numbers(gaussians, camera)
