@@ -61,7 +61,7 @@ class AppearanceRule:
         return jnp.maximum(self.own_color_sums(gaussians, camera, degree) + 0.5, 0.0)
 
     def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        """[N, 3] the sums of spherical harmonics, of either sign, that `own_colors` makes colours of; linear in them."""
+        """[N, 3] sums of spherical harmonics, of either sign, that `own_colors` makes colours of; linear in them."""
         return sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
