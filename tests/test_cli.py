@@ -161,7 +161,7 @@ def test_help_tells_the_options_of_a_system(capsys, name):
     text = capsys.readouterr().out
     assert ("--densify.threshold" in text) == (name in ("gaussians-2d", "supergaussians"))
     assert ("--texture.side" in text) == (name == "textured-gaussians")
-    assert ("--texture.lookup.uv" in text) == (name in ("textured-gaussians", "a2tg"))
+    assert ("--texture.lookup.uv" in text) == (name in ("textured-gaussians", "a2tg", "bytewise"))
     assert ("--billboard.side" in text) == (name == "bbsplat")
 
 

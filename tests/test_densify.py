@@ -128,7 +128,9 @@ def test_average_is_of_the_views_that_saw_the_gaussian_in_half_images():
     probe = jnp.asarray(np.concatenate([gradients, np.float32(5) * is_visible[..., None]], axis=-1))
     camera = Camera(jnp.zeros((3, 4, 4)), jnp.zeros((3, 3, 3)), 640, 480)
     event, model = CloneSplitPrune(NUM), random_model(0)
-    state = event.observe(event.init(model), model, Seen(camera, *read_probe(probe, "center", 640, 480)))
+    state = event.observe(
+        event.init(model), model, Seen(camera, *read_probe(probe, "center", 640, 480), jnp.zeros_like(probe[..., :3]))
+    )
     for row in range(NUM):
         seen = [np.hypot(*(gradients[view, row, :2] * (320, 240))) for view in range(3) if is_visible[view, row]]
         np.testing.assert_allclose(state.average()[row], np.mean(seen) if seen else 0, rtol=1e-5)

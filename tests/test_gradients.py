@@ -69,7 +69,9 @@ def test_norms_are_those_that_events_average(event):
         return loss(model, output)
 
     gradients = jax.grad(of_probe)(jnp.zeros((50, 4)))
-    seen = Seen(camera, *read_probe(gradients[None], event.statistic, camera.width, camera.height))
+    seen = Seen(
+        camera, *read_probe(gradients[None], event.statistic, camera.width, camera.height), gradients[None, :, :3]
+    )
     average = event.observe(event.init(model), model, seen).average()
     assert average.max() > 0
     np.testing.assert_allclose(jnp.where(found.is_visible, found.norms, 0.0), average, rtol=1e-5, atol=1e-6)

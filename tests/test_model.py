@@ -212,9 +212,9 @@ def head(**values) -> str:
         (edit(lambda header, arrays: arrays.pop("appearance/texels")), "texels of textures is missing"),
         (changed("appearance/texels", lambda x: x[1:]), "disagree"),
         (changed("appearance/texels", lambda x: x.astype(np.int32)), "must be floats"),
-        (changed("appearance/sizes", lambda x: -x), "unknown dimension"),
-        (changed("appearance/sizes", lambda x: x.astype(float)), "damaged"),
-        (changed("appearance/sizes", lambda x: x.ravel()), "disagree"),
+        (changed("appearance/sizes", lambda x: -x), r"sizes must be integers \[N, 2\] in 0\.\.16"),
+        (changed("appearance/sizes", lambda x: x.astype(float)), "sizes must be integers"),
+        (changed("appearance/sizes", lambda x: x.ravel()), "sizes must be integers"),
         (
             edit(lambda _, a: a.update({"appearance/sizes": np.ones((2, 2), int), "appearance/texels": np.eye(2, 4)})),
             "of 2 rows, but there are 7 Gaussians",
