@@ -152,7 +152,7 @@ def test_rows_are_not_added_to_textures_of_another_size(trained):
     other = dataclasses.replace(start, appearance=textured)
     params, layout = Textured((1, 1)).allocate(jax.random.key(0), start.gaussians)
     stage = Stage("more", textured, (Mcmc(500),), (), CONFIG.rates, 3_000)
-    with pytest.raises(ValueError, match="stage 'more' would add Gaussians to a model whose textures or degrees have grown"):
+    with pytest.raises(ValueError, match=r"stage 'more' would add Gaussians .* whose textures or degrees have grown"):
         padded(dataclasses.replace(other, params=params, layout=layout), stage, CONFIG)
 
 
