@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, read_pixels
+from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
 

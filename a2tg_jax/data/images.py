@@ -1,4 +1,4 @@
-"""Finding, reading and resizing photographs. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4]."""
+"""Finding and resizing photographs. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4]."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -28,7 +28,9 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
 
     Raises:
       FileNotFoundError: naming the image, if it is not there.
+      ValueError: if the name leads out of the folder.
     """
+    check_inside(folder, name)
     smaller = folder.with_name(f"{folder.name}_{downscale}")
     if downscale > 1 and smaller.is_dir():
         folder, downscale = smaller, 1
@@ -41,23 +43,17 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
     )
 
 
-def read_pixels(path: Path) -> np.ndarray:
-    """The pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
-
-    Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
+def check_inside(folder: Path, name: str) -> None:
+    """Refuses a name, found in a file of the scene, that leads out of the scene's folder. Links may lead anywhere.
 
     Raises:
-      ValueError: naming the file, if it cannot be read as an image of 8 bits per channel.
+      ValueError: naming both, if it is absolute, or climbs by "..".
     """
-    try:
-        with Image.open(path) as image:
-            if image.mode.startswith(("I", "F")):
-                raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
-            has_alpha = "A" in image.getbands() or "transparency" in image.info
-            pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{path}: cannot be read as an image ({error}); replace or remove it") from error
-    return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
+    if os.path.isabs(name) or os.pardir in Path(name).parts or "\0" in name:
+        raise ValueError(
+            f"{folder}: {name!r} leads out of the scene's folder, and nothing outside is read; "
+            "move it there, or put a link there to where it is, and name that"
+        )
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from PIL import Image
 from tqdm import tqdm
 
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.decoding import check_picture
+from a2tg_jax.data.images import map_in_threads
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_EXHAUSTIVE = 200
@@ -152,15 +153,12 @@ def _write_scene(model: Any, photos: Path, work: Path, out: Path) -> None:
 
 
 def _have_one_size(photos: Path, names: list[str]) -> bool:
-    """Whether all photographs have the same width and height, as those of one camera have."""
-    sizes = set()
-    for name in names:
-        try:
-            with Image.open(photos / name) as image:
-                sizes.add(image.size)
-        except OSError as error:
-            raise ValueError(f"{photos / name}: cannot be read as an image ({error}); replace or remove it") from error
-    return len(sizes) == 1
+    """Whether all photographs have the same width and height, as those of one camera have.
+
+    Raises:
+      ValueError: naming the first that this program would not read: COLMAP's own reader knows no bounds.
+    """
+    return len(set(map_in_threads(lambda name: check_picture(photos / name), names))) == 1
 
 
 @contextmanager

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, read_pixels
+from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
@@ -106,6 +107,7 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int) -> Shot:
     """One frame; `frame` holds the file's global values too, under the frame's own."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
+    check_inside(file.parent, frame["file_path"])
     path = file.parent / frame["file_path"]
     name = Path(frame["file_path"]).as_posix()
     # Only a folder of images below the scene has siblings of the form images_k.

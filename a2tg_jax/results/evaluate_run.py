@@ -1,6 +1,7 @@
 """Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
 
 import os
+from pathlib import Path
 
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.data import Scene, View, view_image
@@ -18,7 +19,7 @@ from a2tg_jax.results.pictures import (
     colored_by_resolution,
     error_picture,
     largest_gain,
-    picture_name,
+    picture_names,
     save_picture,
     side_by_side,
     texel_levels,
@@ -120,8 +121,9 @@ def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: 
 def _write_pictures(run: RunFolder, result: RunResult, views: tuple[View, ...], background) -> None:
     """A sheet of each view, and the report with some of them."""
     comparisons = [_compare(view, index, result, background) for index, view in enumerate(views)]
+    names = picture_names(view.name for view in views)
     for comparison in comparisons:
-        _write_sheet(run, comparison)
+        _write_sheet(run.test / names[comparison.name], run, comparison)
     write_report(run, result, comparisons[:: -(-len(views) // REPORTED_VIEWS)])
 
 
@@ -134,8 +136,8 @@ def _compare(view: View, index: int, result: RunResult, background) -> Compariso
     return Comparison(view.name, [truth, *renders], ["photograph", *shown], crop)
 
 
-def _write_sheet(run: RunFolder, comparison: Comparison) -> None:
-    """test/NAME.png: photograph, renders, error of the last render."""
+def _write_sheet(path: Path, run: RunFolder, comparison: Comparison) -> None:
+    """Photograph, renders, error of the last render."""
     error = error_picture(comparison.images[-1], comparison.images[0])
     sheet = side_by_side([*comparison.images, error], [*comparison.captions, f"error, {ERROR_GAIN} times"])
-    save_picture(run.own(run.test / picture_name(comparison.name)), sheet)
+    save_picture(run.own(path), sheet)

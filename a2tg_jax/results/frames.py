@@ -15,7 +15,7 @@ from a2tg_jax.paths import smooth_path
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.pictures import picture_name, save_picture, to_uint8
+from a2tg_jax.results.pictures import picture_names, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
 
 Route = Literal["test", "smooth"]
@@ -78,4 +78,6 @@ def _cameras(model: Model, route: Route, num_frames: int) -> Iterator[tuple[str,
         return
     if not model.origin.is_test.any():
         raise ValueError("the run has no test views; render a path instead with --path smooth")
-    yield from ((picture_name(name), camera) for name, is_test, camera in views if is_test)
+    tests = {name: camera for name, is_test, camera in views if is_test}
+    names = picture_names(tests)
+    yield from ((names[name], camera) for name, camera in tests.items())

@@ -6,8 +6,9 @@ Images are uint8 [H, W, 3] unless said otherwise.
 import base64
 import dataclasses
 import io
+import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jax
@@ -83,9 +84,20 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
     return sheet
 
 
-def picture_name(view_name: str) -> str:
-    """File name of a view's picture: folders become part of it."""
-    return os.path.splitext(view_name)[0].replace("/", "_") + ".png"
+def picture_names(view_names: Iterable[str]) -> dict[str, str]:
+    """File names of the views' pictures, no two alike, in capitals or not: folders become part of the name.
+
+    Where that is another's, as of a/b.png and a_b.jpg, a number follows; names count in their sorted order.
+    """
+    names: dict[str, str] = {}
+    taken: set[str] = set()
+    for view_name in sorted(view_names):
+        stem = os.path.splitext(view_name)[0].replace("/", "_")
+        choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        chosen = next(choice for choice in choices if choice.casefold() not in taken)
+        taken.add(chosen.casefold())
+        names[view_name] = f"{chosen}.png"
+    return names
 
 
 def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> None:

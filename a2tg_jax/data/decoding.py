@@ -1,0 +1,82 @@
+"""Decoding photographs that may be broken, or made to do harm.
+
+Only formats of photographs are tried (Pillow knows others, of which one starts a program), and nothing is decoded
+before its size and its bits are known. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from PIL import Image
+
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
+BITS_PER_SAMPLE = 258
+"""A tag of TIFF."""
+MAX_PIXELS = 128_000_000
+"""Width × height of the largest picture that is decoded, which takes up to 1 GB."""
+
+
+class PictureRefused(ValueError):
+    """A sound picture that is not taken."""
+
+
+def read_pixels(path: str | os.PathLike) -> np.ndarray:
+    """The pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
+
+    Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
+
+    Raises:
+      ValueError: naming the file, if it cannot be read as an image of 8 bits per channel and at most `MAX_PIXELS`.
+    """
+    with _opened(path) as image:
+        has_alpha = "A" in image.getbands() or "transparency" in image.info
+        pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
+
+
+def check_picture(path: str | os.PathLike) -> tuple[int, int]:
+    """(width, height) of an image file that can be decoded. Raises as `read_pixels` does."""
+    with _opened(path) as image:
+        image.load()
+        return image.size
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[Image.Image]:
+    """An image that may be decoded; whatever is wrong with it, then too, becomes one ValueError."""
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            _check_size(path, image)
+            _check_depth(path, image)
+            yield image
+    except PictureRefused:
+        raise
+    except Exception as error:  # what a damaged picture raises goes from SyntaxError to RuntimeError and struct.error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
+
+
+def _check_size(path: str | os.PathLike, image: Image.Image) -> None:
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        raise PictureRefused(
+            f"{path}: has {width}x{height} pixels, and {MAX_PIXELS // 10**6} megapixels are the most that is read; "
+            "make it smaller, or put smaller copies of all images beside them (images_2 and --downscale 2)"
+        )
+
+
+def _check_depth(path: str | os.PathLike, image: Image.Image) -> None:
+    if image.mode.startswith(("I", "F")) or _is_deep(image):
+        raise PictureRefused(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
+
+
+def _is_deep(image: Image.Image) -> bool:
+    """Pillow opens RGB of 16 bits a channel as RGB of 8 and drops the rest: only how it is stored tells."""
+    arguments = [tile[-1] for tile in getattr(image, "tile", ())]
+    if image.format == "TIFF":
+        return max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8  # type: ignore[attr-defined]
+    if image.format == "PPM":
+        return any(isinstance(args, tuple) and args[-1] > 255 for args in arguments)
+    return image.format == "PNG" and any(";16" in str(args) for args in arguments)
