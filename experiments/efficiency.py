@@ -15,9 +15,9 @@ from lab import tables
 from lab.cli import Experiment, Lab, main
 from lab.grid import Grid
 from lab.jobs import Job
+from lab.measured import Figures, measured_once
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import fit_stage
 
 TIMED_ITERATIONS = 150
@@ -27,18 +27,7 @@ TIMED_ROUNDS = 3
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Ours, measured once on this machine, then the paper's."""
     (grid,) = grids
-    path = lab.out / f"{EXPERIMENT.name}.json"
-    times = read_json(path) if path.is_file() else {}
-    rows = []
-    for result in tables.results_of(grid, lab.records):
-        key = result.run.job.key
-        model = None if key in times or lab.args.tables_only else lab.model(result)
-        if model is not None:
-            times[key] = _times(lab, result, model)
-            lab.out.mkdir(parents=True, exist_ok=True)
-            write_json(path, times)
-        if key in times:
-            rows.append(_row(result, times[key]))
+    rows = [_row(result, times) for result, times in measured_once(lab, EXPERIMENT.name, grid, _times)]
     header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
     text = tables.markdown([*header, "machine"], rows)
     columns = (
@@ -51,7 +40,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{text}\n## In the paper\n\n{paper}")
 
 
-def _row(result: tables.Result, times: dict) -> list[str]:
+def _row(result: tables.Result, times: Figures) -> list[str]:
     minutes = sum(steps * pace for steps, pace in zip(times["iterations"], times["ms_per_step"], strict=True)) / 6e4
     paces = ", ".join(tables.number(pace, 1) for pace in times["ms_per_step"])
     return [

@@ -13,13 +13,13 @@ from lab import plots, tables
 from lab.cli import Experiment, Lab, main
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
+from lab.measured import Figures, measured_once
 
 import a2tg_jax as a2tg
 from a2tg_jax.compaction import LADDER, Trial, loss_on_views, measure_choices, smallest_within
 from a2tg_jax.io.coders import CODERS
 from a2tg_jax.io.compact import GROUPS, bytes_by_part, decode_model, encode_model
 from a2tg_jax.results.figures import save_figure
-from a2tg_jax.results.folder import read_json, write_json
 
 MAX_LOSSES = (0.02, 0.05, 0.1, 0.3, 1.0)
 """In dB on training views: a point of a curve each."""
@@ -37,18 +37,7 @@ PUBLISHED = (
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Tables and curves of the models that are there, each measured once."""
     (grid,) = grids
-    path = lab.out / f"{EXPERIMENT.name}.json"
-    measured = read_json(path) if path.is_file() else {}
-    found: list[tuple[tables.Result, dict]] = []
-    for result in tables.results_of(grid, lab.records):
-        key = result.run.job.key
-        model = None if key in measured or lab.args.tables_only else lab.model(result)
-        if model is not None:
-            measured[key] = _measure(lab, result, model)
-            lab.out.mkdir(parents=True, exist_ok=True)
-            write_json(path, measured)
-        if key in measured:
-            found.append((result, measured[key]))
+    found = measured_once(lab, EXPERIMENT.name, grid, _measure)
     parts = [
         f"# {grid.title}\n\nThe smallest files that lose {REPORTED} dB at most on training views; PSNR and LPIPS are "
         f"those of test views, of the model and of its file. 1 kB is 1000 bytes.\n\n{_files(found)}",
@@ -96,7 +85,7 @@ def _size(model: a2tg.Model, trial: Trial, coder: str) -> int:
     return len(encode_model(model, trial.choices.keeping({"coder": coder})))
 
 
-def _files(found: Sequence[tuple[tables.Result, dict]]) -> str:
+def _files(found: Sequence[tuple[tables.Result, Figures]]) -> str:
     header = ["scene", "method", "Gaussians", "kB of numbers", "kB on disk", "ratio", "PSNR", "LPIPS", "kept as"]
     rows = []
     for result, figures in found:
@@ -125,7 +114,7 @@ def _change(pair: Sequence[float | None], digits: int) -> str:
     return " → ".join(tables.number(float("nan") if value is None else value, digits) for value in pair)
 
 
-def _parts(found: Sequence[tuple[tables.Result, dict]]) -> str:
+def _parts(found: Sequence[tuple[tables.Result, Figures]]) -> str:
     shares = [(result, _shares(figures["parts"])) for result, figures in found]
     names = list(dict.fromkeys(name for _, own in shares for name in own))
     rows = [[*_named(result), *(tables.percent(own.get(name, 0.0)) for name in names)] for result, own in shares]
@@ -141,7 +130,7 @@ def _shares(parts: Mapping[str, int]) -> dict[str, float]:
     return shares
 
 
-def _coders(found: Sequence[tuple[tables.Result, dict]]) -> str:
+def _coders(found: Sequence[tuple[tables.Result, Figures]]) -> str:
     rows = [
         [*_named(result), *(tables.number(figures["coders"][coder] / 1e3, 1) for coder in CODER_CHOICES)]
         for result, figures in found
@@ -149,7 +138,7 @@ def _coders(found: Sequence[tuple[tables.Result, dict]]) -> str:
     return tables.markdown(["scene", "method", "Gaussians", *CODER_CHOICES], rows)
 
 
-def _choices(found: Sequence[tuple[tables.Result, dict]]) -> str:
+def _choices(found: Sequence[tuple[tables.Result, Figures]]) -> str:
     """Size relative to the finest of a model's group, and losses."""
     points: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for _, figures in found:
@@ -165,7 +154,7 @@ def _choices(found: Sequence[tuple[tables.Result, dict]]) -> str:
     return tables.markdown(["group", "kept as", "size", "dB lost, training", "dB lost, test", "models"], rows)
 
 
-def _panels(found: Sequence[tuple[tables.Result, dict]]) -> list[tuple[str, dict[str, list[plots.Point]], str, str]]:
+def _panels(found: Sequence[tuple[tables.Result, Figures]]) -> list[tuple[str, dict[str, list[plots.Point]], str, str]]:
     """PSNR on test views against kB on disk, a chart for each scene and a curve for each model."""
     panels: dict[str, dict[str, list[plots.Point]]] = {}
     for result, figures in found:

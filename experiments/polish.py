@@ -13,42 +13,28 @@ from lab import tables
 from lab.cli import Experiment, Lab, main
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
+from lab.measured import measured_once
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.folder import read_json, write_json
 
 NUM_STEPS = (2, 5, 10)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """A table of the models that are there, each measured once."""
-    path = lab.out / f"{EXPERIMENT.name}.json"
-    measured = read_json(path) if path.is_file() else {}
+    (grid,) = grids
     rows, gains = [], []
-    for result in tables.results_of(grids[0], lab.records):
-        key = result.run.job.key
-        model = None if key in measured or lab.args.tables_only else lab.model(result)
-        if model is not None:
-            measured[key] = _measure(lab, result, model)
-            lab.out.mkdir(parents=True, exist_ok=True)
-            write_json(path, measured)
-        if key in measured:
-            found = measured[key]
-            shown = [_told(found[str(steps)], found["0"]) for steps in NUM_STEPS]
-            gains.append([found[str(steps)]["psnr"] - found["0"]["psnr"] for steps in NUM_STEPS])
-            size = f"{result.run.cell.budget:g} MB"
-            rows.append([result.run.cell.scene.label, size, result.label, f"{found['0']['psnr']:.2f}", *shown])
+    for result, found in measured_once(lab, EXPERIMENT.name, grid, _measure):
+        shown = [_told(found[str(steps)], found["0"]) for steps in NUM_STEPS]
+        gains.append([found[str(steps)]["psnr"] - found["0"]["psnr"] for steps in NUM_STEPS])
+        size = f"{result.run.cell.budget:g} MB"
+        rows.append([result.run.cell.scene.label, size, result.label, f"{found['0']['psnr']:.2f}", *shown])
     if gains:
         means = [f"{gain:+.2f}" for gain in np.mean(gains, axis=0)]
         rows.append(["*mean*", "", "", "", *means])
-    header = [
-        "scene",
-        "bytes",
-        "method",
-        "test PSNR",
-        *(f"{steps} steps: dB · LPIPS · train dB" for steps in NUM_STEPS),
-    ]
-    lab.write(EXPERIMENT.name, f"# {grids[0].title}\n\n{tables.markdown(header, rows)}")
+    steps = [f"{steps} steps: dB · LPIPS · train dB" for steps in NUM_STEPS]
+    header = ["scene", "bytes", "method", "test PSNR", *steps]
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{tables.markdown(header, rows)}")
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, dict[str, float]]:

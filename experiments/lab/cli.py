@@ -69,12 +69,13 @@ class Lab:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def model(self, result: Result) -> a2tg.Model | None:
-        """What a run left; None, and a line that says so, where it is gone."""
-        path = self.folders.model(result.run.job)
+    def model(self, result: Result, *, first_stage: bool = False) -> a2tg.Model | None:
+        """What a run, or its first stage, left; None, and a line that says so, where it is gone."""
+        job = dataclasses.replace(result.run.job, stage=0) if first_stage else result.run.job
+        path = self.folders.model(job)
         if path.is_file():
             return a2tg.load_model(path)
-        print(f"{result.label} on {result.run.cell.scene.label}: no picture, for its model is not in {path.parent}")
+        print(f"{result.label} on {result.run.cell.scene.label}: left out, for its model is not in {path.parent}")
         return None
 
     def write(self, name: str, text: str) -> None:

@@ -1,0 +1,43 @@
+"""Figures of models that were trained, each measured once and kept."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import a2tg_jax as a2tg
+from a2tg_jax.results.folder import read_json, write_json
+from lab import tables
+from lab.cli import Lab
+from lab.grid import Grid
+
+Figures = Mapping[str, Any]
+"""In JSON."""
+
+
+def measured_once(
+    lab: Lab,
+    name: str,
+    grid: Grid,
+    measure: Callable[[Lab, tables.Result, a2tg.Model], Figures],
+    *,
+    first_stage: bool = False,
+) -> list[tuple[tables.Result, Figures]]:
+    """The finished runs of a grid with their figures, from NAME.json where they are in it; runs without are left out.
+
+    Args:
+      measure: what it returns of a run's model is kept at once.
+      first_stage: of the model that its first stage left.
+    """
+    path = lab.out / f"{name}.json"
+    kept: dict[str, Figures] = read_json(path) if path.is_file() else {}
+    found: list[tuple[tables.Result, Figures]] = []
+    for result in tables.results_of(grid, lab.records):
+        key = result.run.job.key
+        if key not in kept and not lab.args.tables_only:
+            model = lab.model(result, first_stage=first_stage)
+            if model is not None:
+                kept[key] = measure(lab, result, model)
+                lab.out.mkdir(parents=True, exist_ok=True)
+                write_json(path, kept)
+        if key in kept:
+            found.append((result, kept[key]))
+    return found
