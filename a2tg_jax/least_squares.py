@@ -7,6 +7,7 @@ draws a change of colours and its transpose is the backward pass.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -79,16 +80,17 @@ def polish(model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: fl
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
     settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
     groups = _stacked(views, background)
-    changes, _ = _jitted()(model, groups, background, settings, num_steps, ridge)
+    changes = _jitted()(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
 
 
-def _jitted():
+@functools.cache
+def _jitted() -> jit:
     return jit(_solve, static_argnums=(3, 4))
 
 
 def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):
-    """The changes of the colours, and the right side of the normal equations."""
+    """The changes of the colours."""
 
     def over_views(function):
         """The sum over all views of what a function of camera and photograph gives."""
@@ -113,8 +115,7 @@ def _solve(model: Model, groups: list[Photographs], background: Array, settings:
 
         return over_views(of_view)
 
-    wanted = over_views(right)
-    return solve_cg(normal, wanted, ridge=ridge, maxiter=num_steps, tol=0.0), wanted
+    return solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
 
 
 def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSettings) -> Array:

@@ -6,6 +6,7 @@ whose a row is. A Gaussian without a row in a table pays nothing for it.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -109,22 +110,13 @@ def reallocate_bands(bands: Bands, layout: BandLayout, degrees, moments: Any = N
       moments: any pytree: all `Bands` in it are rebuilt as well, other leaves stay as they are.
     """
     check_shape("degrees", degrees, (layout.num,))
-    empty, new = allocate_bands(degrees, layout.base_degree)
 
-    def rebuilt(old: Bands) -> Bands:
-        tables = []
-        for table, owners, fresh, owners_then in zip(
-            old.tables, layout.owners, empty.tables, new.owners, strict=True
-        ):  # fmt: skip
-            dense = np.zeros((layout.num + 1, *table.shape[1:]), table.dtype)
-            dense[np.asarray(owners)] = np.asarray(table)
-            dense[-1] = 0
-            tables.append(jnp.asarray(dense[np.asarray(owners_then)].reshape(fresh.shape)))
-        return Bands(tuple(tables))
+    def rebuilt(old: Bands) -> tuple[Bands, BandLayout]:
+        return _packed(_dense_tables(old, layout), degrees, layout.base_degree)
 
     is_bands = lambda x: isinstance(x, Bands)  # noqa: E731
-    moments = jax.tree.map(lambda leaf: rebuilt(leaf) if is_bands(leaf) else leaf, moments, is_leaf=is_bands)
-    return rebuilt(bands), new, moments
+    moments = jax.tree.map(lambda leaf: rebuilt(leaf)[0] if is_bands(leaf) else leaf, moments, is_leaf=is_bands)
+    return *rebuilt(bands), moments
 
 
 def gather_bands(bands: Bands, layout: BandLayout, rows: Array) -> Bands:
@@ -155,14 +147,8 @@ def clear_bands(bands: Bands, layout: BandLayout, is_cleared: Array) -> Bands:
 
 def first_bands(bands: Bands, layout: BandLayout, num: int) -> tuple[Bands, BandLayout]:
     """The coefficients of the first `num` Gaussians, in tables of their own (host)."""
-    empty, new = allocate_bands(layout.degrees[:num], layout.base_degree)
-    tables = []
-    for table, owners, fresh in zip(bands.tables, layout.owners, empty.tables, strict=True):
-        filled = np.zeros(fresh.shape, table.dtype)
-        kept = np.asarray(table)[np.asarray(owners) < num]
-        filled[: len(kept)] = kept
-        tables.append(jnp.asarray(filled))
-    return Bands(tuple(tables)), new
+    dense = [table[:num] for table in _dense_tables(bands, layout)]
+    return _packed(dense, layout.degrees[:num], layout.base_degree)
 
 
 def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, degree: Any) -> Array:
@@ -189,23 +175,37 @@ def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, d
 def dense_sh(sh: np.ndarray, bands: Bands, layout: BandLayout) -> np.ndarray:
     """[N, K, 3] all coefficients, with zeros for what a Gaussian lacks; K is that of the highest degree (host)."""
     highest = int(layout.degrees.max(initial=layout.base_degree))
-    dense = np.zeros((layout.num, NUM_BASES[highest], 3), np.asarray(sh).dtype)
-    dense[:, : sh.shape[1]] = np.asarray(sh)
-    for table, owners, band in zip(bands.tables, layout.owners, layout.bands, strict=True):
-        if band <= highest:
-            rows = _owned(owners, layout.num)
-            dense[rows, NUM_BASES[band - 1] : NUM_BASES[band]] = np.asarray(table)[: len(rows)]
-    return dense
+    own = np.asarray(sh)
+    return np.concatenate([own, *_dense_tables(bands, layout)], axis=1, dtype=own.dtype)[:, : NUM_BASES[highest]]
 
 
 def split_sh(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> tuple[Bands, BandLayout]:
     """The inverse of `dense_sh`, given the degrees: what lies above a Gaussian's degree is left out (host)."""
-    bands, layout = allocate_bands(degrees, base_degree)
+    bands = range(base_degree + 1, MAX_DEGREE + 1)
+    dense = np.asarray(dense)
+    return _packed([dense[:, NUM_BASES[band - 1] : NUM_BASES[band]] for band in bands], degrees, base_degree)
+
+
+def _dense_tables(bands: Bands, layout: BandLayout) -> list[np.ndarray]:
+    """[N, 2l + 1, 3] of each band, zeros where a Gaussian lacks it (host)."""
     tables = []
-    for table, owners, band in zip(bands.tables, layout.owners, layout.bands, strict=True):
-        filled, rows = np.zeros(table.shape, np.asarray(dense).dtype), _owned(owners, layout.num)
+    for table, owners in zip(bands.tables, layout.owners, strict=True):
+        rows = _owned(owners, layout.num)
+        dense = np.zeros((layout.num, *table.shape[1:]), table.dtype)
+        dense[rows] = np.asarray(table)[: len(rows)]
+        tables.append(dense)
+    return tables
+
+
+def _packed(dense: Sequence[np.ndarray], degrees, base_degree: int) -> tuple[Bands, BandLayout]:
+    """Tables of what Gaussians of these degrees have of dense ones; those of bands that nobody has may lack columns."""
+    empty, layout = allocate_bands(degrees, base_degree)
+    tables = []
+    for values, fresh, owners in zip(dense, empty.tables, layout.owners, strict=True):
+        rows = _owned(owners, layout.num)
+        filled = np.zeros(fresh.shape, values.dtype)
         if len(rows):
-            filled[: len(rows)] = dense[rows, NUM_BASES[band - 1] : NUM_BASES[band]]
+            filled[: len(rows)] = values[rows]
         tables.append(jnp.asarray(filled))
     return Bands(tuple(tables)), layout
 
