@@ -5,6 +5,8 @@ import math
 import os
 from pathlib import Path
 
+from a2tg_jax.control_groups import group_folders
+
 VARIABLE = "A2TG_NUM_THREADS"
 
 _chosen: int | None = None
@@ -60,25 +62,10 @@ def _own_quota() -> float:
 def cpu_quota(root: Path) -> float:
     """The processors' time per time that control groups leave to this process; inf without a limit.
 
-    A group's limit holds for all groups in it. In a container the path of the process's group may be that outside,
-    whose folders do not exist; then the limit is found at the top.
-
     Args:
-      root: of the file system, with proc/self/cgroup and sys/fs/cgroup.
+      root: of the file system, as for `control_groups.group_folders`.
     """
-    try:
-        lines = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return math.inf
-    quotas = [math.inf]
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        top = root / "sys/fs/cgroup" / controllers
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        here = top / path.lstrip("/")
-        quotas += [_folder_quota(folder) for folder in (here, *here.parents) if folder.is_relative_to(top)]
-    return min(quotas)
+    return min([math.inf, *map(_folder_quota, group_folders(root, "cpu"))])
 
 
 def _folder_quota(folder: Path) -> float:

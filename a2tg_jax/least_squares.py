@@ -177,7 +177,7 @@ def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
     color, dtype = np.asarray(background), background.dtype
     by_size: dict[tuple[int, ...], list[View]] = {}
     for view in views:
-        by_size.setdefault(view.image.shape[:2], []).append(view)
+        by_size.setdefault(view.picture.size, []).append(view)
     return [
         Photographs(
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),

@@ -74,15 +74,19 @@ def add_xla_flags(flags: tuple[str, ...]) -> None:
     os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
 
 
+def cache_folder() -> Path:
+    """The folder of what can be made again: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "a2tg-jax"
+
+
 def compilation_cache_folder() -> Path:
     """The folder of compiled programs, one per processor and jaxlib: code for one may not run on another.
 
-    It is $XDG_CACHE_HOME/a2tg-jax/… (~/.cache/a2tg-jax/…) and may be deleted at any time.
+    It lies in `cache_folder()` and may be deleted at any time.
     """
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
     key = hashlib.sha256(processor.encode()).hexdigest()[:12]
-    return base / "a2tg-jax" / f"jaxlib-{jax.lib.__version__}-{key}"
+    return cache_folder() / f"jaxlib-{jax.lib.__version__}-{key}"
 
 
 def _processor_features() -> frozenset[str]:

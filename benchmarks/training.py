@@ -19,7 +19,7 @@ def measure_training(case: dict) -> dict:
     scene, textured = load_case(case)
     plain = like(Gaussians2dMcmc, textured)
     first = fit_stage(scene, textured, 0, progress=False)
-    height, width = scene.train[0].image.shape[:2]
+    height, width = scene.train[0].picture.size
     return {
         "scene": scene.name,
         "image": [width, height],

@@ -11,6 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
+    {"control_groups"},
     {"classes", "cores", "memory"},
     {"numerics", "startup", "bilinear", "checks"},
     {"sh", "cameras"},

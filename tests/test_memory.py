@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from a2tg_jax.memory import keep_room_for_programs, return_free_memory
+from a2tg_jax.memory import keep_room_for_programs, memory_limit, memory_peak, return_free_memory
 
 
 def told(folder, count: int, limit: str):
@@ -28,3 +28,62 @@ def test_programs_are_dropped_before_there_is_no_room_for_more(tmp_path, count, 
 def test_without_such_a_system_nothing_happens(tmp_path):
     assert not keep_room_for_programs(tmp_path / "nowhere")
     return_free_memory()
+
+
+GROUPS = {
+    "none": ("", {}, 1000),
+    "version 2": ("0::/job", {"job/memory.max": "900000", "job/memory.current": "600000"}, 100 + 293),
+    "version 2, what can be read again is free": (
+        "0::/job",
+        {
+            "job/memory.max": "900000",
+            "job/memory.current": "600000",
+            "job/memory.stat": "anon 7\ninactive_file 102400",
+        },
+        100 + 293 + 100,
+    ),
+    "version 2, the group around it": (
+        "0::/user/job",
+        {
+            "user/memory.max": "512000",
+            "user/memory.current": "307200",
+            "user/job/memory.max": "max",
+            "user/job/memory.current": "307200",
+        },
+        100 + 200,
+    ),
+    "version 1": (
+        "4:memory:/job\n3:cpu:/",
+        {"memory/job/memory.limit_in_bytes": "409600", "memory/job/memory.usage_in_bytes": "307200"},
+        100 + 100,
+    ),
+    "a limit beyond the machine's": (
+        "4:memory:/job",
+        {"memory/job/memory.limit_in_bytes": str(2**63 - 4096), "memory/job/memory.usage_in_bytes": "0"},
+        1000,
+    ),
+    "over its limit": ("0::/", {"memory.max": "1024", "memory.current": "102400"}, 100),
+}
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_memory_that_a_process_may_have(tmp_path, name):
+    groups, files, kilobytes = GROUPS[name]
+    files = {f"sys/fs/cgroup/{path}": text for path, text in files.items()}
+    for path in [path for path in files if path.endswith(("max", "limit_in_bytes"))]:
+        files.setdefault(path.rpartition("/")[0] + "/memory.stat", "anon 0")
+    files |= {
+        "proc/meminfo": "MemTotal:  9000 kB\nMemAvailable:   900 kB\nHugePages_Total:   0",
+        "proc/self/status": "Name:\ta2tg\nVmHWM:\t  300 kB\nVmRSS:\t  100 kB",
+        "proc/self/cgroup": groups,
+    }
+    for path, text in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text + "\n")
+    assert abs(memory_limit(tmp_path) / 1024 - kilobytes) < 1
+    assert memory_peak(tmp_path) == 300 * 1024
+
+
+def test_the_memory_of_this_process_is_told(tmp_path):
+    assert 2**26 < memory_peak() <= memory_limit() + 2**33
+    assert memory_limit(tmp_path) > 2**26 and memory_peak(tmp_path) == 0

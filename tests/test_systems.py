@@ -14,7 +14,7 @@ from toy_system import Toy
 import a2tg_jax as a2tg
 from a2tg_jax import adapt
 from a2tg_jax.training import fit_stage, loop
-from a2tg_jax.training.batches import PhotoStore
+from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict, with_changes
 from a2tg_jax.training.start import initial_model
@@ -240,20 +240,23 @@ def test_the_host_waits_once_for_many_steps(scene, monkeypatch):
 
 
 def test_photographs_stay_on_the_device_while_they_fit(scene):
-    everything, nothing = PhotoStore(scene.train), PhotoStore(scene.train, room=0)
+    order = BatchOrder(scene.train, 2, 0)
+    everything, nothing = PhotoStore(scene.train, order, 9), PhotoStore(scene.train, order, 9, room=0)
     assert everything.is_resident and not nothing.is_resident
-    for indices in ((0,), (3, 1)):
+    for iteration in (1, 4, 2, 9):
         images = [
-            photographs.images[places] for photographs, places in map(lambda s: s.batch(indices), (everything, nothing))
+            photographs.images[places]
+            for photographs, places in map(lambda store: store.batch(iteration), (everything, nothing))
         ]
         np.testing.assert_array_equal(*images)
-    assert everything.batch((0,))[0] is everything.batch((2,))[0]
+    assert everything.batch(1)[0] is everything.batch(3)[0]
+    nothing.close()
 
 
 def test_results_do_not_depend_on_where_photographs_are(scene, monkeypatch):
     system = tiny("gaussians-2d-mcmc")
     resident = a2tg.fit(scene, system, progress=False).model
-    monkeypatch.setattr(loop, "PhotoStore", lambda views: PhotoStore(views, room=0))
+    monkeypatch.setattr(loop, "PhotoStore", lambda *told: PhotoStore(*told, room=0))
     assert_same(a2tg.fit(scene, system, progress=False).model, resident)
 
 

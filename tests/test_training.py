@@ -181,7 +181,7 @@ def test_overflow_loses_nothing(scene):
     def one_step(capacity):
         run = StageRun(scene, CONFIG, 0, initial_model(scene, CONFIG))
         if capacity is not None:
-            run.capacities[scene.train[0].image.shape[:2]] = capacity
+            run.capacities[scene.train[0].picture.size] = capacity
         taken = run.steps(1, 1)
         return run, len(taken) or len(run.steps(1, 1))
 
@@ -250,9 +250,12 @@ def test_numbers_out_of_range_are_named(changes, message):
     ("change", "message"),
     [
         ({"train": lambda views: ()}, "at least one view"),
-        ({"train": lambda views: (dataclasses.replace(views[0], image=views[0].image / 255),)}, r"uint8 .*got float64"),
         (
-            {"train": lambda views: (dataclasses.replace(views[0], image=views[0].image[1:]),)},
+            {"train": lambda views: (dataclasses.replace(views[0], picture=views[0].image / 255),)},
+            r"uint8 .*got float64",
+        ),
+        (
+            {"train": lambda views: (dataclasses.replace(views[0], picture=views[0].image[1:]),)},
             r"uint8 \[29, 40, 3\]",
         ),
         ({"points": lambda points: points * np.nan}, "must be finite"),
@@ -282,7 +285,7 @@ def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch):
     config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=McmcConfig(cap=40))
     resident = fit(mixed, config, progress=False)
     assert resident.model.num == 40
-    monkeypatch.setattr(loop, "PhotoStore", lambda views: PhotoStore(views, room=0))
+    monkeypatch.setattr(loop, "PhotoStore", lambda *told: PhotoStore(*told, room=0))
     assert_same(fit(mixed, config, progress=False), resident)
 
 

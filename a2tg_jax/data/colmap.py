@@ -13,6 +13,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.pictures import Shelf
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
@@ -29,13 +30,13 @@ def find_model(path: Path) -> Path | None:
     return next((folder for folder in folders if _model_suffix(folder) is not None), None)
 
 
-def load_colmap(path: Path, *, downscale: int, test_every: int) -> Scene:
+def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
     """Reads a COLMAP scene: every registered image as a pinhole view, and the sparse points.
 
     Args:
       path: the scene folder, or the folder of the model itself. Its folder `images` (or `images_k`) may be
         there, beside the model, or up to two folders above that.
-      downscale, test_every: as in `load_scene`.
+      downscale, test_every, room: as in `load_scene`.
 
     Raises:
       FileNotFoundError: if there is no model, no folder of images, or an image of the model is missing.
@@ -48,11 +49,12 @@ def load_colmap(path: Path, *, downscale: int, test_every: int) -> Scene:
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
     lenses = {key: Lens(camera) for key, camera in reconstruction.cameras.items()}
+    shelf = Shelf(room)
     registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
     _log_unregistered(images_folder, len(registered))
 
     def shoot(image: Any) -> Shot:
-        return _shot(image, lenses[image.camera_id], images_folder, downscale)
+        return _shot(image, lenses[image.camera_id], images_folder, downscale, shelf)
 
     train, test = every_kth(map_in_threads(shoot, registered), test_every)
     return assemble_scene(images_folder.parent.name, train, test, read_points(reconstruction), source=str(path))
@@ -75,16 +77,16 @@ def viewmat_of(image: Any) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Shot:
+def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Shelf) -> Shot:
     """One registered image, undistorted and downscaled."""
     file, still_to_downscale = locate_image(images_folder, image.name, downscale)
     pixels = read_pixels(file)
     check_aspect(file, pixels, *lens.size)
     try:
-        pixels, K = lens.undistort(pixels, still_to_downscale)
+        shown, K = lens.undistort(pixels, still_to_downscale)
     except ValueError as error:
         raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
-    return Shot(image.name, viewmat_of(image), K, pixels)
+    return Shot(image.name, viewmat_of(image), K, shelf.keep(shown, file if shown is pixels else None))
 
 
 def _model_suffix(folder: Path) -> str | None:

@@ -2,13 +2,14 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 
 
-def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int = 8, room: int | None = None) -> Scene:
     """Reads photographs, cameras and points, and normalises the world.
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
@@ -17,10 +18,11 @@ def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int =
 
     Args:
       path: the scene folder, or a transforms.json.
-      downscale: k >= 1; images are read from `images_k` where that exists and made from the full ones, in memory, where
-        not.
+      downscale: k >= 1; images are read from `images_k` where that exists and made from the full ones where not.
       test_every: every k-th of the name-sorted views, the first among them, is a test view; 0 keeps none. Has no
         effect where the scene names its test views itself.
+      room: bytes that the photographs may take in memory, at 3 or 4 a pixel; those beyond stay on disk and are read
+        when they are needed (`Shelf`), which changes no result. None: a quarter of what the process may have.
 
     Returns:
       The scene, in its normalised world; `Scene.transform` leads there from the input's.
@@ -36,7 +38,9 @@ def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int =
         raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene folder")
-    options = {"downscale": int(downscale), "test_every": test_every}
+    if room is not None and room < 0:
+        raise ValueError(f"room must be at least 0 bytes; got {room}")
+    options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room}
     if path.is_file():
         return load_transforms(path, **options)
     if find_model(path) is not None:

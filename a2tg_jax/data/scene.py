@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.cameras import Camera
+from a2tg_jax.data.pictures import Picture
 from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
@@ -24,10 +25,27 @@ class View:
     """Path of the image below the scene's image folder, with forward slashes; unique in its scene."""
     camera: Camera
     """Its camera in the normalised world, float32, of the image's size."""
-    image: np.ndarray
-    """[H, W, 3] uint8."""
-    alpha: np.ndarray | None = None
-    """[H, W] uint8 opacity (straight: `image` is not multiplied by it), or None where the photograph is opaque."""
+    picture: Picture
+    """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given, too."""
+
+    def __post_init__(self) -> None:
+        """Arrays become pictures that are held."""
+        object.__setattr__(self, "picture", Picture.of(self.picture))
+
+    @property
+    def image(self) -> np.ndarray:
+        """[H, W, 3] uint8. Read from disk where it is kept there: look once."""
+        return np.ascontiguousarray(self.picture.read()[..., :3])
+
+    @property
+    def alpha(self) -> np.ndarray | None:
+        """[H, W] uint8 opacity (straight: `image` is not multiplied by it), or None where the photograph is opaque."""
+        return np.ascontiguousarray(self.picture.read()[..., 3]) if self.has_alpha else None
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the photograph has an opacity; it is not read for that."""
+        return self.picture.shape[2] == 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +76,7 @@ class Shot:
     """[4, 4] float64 world to camera (OpenCV)."""
     K: np.ndarray
     """[3, 3] float64 intrinsics in pixels of `pixels`."""
-    pixels: np.ndarray
+    pixels: Picture | np.ndarray
     """[H, W, 3] or [H, W, 4] uint8, with straight alpha."""
 
 
@@ -82,10 +100,11 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
     Returns:
       [H, W, 3] float32 in [0, 1].
     """
-    color = view.image.astype(np.float32) / np.float32(255)
-    if view.alpha is None:
+    pixels = view.picture.read()
+    color = pixels[..., :3].astype(np.float32) / np.float32(255)
+    if not view.has_alpha:
         return color
-    alpha = view.alpha.astype(np.float32)[..., None] / np.float32(255)
+    alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
     return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
 
 
@@ -179,7 +198,6 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:
     """The shot with its camera in the normalised world."""
-    height, width, channels = shot.pixels.shape
+    height, width = shot.pixels.shape[:2]
     camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height)
-    alpha = shot.pixels[..., 3].copy() if channels == 4 else None
-    return View(shot.name, camera, np.ascontiguousarray(shot.pixels[..., :3]), alpha)
+    return View(shot.name, camera, Picture.of(shot.pixels))

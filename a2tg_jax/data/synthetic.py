@@ -8,6 +8,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax.data import patterns
 from a2tg_jax.data.lighting import light
+from a2tg_jax.data.pictures import Picture
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth
 from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
 
@@ -136,11 +137,12 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
     shares = np.bincount(rng.integers(len(shots), size=count), minlength=len(shots))
     points, colors = [], []
     for shot, share in zip(shots, shares, strict=True):
-        height, width = shot.pixels.shape[:2]
+        pixels = Picture.of(shot.pixels).read()
+        height, width = pixels.shape[:2]
         column, row = rng.integers(width, size=share), rng.integers(height, size=share)
         directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
         points.append(trace(surfaces, _center(shot.viewmat), directions)[1].T)
-        colors.append(shot.pixels[row, column])
+        colors.append(pixels[row, column])
     is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
     return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
 

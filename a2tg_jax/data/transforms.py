@@ -16,6 +16,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.pictures import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
 
@@ -30,7 +31,7 @@ PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "R
 logger = logging.getLogger(__name__)
 
 
-def load_transforms(file: Path, *, downscale: int, test_every: int) -> Scene:
+def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
     """Reads a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide about the split where the file has them (val is
@@ -38,14 +39,14 @@ def load_transforms(file: Path, *, downscale: int, test_every: int) -> Scene:
 
     Args:
       file: path of transforms.json.
-      downscale, test_every: as in `load_scene`.
+      downscale, test_every, room: as in `load_scene`.
 
     Raises:
       FileNotFoundError: if an image or the point file is missing.
       ValueError: if the JSON, a frame, an image or a pose is unusable, or no scene can be made (`assemble_scene`).
     """
     meta = _read_json(file)
-    shots = _read_shots(file, meta, downscale)
+    shots = _read_shots(file, meta, downscale, Shelf(room))
     listed = {key: _names(meta[f"{key}_filenames"]) for key in ("train", "val", "test") if f"{key}_filenames" in meta}
     if listed:
         test_names = listed.get("test") or listed.get("val") or set()
@@ -58,7 +59,7 @@ def load_transforms(file: Path, *, downscale: int, test_every: int) -> Scene:
     return assemble_scene(file.resolve().parent.name, train, test, cloud, source=str(file))
 
 
-def load_blender(folder: Path, *, downscale: int, test_every: int) -> Scene:
+def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
     """Reads a Blender scene as NeRF's are: transforms_train.json and transforms_test.json, images with alpha.
 
     Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
@@ -66,16 +67,17 @@ def load_blender(folder: Path, *, downscale: int, test_every: int) -> Scene:
 
     Args:
       folder: the scene folder.
-      downscale, test_every: as in `load_scene`.
+      downscale, test_every, room: as in `load_scene`.
 
     Raises:
       FileNotFoundError, ValueError: as `load_transforms`.
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
-    train = _read_shots(train_file, _read_json(train_file), downscale)
+    shelf = Shelf(room)
+    train = _read_shots(train_file, _read_json(train_file), downscale, shelf)
     test: list[Shot] = []
     if test_file.is_file():
-        test = _read_shots(test_file, _read_json(test_file), downscale)
+        test = _read_shots(test_file, _read_json(test_file), downscale, shelf)
     else:
         train, test = every_kth(train, test_every)
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
@@ -94,16 +96,16 @@ def _read_json(file: Path) -> dict[str, Any]:
     return meta
 
 
-def _read_shots(file: Path, meta: dict[str, Any], downscale: int) -> list[Shot]:
+def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) -> list[Shot]:
     """The frames of a transforms file, undistorted and downscaled, in the file's order."""
 
     def shoot(frame: dict[str, Any]) -> Shot:
-        return _shot(file, {**meta, **frame}, downscale)
+        return _shot(file, {**meta, **frame}, downscale, shelf)
 
     return map_in_threads(shoot, meta["frames"])
 
 
-def _shot(file: Path, frame: dict[str, Any], downscale: int) -> Shot:
+def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Shot:
     """One frame; `frame` holds the file's global values too, under the frame's own."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
@@ -117,10 +119,11 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int) -> Shot:
     lens = _lens(frame, pixels, f"{file}: {name}")
     check_aspect(image_file, pixels, *lens.size)
     try:
-        pixels, K = lens.undistort(pixels, still_to_downscale)
+        shown, K = lens.undistort(pixels, still_to_downscale)
     except ValueError as error:
         raise ValueError(f"{file}: {name}: its camera model {error}") from None
-    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, pixels)
+    kept = shelf.keep(shown, image_file if shown is pixels else None)
+    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept)
 
 
 def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:

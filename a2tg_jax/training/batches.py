@@ -1,6 +1,7 @@
 """Which views an iteration trains on: shuffled epochs that depend on the seed and the iteration alone."""
 
-import functools
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -8,11 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.cores import num_threads
 from a2tg_jax.data.scene import View
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
 """Photographs stay on the device while they take no more than this share of its memory; on a CPU, 1 GiB."""
+ROOM_AHEAD = 2**28
+MOST_AHEAD = 10
+"""Batches that are made ready before they are wanted: so many, as long as they take no more bytes than that."""
 
 
 class Photographs(NamedTuple):
@@ -47,7 +52,7 @@ class BatchOrder:
         rng = np.random.default_rng([self._seed, epoch])
         by_size: dict[tuple[int, int], list[int]] = {}
         for index in rng.permutation(len(self._views)):
-            by_size.setdefault(self._views[index].image.shape[:2], []).append(int(index))  # type: ignore[arg-type]
+            by_size.setdefault(self._views[index].picture.size, []).append(int(index))
         batches = []
         for _, order in sorted(by_size.items()):
             for start in range(0, len(order), self._batch_size):
@@ -56,45 +61,88 @@ class BatchOrder:
 
 
 class PhotoStore:
-    """The photographs, on the device while all of them fit there, else brought to it batch by batch."""
+    """The photographs of a stage's iterations: on the device while all of them fit there, else brought to it batch by
+    batch, made ready by threads that know the order. Close it when the stage is over."""
 
-    def __init__(self, views: tuple[View, ...], room: float | None = None):
+    def __init__(self, views: tuple[View, ...], order: BatchOrder, last: int, room: float | None = None):
         """Args:
         views: of one scene.
+        order: which of them each iteration wants.
+        last: the stage's last iteration.
         room: bytes of the device that they may take; None: `DEVICE_SHARE` of it.
         """
-        self._views = views
-        num_bytes = sum(view.image.nbytes + (0 if view.alpha is None else view.alpha.nbytes) for view in views)
-        self.is_resident = num_bytes <= (device_room() if room is None else room)
-        self._stacks: dict[tuple[int, ...], tuple[Photographs, dict[int, int]]] = {}
-        self._latest = functools.lru_cache(maxsize=2)(lambda indices: stack_views([views[i] for i in indices]))
+        self._views, self._order, self._last = views, order, last
+        fits = sum(view.picture.nbytes for view in views) <= (device_room() if room is None else room)
+        self.is_resident = fits and all(view.picture.is_held for view in views)
+        self._stacks: dict[tuple[int, int], tuple[Photographs, dict[int, int]]] = {}
+        largest = max(view.picture.nbytes for view in views) * len(order.indices(1))
+        self.num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(largest, 1))))
+        self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices]), self.num_ahead)
 
-    def batch(self, indices: tuple[int, ...]) -> tuple[Photographs, np.ndarray]:
-        """Photographs among which those of `indices`, all of one image size, are; and where among them, int32."""
+    def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
+        """Photographs among which those of an iteration, all of one size, are; and where among them, int32.
+
+        Raises:
+          ValueError: if a photograph that was left on disk is not there any more, or is another.
+        """
+        indices = self._order.indices(iteration)
         if not self.is_resident:
-            return self._latest(indices), np.arange(len(indices), dtype=np.int32)
-        size = self._views[indices[0]].image.shape[:2]
+            following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
+            batch = self._ahead.first({key: self._order.indices(key) for key in following})
+            return batch, np.arange(len(indices), dtype=np.int32)
+        stack, places = self._stack(self._views[indices[0]].picture.size)
+        return stack, np.asarray([places[index] for index in indices], np.int32)
+
+    def _stack(self, size: tuple[int, int]) -> tuple[Photographs, dict[int, int]]:
+        """All the photographs of a size on the device, and where each view's is."""
         if size not in self._stacks:
-            found = [index for index, view in enumerate(self._views) if view.image.shape[:2] == size]
+            found = [index for index, view in enumerate(self._views) if view.picture.size == size]
             stack = jax.tree.map(jnp.asarray, stack_views([self._views[index] for index in found]))
             self._stacks[size] = stack, {index: place for place, index in enumerate(found)}
-        stack, places = self._stacks[size]
-        return stack, np.asarray([places[index] for index in indices], np.int32)
+        return self._stacks[size]
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._ahead.close()
+
+
+class Ahead:
+    """Makes batches ready in threads, those that are wanted next first."""
+
+    def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int):
+        """Args:
+        load: makes the batch of some views; its errors reach who waits for that batch.
+        num_ahead: how many batches may be ready before they are wanted.
+        """
+        self._load = load
+        self._pool = ThreadPoolExecutor(min(num_ahead, num_threads()), thread_name_prefix="photographs")
+        self._batches: dict[int, Future[Photographs]] = {}
+
+    def first(self, wanted: dict[int, tuple[int, ...]]) -> Photographs:
+        """The first of the batches that are wanted, by iteration; the others are made ready, and none besides."""
+        for iteration in self._batches.keys() - wanted.keys():
+            self._batches.pop(iteration).cancel()
+        for iteration, indices in wanted.items():
+            if iteration not in self._batches:
+                self._batches[iteration] = self._pool.submit(self._load, indices)
+        return self._batches[next(iter(wanted))].result()
+
+    def close(self) -> None:
+        """Ends the threads, once what they are at is done."""
+        self._pool.shutdown(cancel_futures=True)
 
 
 def check_views(views: tuple[View, ...]) -> None:
-    """Raises ValueError, naming the view, unless there are photographs, [H, W, 3] uint8, of their cameras' sizes."""
+    """Raises ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
     if not views:
         raise ValueError("scene.train must hold at least one view; got none")
     for view in views:
-        size = view.camera.height, view.camera.width
-        named = {"image": (view.image, (*size, 3)), "alpha": (view.alpha, size)}
-        for name, (array, wanted) in named.items():
-            if array is not None and (array.shape, array.dtype) != (wanted, np.uint8):
-                raise ValueError(
-                    f"{name} of view {view.name} must be uint8 {list(wanted)}, as large as its camera says; "
-                    f"got {array.dtype} {list(array.shape)}"
-                )
+        height, width, picture = view.camera.height, view.camera.width, view.picture
+        if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
+            raise ValueError(
+                f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
+                f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
+            )
 
 
 def device_room() -> float:
@@ -105,13 +153,14 @@ def device_room() -> float:
 
 def stack_views(views: list[View]) -> Photographs:
     """Views of one image size, stacked on the host."""
+    pixels = [view.picture.read() for view in views]
     alphas = None
-    if any(view.alpha is not None for view in views):
-        opaque = np.full(views[0].image.shape[:2], 255, np.uint8)
-        alphas = np.stack([opaque if view.alpha is None else view.alpha for view in views])
+    if any(view.has_alpha for view in views):
+        opaque = np.full(views[0].picture.size, 255, np.uint8)
+        alphas = np.stack([own[..., 3] if own.shape[2] == 4 else opaque for own in pixels])
     return Photographs(
         viewmats=np.stack([np.asarray(view.camera.viewmat) for view in views]),  # type: ignore[arg-type]
         Ks=np.stack([np.asarray(view.camera.K) for view in views]),  # type: ignore[arg-type]
-        images=np.stack([view.image for view in views]),  # type: ignore[arg-type]
+        images=np.stack([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
         alphas=alphas,  # type: ignore[arg-type]
     )

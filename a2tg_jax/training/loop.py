@@ -35,7 +35,7 @@ from a2tg_jax.training.step import (
 )
 
 LAUNCHED = 10
-"""Steps between two waits for the device."""
+"""Steps between two waits for the device; fewer where the photographs of so many would take too much memory."""
 LOG_EVERY = 10
 PLANNED_VIEWS = 64
 GROWTH_ROOM = 1.5
@@ -76,7 +76,8 @@ class StageRun:
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1)
-        self.photographs = PhotoStore(self.views)
+        self.photographs = PhotoStore(self.views, self.order, self.stage.iterations)
+        self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}
         self.started = time.perf_counter()
         self.num_regrown = self.num_refused = 0
@@ -97,7 +98,15 @@ class StageRun:
         progress: bool,
         title: str | None = None,
     ) -> None:
-        """Runs the stage to its end."""
+        """Runs the stage to its end; its photographs are let go then."""
+        try:
+            self._train(on_checkpoint, checkpoint_every, progress, title)
+        finally:
+            self.photographs.close()
+
+    def _train(
+        self, on_checkpoint: OnCheckpoint | None, checkpoint_every: int | None, progress: bool, title: str | None
+    ) -> None:
         iteration, end = int(self.state.iteration), self.stage.iterations
         with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress) as bar:
             while iteration < end:
@@ -120,7 +129,7 @@ class StageRun:
 
     def _next_stop(self, iteration: int, checkpoint_every: int | None) -> int:
         """The iteration after which the host has something to do."""
-        stops = [iteration + LAUNCHED - iteration % LAUNCHED, self.stage.iterations]
+        stops = [iteration + self.launched - iteration % self.launched, self.stage.iterations]
         stops += [due for due in self._due_on_host() if due > iteration]
         if checkpoint_every is not None:
             stops.append(iteration + checkpoint_every - iteration % checkpoint_every)
@@ -148,8 +157,7 @@ class StageRun:
         return taken
 
     def _launch(self, iteration: int) -> StepInfo:
-        indices = self.order.indices(iteration)
-        photographs, views = self.photographs.batch(indices)
+        photographs, views = self.photographs.batch(iteration)
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
         step = jitted_step()
         num_compiled = step.num_compiled()
@@ -162,8 +170,7 @@ class StageRun:
         return info
 
     def _size(self, iteration: int) -> tuple[int, int]:
-        height, width = self.views[self.order.indices(iteration)[0]].image.shape[:2]
-        return height, width
+        return self.views[self.order.indices(iteration)[0]].picture.size
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Makes more room for the tile lists; refuses to go on for every other reason."""
@@ -216,7 +223,7 @@ class StageRun:
         """Render settings with the capacity for views of a size, planned before the first of them."""
         settings = RenderSettings(tile_size=self.system.tile_size)
         if size not in self.capacities:
-            views = [view for view in self.views if view.image.shape[:2] == size]
+            views = [view for view in self.views if view.picture.size == size]
             live, dtype = self.model, self.scene_scale.dtype
             sample = views[:: -(-len(views) // PLANNED_VIEWS)]
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]

@@ -1,0 +1,27 @@
+"""The control groups (of a container, a batch system, a service) that this process is in, as Linux tells of them."""
+
+from pathlib import Path
+
+
+def group_folders(root: Path, controller: str) -> list[Path]:
+    """The folders of the groups that limit this process in something, its own first, those around it after.
+
+    A group's limit holds for all groups in it. In a container the path of the process's group may be that outside,
+    whose folders do not exist; then the limit is found at the top.
+
+    Args:
+      root: of the file system, with proc/self/cgroup and sys/fs/cgroup.
+      controller: "cpu" or "memory".
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    folders: list[Path] = []
+    for _, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
+        top = root / "sys/fs/cgroup" / controllers
+        if controllers and controller not in controllers.split(","):
+            continue
+        here = top / path.lstrip("/")
+        folders += [folder for folder in (here, *here.parents) if folder.is_relative_to(top)]
+    return folders

@@ -1,0 +1,207 @@
+"""Photographs that do not fit into memory: the same bits from disk, read ahead, and named where they are gone."""
+
+import dataclasses
+import json
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from small_values import assert_same
+
+from a2tg_jax import Gaussians2dMcmc, McmcConfig, fit, load_scene, synthetic_scene
+from a2tg_jax.data import pictures
+from a2tg_jax.data.pictures import Picture, Shelf
+from a2tg_jax.training import loop
+from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore
+
+SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=McmcConfig(cap=70))
+KINDS = {
+    "as in their files": {},
+    "smaller": {"downscale": 2},
+    "undistorted": {"k1": 0.05},
+    "with opacity": {"alpha": True},
+}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A folder of its own for what goes to disk."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "a2tg-jax"
+
+
+def write_scene(folder, *, alpha=False, **intrinsics):
+    """The built-in scene as files; returns the folder."""
+    made = synthetic_scene(num_views=6, width=40, height=32, num_points=100)
+    frames = []
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for index, view in enumerate((*made.train, *made.test)):
+        pixels = view.image
+        if alpha:  # one picture of them is opaque
+            opacity = np.full((*view.picture.size, 1), 255 if index == 1 else 100, np.uint8)
+            pixels = np.concatenate([pixels, opacity], axis=2)
+        Image.fromarray(pixels).save(folder / "images" / view.name)
+        pose = np.linalg.inv(np.asarray(view.camera.viewmat, np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"images/{view.name}", "transform_matrix": pose.tolist()})
+    K = np.asarray(made.train[0].camera.K, float)
+    told = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **intrinsics}
+    (folder / "transforms.json").write_text(json.dumps({**told, "frames": frames}))
+    return folder
+
+
+def num_readers():
+    """Threads that read photographs ahead."""
+    return sum(thread.name.startswith("photographs") for thread in threading.enumerate())
+
+
+def load(folder, room=None, *, downscale=1):
+    with pytest.warns(UserWarning, match="random points"):
+        return load_scene(folder, room=room, downscale=downscale)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, kind, cache):
+    changes = dict(KINDS[kind])
+    downscale = changes.pop("downscale", 1)
+    folder = write_scene(tmp_path / "scene", **changes)
+    held, on_disk = load(folder, downscale=downscale), load(folder, 0, downscale=downscale)
+    assert all(view.picture.is_held for view in held.train)
+    assert not any(view.picture.is_held for view in (*on_disk.train, *on_disk.test))
+    for one, other in zip((*held.train, *held.test), (*on_disk.train, *on_disk.test), strict=True):
+        assert one.has_alpha == other.has_alpha and one.picture.shape == other.picture.shape
+        np.testing.assert_array_equal(one.picture.read(), other.picture.read())
+    order = BatchOrder(held.train, 2, 0)
+    stores = [PhotoStore(scene.train, order, 7, room=0) for scene in (held, on_disk)]
+    for iteration in range(1, 8):
+        (one, _), (other, _) = (store.batch(iteration) for store in stores)
+        jax.tree.map(np.testing.assert_array_equal, one, other)
+    for store in stores:
+        store.close()
+    assert not cache.is_dir() or not [path for path in cache.iterdir() if path.is_file()], "the file has a name"
+
+
+def test_training_gives_the_same_bits_wherever_photographs_are(tmp_path, monkeypatch):
+    """Beside photographs that are held, but brought to the device batch by batch. The threads end with training."""
+    folder = write_scene(tmp_path / "scene", k1=0.05)
+    monkeypatch.setattr(loop, "PhotoStore", lambda *told: PhotoStore(*told, room=0))
+    models, seen = [], []
+    for room in (None, 0):
+        keep = lambda _: seen.append(num_readers())  # noqa: E731
+        models.append(fit(load(folder, room), SYSTEM, on_checkpoint=keep, progress=False).model)
+        assert seen.pop() > 0 == num_readers()
+    assert_same(*(model.gaussians for model in models))
+
+
+def test_memory_takes_as_many_photographs_as_it_has_room_for(tmp_path):
+    folder = write_scene(tmp_path / "scene")
+    scene = load(folder, 2 * 40 * 32 * 3 + 1)
+    assert sum(view.picture.is_held for view in (*scene.train, *scene.test)) == 2
+    store = PhotoStore(scene.train, BatchOrder(scene.train, 1, 0), 12)
+    assert not store.is_resident
+    store.close()
+
+
+def test_room_must_not_be_negative(tmp_path):
+    with pytest.raises(ValueError, match=r"room must be at least 0 bytes; got -1"):
+        load_scene(tmp_path, room=-1)
+
+
+@pytest.mark.parametrize("change", ["gone", "another", "cut off"])
+def test_a_photograph_that_does_not_stay_is_named(tmp_path, change):
+    folder = write_scene(tmp_path / "scene")
+    scene = load(folder, 0)
+    victim = folder / "images" / scene.train[2].name.rpartition("/")[2]
+    if change == "gone":
+        victim.unlink()
+    elif change == "another":
+        Image.fromarray(np.zeros((32, 40, 3), np.uint8)).save(victim)
+    else:
+        victim.write_bytes(victim.read_bytes()[:200])
+    with pytest.raises(ValueError, match=f"{victim.name}: (cannot be read|has changed since)"):
+        fit(scene, SYSTEM, progress=False)
+    assert num_readers() == 0
+
+
+def test_batches_are_made_in_order_once_and_not_too_many():
+    made = []
+
+    def load(indices):
+        made.append(indices[0])
+        return indices
+
+    ahead = Ahead(load, 2)
+    for iteration in (1, 2, 3, 4):
+        wanted = {key: (key,) for key in range(iteration, min(iteration + 2, 5) + 1)}
+        assert ahead.first(wanted) == (iteration,)
+    ahead.close()
+    assert sorted(made) == [1, 2, 3, 4, 5]
+
+
+def test_going_back_makes_batches_again():
+    ahead = Ahead(lambda indices: indices, 2)
+    assert ahead.first({5: (5,), 6: (6,)}) == (5,)
+    assert ahead.first({3: (3,), 4: (4,)}) == (3,)
+    ahead.close()
+
+
+def test_an_error_reaches_who_waits_for_that_batch_alone():
+    def load(indices):
+        if indices == (2,):
+            raise ValueError("photograph 2 is gone")
+        return indices
+
+    ahead = Ahead(load, 2)
+    assert ahead.first({1: (1,), 2: (2,), 3: (3,)}) == (1,)
+    with pytest.raises(ValueError, match="photograph 2 is gone"):
+        ahead.first({2: (2,), 3: (3,)})
+    assert ahead.first({3: (3,)}) == (3,)
+    ahead.close()
+
+
+def test_what_comes_next_is_made_while_one_is_looked_at():
+    is_made = threading.Event()
+    ahead = Ahead(lambda indices: (indices, indices == (2,) and is_made.set())[0], 1)
+    ahead.first({1: (1,), 2: (2,)})
+    assert is_made.wait(10)
+    ahead.close()
+
+
+def test_shelves_are_filled_and_read_by_many_threads():
+    shelf, images = Shelf(0), [np.full((7, 5, 3), value, np.uint8) for value in range(60)]
+    kept: dict[int, Picture] = {}
+
+    def work(start):
+        for index in range(start, 60, 4):
+            kept[index] = shelf.keep(images[index])
+            time.sleep(0)
+            np.testing.assert_array_equal(kept[index].read(), images[index])
+
+    threads = [threading.Thread(target=work, args=(start,)) for start in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(kept) == 60
+    for index, picture in kept.items():
+        np.testing.assert_array_equal(picture.read(), images[index])
+
+
+def test_a_full_disk_is_said_with_what_to_do(monkeypatch):
+    def full(**_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pictures.tempfile, "TemporaryFile", full)
+    with pytest.raises(OSError, match=r"cannot keep the scene's photographs \(No space left.*larger downscale"):
+        Shelf(0).keep(np.zeros((4, 4, 3), np.uint8))
+
+
+def test_a_view_takes_pixels_and_pictures():
+    view = synthetic_scene(num_views=3, width=16, height=12, num_points=20).train[0]
+    pixels = np.arange(16 * 12 * 4).reshape(12, 16, 4).astype(np.uint8)
+    changed = dataclasses.replace(view, picture=pixels)
+    np.testing.assert_array_equal(changed.image, pixels[..., :3])
+    np.testing.assert_array_equal(changed.alpha, pixels[..., 3])
+    assert dataclasses.replace(changed, name="other").picture is changed.picture
