@@ -6,7 +6,7 @@ or, where there are none, guessed from how far renders are from that model's.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -70,9 +70,9 @@ def loss_on_views(
     """How much PSNR, as a mean over the photographs of some views, models have less than the given one."""
     background = model.background if background is None else background
     draw = _drawing(model, [view.camera for view in views], background, settings)
-    photographs = [np.clip(view_image(view, background), 0, 1) for view in views]
 
     def psnr(other: Model) -> float:
+        photographs = (np.clip(view_image(view, background), 0, 1) for view in views)
         errors = (_squared_error(*pair) for pair in zip(draw(other), photographs, strict=True))
         return float(np.mean([-10 * math.log10(max(error, 1e-12)) for error in errors]))
 
@@ -93,7 +93,7 @@ def loss_beside_renders(
     that have nothing to do with each other add up so.
     """
     draw = _drawing(model, cameras, model.background, settings)
-    renders = draw(model)
+    renders = list(draw(model))
     assumed_error = 10 ** (-assumed_psnr / 10)
 
     def loss(other: Model) -> float:
@@ -111,9 +111,9 @@ def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings:
     first = Renderer(model, cameras=cameras, **options)
     capacities = {size: 2 * capacity for size, capacity in first.capacities.items()}
 
-    def draw(other: Model) -> list[np.ndarray]:
+    def draw(other: Model) -> Iterator[np.ndarray]:
         renderer = Renderer(other, capacities=capacities, **options)
-        return [np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras]
+        return (np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras)
 
     return draw
 

@@ -31,7 +31,7 @@ from a2tg_jax.results.record import (
     repeating_command,
     write_record,
 )
-from a2tg_jax.results.report import SECTIONS, Comparison, write_report
+from a2tg_jax.results.report import SECTIONS, Comparison, comparison_html, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, minutes, per_view_json, summary_text
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.bbsplat import BBSplat
@@ -418,7 +418,8 @@ def test_report_is_one_self_contained_page(tmp_path):
     save_figure(run.figures / "curves.png", curves_figure({"a": some_history()}, {"a": 0}))
     image = np.zeros((30, 40, 3), np.uint8)
     crop = largest_gain(image, image, image)
-    write_report(run, some_result(), [Comparison("a<b.png", [image] * 3, ["photograph", "before", "after"], crop)])
+    pictures = comparison_html(Comparison("a<b.png", [image] * 3, ["photograph", "before", "after"], crop))
+    write_report(run, some_result(), [pictures])
     page = run.report.read_text(encoding="utf-8")
     for name, title in SECTIONS:
         assert f'<section id="{name}"><h2>{title}</h2>' in page

@@ -1,6 +1,7 @@
 """Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from a2tg_jax.appearance import Billboards
@@ -9,6 +10,7 @@ from a2tg_jax.evaluation import evaluate
 from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
+from a2tg_jax.origin import Color
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
@@ -27,7 +29,7 @@ from a2tg_jax.results.pictures import (
 )
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import read_record
-from a2tg_jax.results.report import Comparison, write_report
+from a2tg_jax.results.report import Comparison, comparison_html, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.training import System
 
@@ -65,7 +67,7 @@ def evaluate_run(
     if main.textures is not None and not isinstance(main.appearance, Billboards):
         _write_texture_figures(run, main, plan[result.main].system, scene)
     save_ply(run.own(run.point_cloud), main)
-    _write_pictures(run, result, scene.test or scene.train, main.background)
+    _write_pictures(run, result, models, scene)
     return result
 
 
@@ -80,13 +82,8 @@ def _seconds(run: RunFolder, name: str) -> float:
 
 
 def _measure(model: Model, scene: Scene, system: System, seconds: float, lpips_weights) -> ModelResult:
-    found = evaluate(
-        (*scene.test, *scene.train),
-        model,
-        settings=settings_of(system),
-        lpips_weights=lpips_weights,
-        num_renders=len(scene.test or scene.train),
-    )
+    views = (*scene.test, *scene.train)
+    found = evaluate(views, model, settings=settings_of(system), lpips_weights=lpips_weights)
     return ModelResult(
         train=found[len(scene.test) :],
         test=found[: len(scene.test)] if scene.test else None,
@@ -118,22 +115,32 @@ def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: 
     save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels))
 
 
-def _write_pictures(run: RunFolder, result: RunResult, views: tuple[View, ...], background) -> None:
-    """A sheet of each view, and the report with some of them."""
-    comparisons = [_compare(view, index, result, background) for index, view in enumerate(views)]
-    names = picture_names(view.name for view in views)
-    for comparison in comparisons:
-        _write_sheet(run.test / names[comparison.name], run, comparison)
-    write_report(run, result, comparisons[:: -(-len(views) // REPORTED_VIEWS)])
+def _write_pictures(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> None:
+    """A sheet of each view, and the report with some of them. One view's pictures are in memory at a time."""
+    views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
+    renderers = {name: _renderer(models[name], scene, result.plan[name].system) for name in names}
+    files = picture_names(view.name for view in views)
+    reported = []
+    for index, view in enumerate(views):
+        comparison = _compare(view, renderers, models[result.main].background)
+        _write_sheet(run.test / files[view.name], run, comparison)
+        if index % -(-len(views) // REPORTED_VIEWS) == 0:
+            reported.append(comparison_html(comparison))
+    write_report(run, result, reported)
 
 
-def _compare(view: View, index: int, result: RunResult, background) -> Comparison:
+def _renderer(model: Model, scene: Scene, system: System) -> Renderer:
+    """What `evaluate` draws with: nothing is compiled anew."""
+    cameras = [view.camera for view in (*scene.test, *scene.train)]
+    return Renderer(model, cameras=cameras, settings=settings_of(system), has_geometry=False)
+
+
+def _compare(view: View, renderers: Mapping[str, Renderer], background: Color) -> Comparison:
     """One view: the photograph, what the main model is to be compared with, the main model."""
-    shown = [*(result.compared or result.before), result.main]
     truth = to_uint8(view_image(view, background))
-    renders = [result.models[name].shown.renders[index] for name in shown]
+    renders = [to_uint8(renderer(view.camera).color) for renderer in renderers.values()]
     crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
-    return Comparison(view.name, [truth, *renders], ["photograph", *shown], crop)
+    return Comparison(view.name, [truth, *renders], ["photograph", *renderers], crop)
 
 
 def _write_sheet(path: Path, run: RunFolder, comparison: Comparison) -> None:

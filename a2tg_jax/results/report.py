@@ -40,11 +40,12 @@ class Comparison:
     """A part to show enlarged."""
 
 
-def write_report(run: RunFolder, result: RunResult, comparisons: Sequence[Comparison]) -> None:
-    """Writes report.html from the results and the figures that lie in the run folder already."""
+def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) -> None:
+    """Writes report.html from the results, the figures that lie in the run folder already, and some comparisons
+    (`comparison_html`)."""
     bodies = {
         "summary": _summary(result),
-        "pictures": "".join(_comparison(comparison) for comparison in comparisons),
+        "pictures": "".join(comparisons),
         "textures": _textures(run),
         "curves": _figure(run.figures / "curves.png", "Loss and PSNR of the training views seen, with running means."),
         "views": _views(result),
@@ -103,7 +104,8 @@ def _summary(result: RunResult) -> str:
     return f'<div class="cards">{tiles}</div>{_table(titles, rows)}<p class="soft">{escape(note)}</p>'
 
 
-def _comparison(comparison: Comparison) -> str:
+def comparison_html(comparison: Comparison) -> str:
+    """The pictures of a view for the report."""
     pairs = list(zip(comparison.images, comparison.captions, strict=True))
     whole = "".join(_image(jpeg_uri(image), caption, "") for image, caption in pairs)
     html = f'<h3>{escape(comparison.name)}</h3><div class="row">{whole}</div>'
