@@ -91,6 +91,7 @@ from a2tg_jax.texture import allocate_textures as allocate_textures
 from a2tg_jax.texture import texture_arrays as texture_arrays
 from a2tg_jax.texture import textures_from_arrays as textures_from_arrays
 from a2tg_jax.training import Checkpoint as Checkpoint
+from a2tg_jax.training import DivergedError as DivergedError
 from a2tg_jax.training import FitResult as FitResult
 from a2tg_jax.training import History as History
 from a2tg_jax.training import LearningRates as LearningRates

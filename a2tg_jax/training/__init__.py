@@ -4,6 +4,7 @@ from a2tg_jax.training.checkpoint import Checkpoint as Checkpoint
 from a2tg_jax.training.checkpoint import History as History
 from a2tg_jax.training.checkpoint import load_checkpoint as load_checkpoint
 from a2tg_jax.training.checkpoint import save_checkpoint as save_checkpoint
+from a2tg_jax.training.divergence import DivergedError as DivergedError
 from a2tg_jax.training.fit import FitResult as FitResult
 from a2tg_jax.training.fit import StageResult as StageResult
 from a2tg_jax.training.fit import fit as fit

@@ -36,8 +36,15 @@ class Photographs(NamedTuple):
 class BatchOrder:
     """Batches of views of one image size. Any iteration can be asked for, so a resumed run sees the same order."""
 
-    def __init__(self, views: tuple[View, ...], batch_size: int, seed: int):
-        self._views, self._batch_size, self._seed = views, batch_size, seed
+    def __init__(self, views: tuple[View, ...], batch_size: int, seed: int, number: int = 0):
+        """Args:
+        views: of one scene.
+        batch_size: views of an iteration.
+        seed: of the order.
+        number: which of the orders of this seed, from 0.
+        """
+        self._views, self._batch_size = views, batch_size
+        self._seeds = (seed, number) if number else (seed,)
         self._epoch, self._batches = -1, self._draw(0)
 
     def indices(self, iteration: int) -> tuple[int, ...]:
@@ -49,7 +56,7 @@ class BatchOrder:
 
     def _draw(self, epoch: int) -> list[tuple[int, ...]]:
         """One epoch: every view once; the last batch of a size is filled up from the start of its order."""
-        rng = np.random.default_rng([self._seed, epoch])
+        rng = np.random.default_rng([*self._seeds, epoch])
         by_size: dict[tuple[int, int], list[int]] = {}
         for index in rng.permutation(len(self._views)):
             by_size.setdefault(self._views[index].picture.size, []).append(int(index))

@@ -66,6 +66,8 @@ class Checkpoint:
     state: TrainState
     history: History
     """Of this stage."""
+    num_restored: int = 0
+    """How often the stage went back to an earlier state because it diverged: which order of the views it follows."""
 
     @property
     def iteration(self) -> int:
@@ -85,6 +87,7 @@ def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
         "system": system_to_dict(checkpoint.system),
         "stage": checkpoint.stage,
         "is_ahead": [event is not None for event in state.events],
+        "num_restored": checkpoint.num_restored,
     }
     shown = model.appearance.arrays(model.params, model.layout)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
@@ -117,7 +120,8 @@ def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None)
         raise ValueError(f"{path}: the checkpoint lacks {error}; it is damaged or of another version") from error
     gaussians, moments, (num_live, *rest) = jax.tree.map(jnp.asarray, (gaussians, moments, rest))
     model = Model(gaussians, params, layout, num_live, appearance=stage.appearance)
-    return Checkpoint(options, header["stage"], TrainState(model, moments, *rest), History(**history))
+    state = TrainState(model, moments, *rest)
+    return Checkpoint(options, header["stage"], state, History(**history), header.get("num_restored", 0))
 
 
 SHOWN = "shown/"

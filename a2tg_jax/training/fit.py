@@ -9,7 +9,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.origin import BLACK, WHITE, Color, Origin
 from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
-from a2tg_jax.training.loop import OnCheckpoint, StageRun, check_resume
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, check_resume, never
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
@@ -72,6 +72,7 @@ def fit(
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
     progress: bool = True,
+    is_stopped: IsStopped = never,
 ) -> FitResult:
     """Trains a scene: every stage of a system, each from the result of the one before.
 
@@ -83,9 +84,12 @@ def fit(
         iteration takes over the state's buffers, so save it there and then, or copy it.
       checkpoint_every: None: at the end of each stage only.
       progress: show a progress bar.
+      is_stopped: asked between steps. Once it says True, `on_checkpoint` is called a last time, and then
+        KeyboardInterrupt raised.
 
     Raises:
-      ValueError: if the options contradict each other or the checkpoint, or the loss stops being finite.
+      DivergedError: if the loss or a gradient is not finite, or the loss explodes; it has the state before that.
+      ValueError: if the options contradict each other or the checkpoint.
     """
     system.check()
     if resume is not None:
@@ -102,6 +106,7 @@ def fit(
             on_checkpoint=on_checkpoint,
             checkpoint_every=checkpoint_every,
             progress=progress,
+            is_stopped=is_stopped,
         )
         results.append(result)
     return FitResult(system, tuple(results))
@@ -118,6 +123,8 @@ def fit_stage(
     checkpoint_every: int | None = None,
     progress: bool = True,
     title: str | None = None,
+    is_stopped: IsStopped = never,
+    num_restored: int | None = None,
 ) -> StageResult:
     """Trains one stage of a system. Arguments as in `fit`.
 
@@ -125,6 +132,8 @@ def fit_stage(
       index: which stage, from 0.
       start: the model to start from; None: Gaussians at the scene's points.
       title: of the progress bar; None: the stage's name.
+      num_restored: how often the stage went back because it diverged: another number is another order of the views.
+        None: that of the checkpoint, or 0.
     """
     system.check()
     if not 0 <= index < len(system.stages()):
@@ -134,8 +143,8 @@ def fit_stage(
     check_views(scene.train)
     if start is None and resume is None:
         start = initial_model(scene, system)
-    run = StageRun(scene, system, index, start, resume)
-    run.train(on_checkpoint, checkpoint_every, progress, title)
+    run = StageRun(scene, system, index, start, resume, num_restored)
+    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped)
     model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
     if index == len(system.stages()) - 1:
         warn_of_budget(system, model)

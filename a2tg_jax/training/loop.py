@@ -19,10 +19,12 @@ from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
 from a2tg_jax.training.start import padded
 from a2tg_jax.training.step import (
+    EXPLODED,
     FINE,
     IMPOSSIBLE,
     NOT_FINITE,
@@ -42,6 +44,12 @@ GROWTH_ROOM = 1.5
 """How many times the pairs of the first image the lists of a stage have room for."""
 
 OnCheckpoint = Callable[[Checkpoint], None]
+IsStopped = Callable[[], bool]
+
+
+def never() -> bool:
+    """Training that nobody stops."""
+    return False
 
 
 def read(infos: list[StepInfo]) -> list[StepInfo]:
@@ -52,17 +60,26 @@ def read(infos: list[StepInfo]) -> list[StepInfo]:
 class StageRun:
     """One stage under way: the state, and what the host keeps beside it."""
 
-    def __init__(self, scene: Scene, system: System, index: int, start: Model | None, resume: Checkpoint | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        system: System,
+        index: int,
+        start: Model | None,
+        resume: Checkpoint | None = None,
+        num_restored: int | None = None,
+    ):
         """Args:
         scene: its training views are trained on.
         system: the options.
         index: which of its stages, from 0.
         start: the model to start from; None where `resume` is given.
         resume: a checkpoint of this stage.
+        num_restored: which order of the views, from 0; None: that of the checkpoint, or the first.
         """
         self.views, self.system, self.index = scene.train, system, index
         self.stage = system.stages()[index]
-        self.clock = self.stage.clock()
+        self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
         self.history, self.earlier_seconds = History.empty(), 0.0
         if resume is not None:
             check_resume(resume, system, index)
@@ -73,9 +90,10 @@ class StageRun:
             self.state = initial_state(self.stage, padded(jax.tree.map(jnp.array, start.live), self.stage, system))
         else:
             raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
+        self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
-        self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1)
+        self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations)
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}
@@ -91,35 +109,53 @@ class StageRun:
         """The Gaussians that exist, and what they show."""
         return self.state.model.live
 
+    @property
+    def checkpoint(self) -> Checkpoint:
+        """The state now; the next step takes over its buffers."""
+        return Checkpoint(self.system, self.index, self.state, self.history, self.num_restored)
+
     def train(
         self,
         on_checkpoint: OnCheckpoint | None,
         checkpoint_every: int | None,
         progress: bool,
         title: str | None = None,
+        is_stopped: IsStopped = never,
     ) -> None:
-        """Runs the stage to its end; its photographs are let go then."""
+        """Runs the stage to its end, or, with a last checkpoint and a KeyboardInterrupt, to where it is stopped.
+
+        Its photographs are let go then.
+        """
         try:
-            self._train(on_checkpoint, checkpoint_every, progress, title)
+            self._train(on_checkpoint, checkpoint_every, progress, title, is_stopped)
         finally:
             self.photographs.close()
 
     def _train(
-        self, on_checkpoint: OnCheckpoint | None, checkpoint_every: int | None, progress: bool, title: str | None
+        self,
+        on_checkpoint: OnCheckpoint | None,
+        checkpoint_every: int | None,
+        progress: bool,
+        title: str | None,
+        is_stopped: IsStopped,
     ) -> None:
-        iteration, end = int(self.state.iteration), self.stage.iterations
+        first, end = int(self.state.iteration), self.stage.iterations
+        iteration = first
         with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress) as bar:
             while iteration < end:
                 stop = self._next_stop(iteration, checkpoint_every)
-                for info in self.steps(iteration + 1, stop):
+                for info in self.steps(iteration + 1, stop, is_stopped):
                     iteration += 1
                     self._log(iteration, info)
                     bar.update(info, self.history)
                 if iteration == stop:
                     self._host_events(iteration)
-                    is_due = checkpoint_every is not None and iteration % checkpoint_every == 0
-                    if on_checkpoint is not None and (is_due or iteration == end):
-                        on_checkpoint(Checkpoint(self.system, self.index, self.state, self.history))
+                is_asked = is_stopped() and iteration > first
+                is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
+                if on_checkpoint is not None and (is_due or is_asked or iteration == end):
+                    on_checkpoint(self.checkpoint)
+                if is_stopped() and iteration < end:
+                    raise KeyboardInterrupt
         if self.num_refused:
             warnings.warn(
                 f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
@@ -146,9 +182,11 @@ class StageRun:
                 due.append(times.last)
         return due
 
-    def steps(self, first: int, last: int) -> list[StepInfo]:
+    def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
         """Iterations `first` to `last`, or up to the one that could not be taken, whose cause is mended."""
-        launched = [self._launch(iteration) for iteration in range(first, last + 1)]
+        launched: list[StepInfo] = []
+        while first + len(launched) <= last and not is_stopped():
+            launched.append(self._launch(first + len(launched)))
         infos = read(launched)
         taken = [info for info in infos if info.status == FINE]
         self.num_refused += sum(int(info.num_refused) for info in taken)
@@ -156,14 +194,16 @@ class StageRun:
             self._mend(first + len(taken), infos[len(taken)])
         return taken
 
-    def _launch(self, iteration: int) -> StepInfo:
+    def _arguments(self, iteration: int) -> tuple:
+        """What the step of an iteration is given."""
         photographs, views = self.photographs.batch(iteration)
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
-        step = jitted_step()
+        return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
+
+    def _launch(self, iteration: int) -> StepInfo:
+        arguments, step = self._arguments(iteration), jitted_step()
         num_compiled = step.num_compiled()
-        self.state, info = step(
-            settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
-        )
+        self.state, info = step(*arguments)
         if step.num_compiled() > num_compiled:
             return_free_memory()
             keep_room_for_programs()
@@ -181,15 +221,21 @@ class StageRun:
             self.capacities[size] = self._shared_capacity(size, capacity_for(int(float(info.num_pairs) * GROWTH_ROOM)))
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
-        if info.status == NOT_FINITE:
-            names = ", ".join(self.views[index].name for index in self.order.indices(iteration))
-            raise ValueError(
-                f"loss or gradient is not finite {where}, view {names}: lower the learning rates, or look for a "
-                "damaged camera or image; the state before it is unharmed"
-            )
+        if info.status in (NOT_FINITE, EXPLODED):
+            raise self._diverged(iteration, where, info)
         assert info.status == IMPOSSIBLE
         reasons = [event.impossible for event in self.stage.events if isinstance(event, StepEvent) and event.impossible]
         raise ValueError(f"training cannot go on {where}: {'; or '.join(reasons)}")
+
+    def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
+        """The error that tells what was not finite, or too large."""
+        names = [self.views[index].name for index in self.order.indices(iteration)]
+        what = "loss or gradient is not finite" if info.status == NOT_FINITE else "the loss has exploded"
+        return DivergedError(
+            f"{what} {where}, view {', '.join(names)}: {what_diverged(self._arguments(iteration), names)}: lower the "
+            "learning rates, or look for a damaged camera or image; the state before it is unharmed",
+            self.checkpoint,
+        )
 
     def _log(self, iteration: int, info: StepInfo) -> None:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
@@ -199,6 +245,7 @@ class StageRun:
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
                 num_bytes / 1e6, self.seconds,
             )  # fmt: skip
+            self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:
         """The host events that follow an iteration; events that are past forget what they have gathered."""

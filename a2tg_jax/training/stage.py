@@ -131,6 +131,8 @@ class Clock(NamedTuple):
     """Iterations between two degrees."""
     times: tuple[Times | None, ...]
     """Of every event; None where it happens after every iteration, or on the host."""
+    largest_loss: float = math.inf
+    """A larger one is an explosion: the step is not taken."""
 
 
 def _times(event: Event, num_iterations: int) -> Times | None:

@@ -1,7 +1,7 @@
 """One training step, jitted once per image size and stage: render, loss, gradients, Adam, events.
 
-What cannot be taken, because the tile lists overflowed or a number is not finite, leaves the state as it was, with a
-status that makes all further steps idle: the host may look at it some steps later and lose nothing.
+What cannot be taken, because the tile lists overflowed, a number is not finite or the loss exploded, leaves the state
+as it was, with a status that makes all further steps idle: the host may look at it some steps later and lose nothing.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 
-FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE = range(4)
+FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
 """The status of a state: why it did not take the last step."""
 
 
@@ -41,7 +41,7 @@ class TrainState:
     iteration: Array
     """int32, iterations of this stage done so far."""
     status: Array
-    """int32: FINE, OVERFLOW, NOT_FINITE or IMPOSSIBLE."""
+    """int32: FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE or EXPLODED."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +79,17 @@ def initial_state(stage: Stage, model: Model) -> TrainState:
     )
 
 
+class Attempt(NamedTuple):
+    """What a step makes of a state, whether it can be taken or not."""
+
+    views: "_ViewGradients"
+    grads: tuple[Gaussians, Any]
+    """Means over the views."""
+    state: TrainState
+    """After the step, with the status of the state before."""
+    info: EventInfo
+
+
 @functools.cache
 def jitted_step():
     """`train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
@@ -101,6 +112,22 @@ def train_step(
       scene_scale: factor of the means' learning rate.
       key: of the stage; each iteration folds in its number.
     """
+    tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key)
+    status = jnp.where(state.status == FINE, _status(clock, tried), state.status)
+    new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
+    chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
+    found = tried.views
+    return chosen, StepInfo(
+        loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
+        num_live=chosen.model.num_live, num_refused=jnp.asarray(tried.info.num_refused),
+    )  # fmt: skip
+
+
+def attempt(
+    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
+    scene_scale: Array, key: Array,
+) -> Attempt:  # fmt: skip
+    """What one iteration would lead to. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
@@ -118,15 +145,7 @@ def train_step(
     now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
     seen = _seen(stage, batch, found)
     model, moments, events, info = _events(stage, clock, now, seen, model, moments, state.events)
-
-    status = _status(found, grads, model, info)
-    status = jnp.where(state.status == FINE, status, state.status)
-    new = TrainState(model, moments, events, iteration, status)
-    chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, dataclasses.replace(state, status=status))
-    return chosen, StepInfo(
-        loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
-        num_live=chosen.model.num_live, num_refused=jnp.asarray(info.num_refused),
-    )  # fmt: skip
+    return Attempt(found, grads, TrainState(model, moments, events, iteration, state.status), info)
 
 
 class _ViewGradients(NamedTuple):
@@ -244,10 +263,12 @@ def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: Adam
     return jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
 
 
-def _status(found: _ViewGradients, grads, model: Model, info: EventInfo) -> Array:
+def _status(clock: Clock, tried: Attempt) -> Array:
     """Why a step may not be taken, the first reason that holds."""
-    is_finite = _all_finite((found.loss, grads, model.gaussians, model.params))
-    status = jnp.where(info.is_possible, FINE, IMPOSSIBLE)
+    found, model = tried.views, tried.state.model
+    is_finite = _all_finite((found.loss, tried.grads, model.gaussians, model.params))
+    status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
+    status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
     status = jnp.where(is_finite, status, NOT_FINITE)
     return jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
 

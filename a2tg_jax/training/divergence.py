@@ -1,0 +1,71 @@
+"""Where training diverged: the iteration, its views, and which rows of which parameters. Asked after the fact (host).
+
+The step itself says no more than that it could not be taken (`step.NOT_FINITE`, `step.EXPLODED`), which costs nothing.
+"""
+
+import functools
+from collections.abc import Iterator, Sequence
+
+import jax
+import numpy as np
+
+from a2tg_jax.classes import jit
+from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.step import Attempt, attempt
+
+EXPLOSION = 100.0
+"""A loss that is larger than so many times that of the stage's first logged iteration is an explosion, …"""
+SMALL_LOSS = 10.0
+"""… unless it is no larger than this."""
+TOLD_ROWS = 5
+
+
+class DivergedError(ValueError):
+    """A loss or gradient is not finite, or the loss exploded. The state before that step is unharmed."""
+
+    def __init__(self, message: str, checkpoint: Checkpoint):
+        """Args:
+        message: one line.
+        checkpoint: the state before the step.
+        """
+        super().__init__(message)
+        self.checkpoint = checkpoint
+
+
+def largest_loss(history: History) -> float:
+    """What the loss of a stage may not exceed; infinite before the first logged iteration."""
+    return max(SMALL_LOSS, EXPLOSION * float(history.loss[0])) if len(history.loss) else float("inf")
+
+
+@functools.cache
+def _jitted_attempt():
+    return jit(attempt, static_argnums=(0,))
+
+
+def what_diverged(arguments: tuple, names: Sequence[str]) -> str:
+    """The views and parameters whose numbers are not finite, or how large the loss is where all of them are.
+
+    Args:
+      arguments: of `train_step`, with the state before the step that could not be taken.
+      names: of its views.
+    """
+    tried: Attempt = _jitted_attempt()(*arguments)
+    losses = np.asarray(tried.views.loss)
+    found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
+    found += [f"the gradient by {told}" for told in _not_finite(tried.grads)]
+    model = tried.state.model
+    found += [f"after the step, {told}" for told in _not_finite((model.gaussians, model.params))]
+    return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
+
+
+def _not_finite(parameters: tuple) -> Iterator[str]:
+    """Each leaf of (gaussians, params) with such numbers, and their rows."""
+    for place, prefix in enumerate(("", "params")):
+        for path, leaf in jax.tree_util.tree_flatten_with_path(parameters[place])[0]:
+            numbers = np.asarray(leaf)
+            is_bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
+            if is_bad.any():
+                rows = np.flatnonzero(is_bad)
+                told = ", ".join(map(str, rows[:TOLD_ROWS])) + (", …" if len(rows) > TOLD_ROWS else "")
+                name = (prefix + jax.tree_util.keystr(path)).lstrip(".")
+                yield f"{name} is not finite in {len(rows):,} of {len(numbers):,} rows ({told})"

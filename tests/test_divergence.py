@@ -1,0 +1,128 @@
+"""Numbers that are not finite and losses that explode: seen in the step, told, undone, and stops that lose nothing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from a2tg_jax import (
+    A2tg,
+    Change,
+    DivergedError,
+    StepEvent,
+    event,
+    fit,
+    load_checkpoint,
+    save_checkpoint,
+    synthetic_scene,
+)
+from a2tg_jax.systems.a2tg import TextureConfig
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training.batches import BatchOrder
+from a2tg_jax.training.divergence import largest_loss
+
+SIZES = {"initial_gaussians": 60, "densify": McmcConfig(cap=60)}
+BAD_ROW = 7
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic_scene(num_views=8, width=40, height=30, num_points=150)
+
+
+@event
+class Poison(StepEvent):
+    """After one iteration, a row becomes NaN."""
+
+    iteration: int = 12
+
+    def apply(self, now, model, moments, state):
+        is_bad = (now.iteration == self.iteration) & (jnp.arange(model.gaussians.num) == BAD_ROW)
+        log_scales = jnp.where(is_bad[:, None], jnp.nan, model.gaussians.log_scales)
+        gaussians = dataclasses.replace(model.gaussians, log_scales=log_scales)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+@event
+class Brighten(StepEvent):
+    """After every iteration, colours double."""
+
+    def apply(self, now, model, moments, state):
+        gaussians = dataclasses.replace(model.gaussians, sh=2 * model.gaussians.sh)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Poisoned(Gaussians2dMcmc):
+    """One stage with that event."""
+
+    def stages(self):
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(*stage.events, Poison())),)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Exploding(Gaussians2dMcmc):
+    """One stage with the other event."""
+
+    def stages(self):
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(*stage.events, Brighten())),)
+
+
+def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_path):
+    system = Poisoned(stage1_iterations=20, **SIZES)
+    with pytest.raises(DivergedError) as raised:
+        fit(scene, system, progress=False)
+    text = str(raised.value)
+    assert "not finite at iteration 12 of stage gaussians, view " in text and "\n" not in text
+    assert f"after the step, log_scales is not finite in 1 of 60 rows ({BAD_ROW})" in text
+    save_checkpoint(tmp_path / "kept.npz", raised.value.checkpoint)
+    kept = load_checkpoint(tmp_path / "kept.npz", Poisoned)
+    assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.log_scales).all()
+
+
+def test_an_explosion_is_seen_in_the_step(scene):
+    with pytest.raises(
+        DivergedError, match=r"exploded at iteration \d+ of stage .*, view \S+: the loss of \S+ is \d"
+    ) as raised:
+        fit(scene, Exploding(stage1_iterations=60, **SIZES), progress=False)
+    before = raised.value.checkpoint
+    assert 10 < before.iteration < 60 and before.history.loss[-1] < largest_loss(before.history)
+
+
+def test_the_limit_of_the_loss_follows_the_first_logged_one(scene):
+    history = fit(scene, Gaussians2dMcmc(stage1_iterations=10, **SIZES), progress=False).history
+    assert largest_loss(history) == 100 * history.loss[0]
+    assert largest_loss(dataclasses.replace(history, loss=np.asarray([0.01, 0.1]))) == 10
+    assert largest_loss(dataclasses.replace(history, loss=np.asarray([3.0, 0.1]))) == 300
+    assert largest_loss(dataclasses.replace(history, loss=np.zeros(0))) == np.inf
+
+
+def test_each_restoration_has_an_order_of_its_own(scene):
+    orders = [BatchOrder(scene.train, 1, 5, number) for number in (0, 1, 2)]
+    seen = [tuple(order.indices(i)[0] for i in range(1, 22)) for order in orders]
+    assert len(set(seen)) == 3 and all(sorted(s[:7]) == list(range(7)) for s in seen)
+    assert seen[0] == tuple(BatchOrder(scene.train, 1, 5).indices(i)[0] for i in range(1, 22))
+
+
+@pytest.mark.parametrize(("calls", "stage"), [(17, 0), (40, 1)])
+def test_a_stop_between_any_two_steps_changes_nothing(scene, tmp_path, calls, stage):
+    system = A2tg(
+        stage1_iterations=24, stage2_iterations=20, texture=TextureConfig(upscale_at=(0.3, 0.6)), seed=3, **SIZES
+    )
+    left, kept = iter(range(calls)), []
+
+    def keep(checkpoint):
+        kept.append((checkpoint.stage, checkpoint.iteration))
+        save_checkpoint(tmp_path / "checkpoint.npz", checkpoint)
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, system, on_checkpoint=keep, progress=False, is_stopped=lambda: next(left, None) is None)
+    assert kept[-1][0] == stage and 0 < kept[-1][1] < 20 and kept[-1][1] % 10
+    resumed = fit(scene, system, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False)
+    whole = fit(scene, system, progress=False)
+    jax.tree.map(np.testing.assert_array_equal, resumed.model, whole.model)
