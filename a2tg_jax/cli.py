@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.data import Scene, run_sfm
+from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.metrics import load_lpips
 from a2tg_jax.results.compress import compress, compression_text
 from a2tg_jax.results.evaluate_run import evaluate_run
@@ -111,6 +112,8 @@ class Train:
     """Use the images at 1/k of their size."""
     test_every: int = 8
     """Every k-th image is kept for testing."""
+    alpha: AlphaMeaning = "transparency"
+    """What the alpha channel of images is: the transparency of what they show, or a mask, which leaves pixels out."""
     compare: UseAppendAction[tuple[str, ...]] = ()
     """Also train this system, to compare with: with the options above and below, where it has any of that name."""
     baseline: bool = False
@@ -135,7 +138,7 @@ class Train:
         """The run that the flags ask for."""
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
-        source = SceneSource(path, self.downscale, self.test_every)
+        source = SceneSource(path, self.downscale, self.test_every, self.alpha)
         return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset)
 
     def _resumed(self) -> RunFolder:
@@ -346,6 +349,7 @@ def _train_defaults(arguments: list[str]) -> Train:
         preset=file.preset,
         downscale=file.downscale,
         test_every=file.test_every,
+        alpha=file.alpha,
         compare=file.compare,
         options=file.chosen(path),
     )

@@ -72,8 +72,7 @@ def loss_on_views(
     draw = _drawing(model, [view.camera for view in views], background, settings)
 
     def psnr(other: Model) -> float:
-        photographs = (np.clip(view_image(view, background), 0, 1) for view in views)
-        errors = (_squared_error(*pair) for pair in zip(draw(other), photographs, strict=True))
+        errors = (_error_on(view, image, background) for view, image in zip(views, draw(other), strict=True))
         return float(np.mean([-10 * math.log10(max(error, 1e-12)) for error in errors]))
 
     own = psnr(model)
@@ -116,6 +115,12 @@ def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings:
         return (np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras)
 
     return draw
+
+
+def _error_on(view: View, image: np.ndarray, background: Color) -> float:
+    """Mean squared error of a render over the pixels of a photograph that count."""
+    counts = ... if view.mask is None else view.mask.read()
+    return _squared_error(image[counts], np.clip(view_image(view, background), 0, 1)[counts])
 
 
 def _squared_error(image: np.ndarray, target: np.ndarray) -> float:

@@ -77,7 +77,7 @@ def evaluate(
     lpips_weights: str | os.PathLike | None = None,
     num_renders: int = 0,
 ) -> Evaluation:
-    """Renders every view and compares it with its photograph (host).
+    """Renders every view and compares it with its photograph, where its pixels count (host).
 
     Args:
       views: at least one.
@@ -98,15 +98,16 @@ def evaluate(
     background = model.background if background is None else background
     cameras = [view.camera for view in views]
     renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
-    psnr_and_ssim = jax.jit(lambda image, target: (psnr(image, target), ssim(image, target)))
+    psnr_and_ssim = jax.jit(lambda *compared: (psnr(*compared), ssim(*compared)))
     per_view: list[ViewMetrics] = []
     seconds: list[float] = []
     renders: list[np.ndarray] = []
     for view in views:
         image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
         seconds.append(_seconds_to_draw(renderer, view.camera))
-        decibels, similarity = psnr_and_ssim(image, target)
-        distance = None if weights is None else float(lpips(image, target, weights))
+        mask = None if view.mask is None else jnp.asarray(view.mask.read())
+        decibels, similarity = psnr_and_ssim(image, target, mask)
+        distance = None if weights is None else float(lpips(image, target, weights, mask))
         per_view.append(ViewMetrics(view.name, float(decibels), float(similarity), distance))
         if len(renders) < num_renders:
             renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))

@@ -59,6 +59,8 @@ class Photographs(NamedTuple):
     Ks: Array
     images: Array
     """[V, H, W, 3] over the background."""
+    weights: Array
+    """[V, H, W, 1]: 1 where a pixel counts, else 0; or [V, 1, 1, 1] where all of them do."""
 
 
 def polish(model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background=None) -> Model:
@@ -100,18 +102,18 @@ def _solve(model: Model, groups: list[Photographs], background: Array, settings:
 
             def step(total, view, height=height, width=width):
                 camera = Camera(view.viewmats, view.Ks, width, height)
-                return jax.tree.map(jnp.add, total, function(camera, view.images)), None
+                return jax.tree.map(jnp.add, total, function(camera, view)), None
 
             total, _ = jax.lax.scan(step, total, group)
         return total
 
-    def right(camera: Camera, image: Array) -> Colors:
-        residual = image - _drawn(model, camera, background, settings)
-        return _transpose(model, camera, settings, residual)
+    def right(camera: Camera, view: Photographs) -> Colors:
+        residual = view.images - _drawn(model, camera, background, settings)
+        return _transpose(model, camera, settings, view.weights * residual)
 
     def normal(change: Colors) -> Colors:
-        def of_view(camera: Camera, image: Array) -> Colors:
-            return _transpose(model, camera, settings, draw_change(model, change, camera, settings))
+        def of_view(camera: Camera, view: Photographs) -> Colors:
+            return _transpose(model, camera, settings, view.weights * draw_change(model, change, camera, settings))
 
         return over_views(of_view)
 
@@ -183,6 +185,15 @@ def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
             jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
             jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),
+            _weights(own, dtype),
         )
         for own in by_size.values()
     ]
+
+
+def _weights(views: Sequence[View], dtype) -> Array:
+    """What each pixel counts, of views of one size."""
+    if all(view.mask is None for view in views):
+        return jnp.ones((len(views), 1, 1, 1), dtype)
+    masks = [np.ones(view.picture.size, bool) if view.mask is None else view.mask.read() for view in views]
+    return jnp.asarray(np.stack(masks)[..., None], dtype)

@@ -1,6 +1,7 @@
 """What a result is judged by: PSNR, SSIM, LPIPS on images clipped to [0, 1], and the bytes of its parameters.
 
-Images are [H, W, 3] floats. LPIPS takes its network from a weights file, which this package does not contain.
+Images are [H, W, 3] floats, a mask is [H, W] bool, True where a pixel counts: where one does not, both images are
+black. LPIPS takes its network from a weights file, which this package does not contain.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from jax import Array
 
 from a2tg_jax import losses
 from a2tg_jax.budget import BYTES_PER_FLOAT
+from a2tg_jax.checks import check_shape
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.texture import BYTES_PER_TEXEL, AtlasLayout
@@ -25,31 +27,38 @@ LPIPS_MIN_SIDE = 32
 LPIPS_LINEAR_LAYERS = {"alex": 5, "squeeze": 7}
 
 
-def psnr(image: Array, target: Array) -> Array:
+def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
     """Peak signal-to-noise ratio in dB, -10·log10(mean squared error); infinite for equal images.
 
     Args:
       image: [H, W, 3], clipped to [0, 1] first.
       target: [H, W, 3], likewise.
+      mask: the mean is that over the pixels that count, one at least.
 
     Raises:
       ValueError: if the shapes differ.
     """
-    image, target = _clip_pair(image, target)
-    return -10 * jnp.log10(jnp.mean((image - target) ** 2))
+    image, target = _clip_pair(image, target, mask)
+    error = jnp.mean((image - target) ** 2)
+    return -10 * jnp.log10(error if mask is None else error / jnp.mean(jnp.asarray(mask, error.dtype)))
 
 
-def ssim(image: Array, target: Array) -> Array:
+def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
     """Structural similarity in [-1, 1] (see `losses.mean_ssim`) of the images clipped to [0, 1].
 
     Args:
       image: [H, W, 3], sides of at least 11 pixels.
       target: [H, W, 3].
+      mask: the mean is that over the windows in which at least one pixel counts.
 
     Raises:
       ValueError: if the shapes differ or a side is shorter than 11 pixels.
     """
-    return losses.mean_ssim(*_clip_pair(image, target))
+    similarity = losses.mean_ssim(*_clip_pair(image, target, mask))
+    if mask is None:
+        return similarity
+    # Windows in which nothing counts are equal, and count 1 each.
+    return 1 - (1 - similarity) / _share_of_windows(jnp.asarray(mask), similarity.dtype)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,20 +81,21 @@ def load_lpips(path: str | os.PathLike) -> LpipsWeights:
     return _load_lpips(pathlib.Path(path).resolve())
 
 
-def lpips(image: Array, target: Array, weights: LpipsWeights | str | os.PathLike) -> Array:
+def lpips(image: Array, target: Array, weights: LpipsWeights | str | os.PathLike, mask: Array | None = None) -> Array:
     """Learned perceptual distance (LPIPS v0.1, Zhang et al., 2018) of the images clipped to [0, 1]; 0 is equal.
 
     Args:
       image: [H, W, 3], sides of at least 32 pixels.
       target: [H, W, 3].
       weights: from `load_lpips`, or the path of the file.
+      mask: the mean is still that over the whole image.
 
     Raises:
       ValueError: if the shapes differ or a side is too short, or as `load_lpips` does.
     """
     if not isinstance(weights, LpipsWeights):
         weights = load_lpips(weights)
-    pair = jnp.stack(_clip_pair(image, target))
+    pair = jnp.stack(_clip_pair(image, target, mask))
     if min(pair.shape[1:3]) < LPIPS_MIN_SIDE:
         raise ValueError(
             f"LPIPS needs sides of at least {LPIPS_MIN_SIDE} pixels; got {pair.shape[2]} by {pair.shape[1]}"
@@ -108,10 +118,23 @@ def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> 
     return BYTES_PER_FLOAT * gaussians.floats_per_row * gaussians.num + BYTES_PER_TEXEL * texels
 
 
-def _clip_pair(image: Array, target: Array) -> tuple[Array, Array]:
+def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
+    """Both images in [0, 1], and black where pixels do not count."""
     image, target = jnp.asarray(image), jnp.asarray(target)
     losses.check_same_shape(image, target)
-    return jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
+    image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
+    if mask is None:
+        return image, target
+    check_shape("mask", mask, image.shape[:2])
+    counts = jnp.asarray(mask)[..., None]
+    return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
+
+
+def _share_of_windows(mask: Array, dtype) -> Array:
+    """Share of SSIM's windows in which at least one pixel counts."""
+    window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
+    counts = jax.lax.reduce_window(mask.astype(dtype), -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
+    return jnp.mean(counts)
 
 
 @functools.lru_cache(maxsize=4)

@@ -13,6 +13,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.pictures import Shelf
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
 
@@ -56,7 +57,9 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     def shoot(image: Any) -> Shot:
         return _shot(image, lenses[image.camera_id], images_folder, downscale, shelf)
 
-    train, test = every_kth(map_in_threads(shoot, registered), test_every)
+    shots = map_in_threads(shoot, registered)
+    check_masks(shots, str(path), images_folder.with_name(FOLDER))
+    train, test = every_kth(shots, test_every)
     return assemble_scene(images_folder.parent.name, train, test, read_points(reconstruction), source=str(path))
 
 
@@ -80,13 +83,15 @@ def viewmat_of(image: Any) -> np.ndarray:
 def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Shelf) -> Shot:
     """One registered image, undistorted and downscaled."""
     file, still_to_downscale = locate_image(images_folder, image.name, downscale)
-    pixels = read_pixels(file)
-    check_aspect(file, pixels, *lens.size)
+    photograph = read_pixels(file)
+    check_aspect(file, photograph, *lens.size)
     try:
-        shown, K = lens.undistort(pixels, still_to_downscale)
+        pixels, K = lens.undistort(photograph, still_to_downscale)
     except ValueError as error:
         raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
-    return Shot(image.name, viewmat_of(image), K, shelf.keep(shown, file if shown is pixels else None))
+    mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
+    kept = shelf.keep(pixels, file if pixels is photograph else None)
+    return Shot(image.name, viewmat_of(image), K, kept, mask)
 
 
 def _model_suffix(folder: Path) -> str | None:

@@ -2,19 +2,28 @@
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
+from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 
 
-def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int = 8, room: int | None = None) -> Scene:
+def load_scene(
+    path: str | os.PathLike,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    room: int | None = None,
+    alpha: AlphaMeaning = "transparency",
+) -> Scene:
     """Reads photographs, cameras and points, and normalises the world.
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
     nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`).
-    Distorted cameras are undistorted to pinholes. Images in the folder without a pose are left aside.
+    Distorted cameras are undistorted to pinholes. Images in the folder without a pose are left aside. Masks, black
+    where a pixel shall not count, lie in `masks` beside `images`, or where `mask_path` says.
 
     Args:
       path: the scene folder, or a transforms.json.
@@ -23,15 +32,24 @@ def load_scene(path: str | os.PathLike, *, downscale: int = 1, test_every: int =
         effect where the scene names its test views itself.
       room: bytes that the photographs may take in memory, at 3 or 4 a pixel; those beyond stay on disk and are read
         when they are needed (`Shelf`), which changes no result. None: a quarter of what the process may have.
+      alpha: what an alpha channel is: the "transparency" of what was photographed, before a background; or a "mask",
+        of which only what is opaque counts.
 
     Returns:
       The scene, in its normalised world; `Scene.transform` leads there from the input's.
 
     Raises:
-      FileNotFoundError: if the path or an image does not exist, or nothing there is a scene.
-      ValueError: if an argument, the model, a pose or an image is unusable, or fewer than two views are left.
+      FileNotFoundError: if the path, an image or a mask that is named does not exist, or nothing there is a scene.
+      ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
     """
-    path = Path(path)
+    if alpha not in get_args(AlphaMeaning):
+        raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
+    scene = _load(Path(path), downscale, test_every, room)
+    return alpha_as_mask(scene, str(path)) if alpha == "mask" else scene
+
+
+def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scene:
+    """The scene as it lies on disk."""
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
     if test_every < 0 or test_every == 1:

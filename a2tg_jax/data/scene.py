@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.cameras import Camera
+from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.pictures import Picture
 from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similarity, scene_scale
 
@@ -27,10 +28,13 @@ class View:
     """Its camera in the normalised world, float32, of the image's size."""
     picture: Picture
     """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given, too."""
+    mask: Mask | None = None
+    """Which pixels count, in losses and metrics; None: all of them. An array [H, W] bool may be given, too."""
 
     def __post_init__(self) -> None:
-        """Arrays become pictures that are held."""
+        """Arrays become pictures that are held, and masks."""
         object.__setattr__(self, "picture", Picture.of(self.picture))
+        object.__setattr__(self, "mask", None if self.mask is None else Mask.of(self.mask))
 
     @property
     def image(self) -> np.ndarray:
@@ -78,6 +82,8 @@ class Shot:
     """[3, 3] float64 intrinsics in pixels of `pixels`."""
     pixels: Picture | np.ndarray
     """[H, W, 3] or [H, W, 4] uint8, with straight alpha."""
+    mask: Mask | None = None
+    """Which pixels count; None: there is no mask."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -200,4 +206,5 @@ def _view(shot: Shot, viewmat: np.ndarray) -> View:
     """The shot with its camera in the normalised world."""
     height, width = shot.pixels.shape[:2]
     camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height)
-    return View(shot.name, camera, Picture.of(shot.pixels))
+    mask = None if shot.mask is None or shot.mask.is_full else shot.mask
+    return View(shot.name, camera, Picture.of(shot.pixels), mask)

@@ -16,6 +16,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
 from a2tg_jax.data.pictures import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
@@ -102,7 +103,9 @@ def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) 
     def shoot(frame: dict[str, Any]) -> Shot:
         return _shot(file, {**meta, **frame}, downscale, shelf)
 
-    return map_in_threads(shoot, meta["frames"])
+    shots = map_in_threads(shoot, meta["frames"])
+    check_masks(shots, str(file))
+    return shots
 
 
 def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Shot:
@@ -115,15 +118,25 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Sh
     # Only a folder of images below the scene has siblings of the form images_k.
     image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
     image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
-    pixels = read_pixels(image_file)
-    lens = _lens(frame, pixels, f"{file}: {name}")
-    check_aspect(image_file, pixels, *lens.size)
+    photograph = read_pixels(image_file)
+    lens = _lens(frame, photograph, f"{file}: {name}")
+    check_aspect(image_file, photograph, *lens.size)
     try:
-        shown, K = lens.undistort(pixels, still_to_downscale)
+        pixels, K = lens.undistort(photograph, still_to_downscale)
     except ValueError as error:
         raise ValueError(f"{file}: {name}: its camera model {error}") from None
-    kept = shelf.keep(shown, image_file if shown is pixels else None)
-    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept)
+    mask = load_mask(_find_mask(file, frame, image_folder / image_name, downscale), lens, photograph, pixels)
+    kept = shelf.keep(pixels, image_file if pixels is photograph else None)
+    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask)
+
+
+def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
+    """The mask that a frame names, or else that of its image in a folder `masks` beside the folder `images`."""
+    if frame.get("mask_path"):
+        check_inside(file.parent, frame["mask_path"])
+        return named_mask(file.parent / frame["mask_path"], downscale)
+    images = file.parent / "images"
+    return find_mask(images, str(image.relative_to(images)), downscale) if image.is_relative_to(images) else None
 
 
 def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:

@@ -21,6 +21,7 @@ from typing import Any
 import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
+from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.results.folder import RunFolder
@@ -44,6 +45,8 @@ class SceneSource:
     """Use the images at 1/k of their size."""
     test_every: int = 8
     """Every k-th view is a test view."""
+    alpha: AlphaMeaning = "transparency"
+    """What the alpha channel of photographs is: the transparency of what they show, or a mask."""
 
     def load(self) -> Scene:
         """The scene in its normalised world.
@@ -54,7 +57,7 @@ class SceneSource:
         if self.path == SYNTHETIC:
             width, height = SYNTHETIC_SIZE
             return synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=self.test_every)
-        return load_scene(self.path, downscale=self.downscale, test_every=self.test_every)
+        return load_scene(self.path, downscale=self.downscale, test_every=self.test_every, alpha=self.alpha)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +121,7 @@ class RunFile:
     scene: str | None = None
     downscale: int = 1
     test_every: int = 8
+    alpha: AlphaMeaning = "transparency"
     system: str = DEFAULT_SYSTEM
     preset: str | None = None
     compare: tuple[str, ...] = ()
@@ -190,6 +194,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "scene": record.scene.path,
         "downscale": record.scene.downscale,
         "test_every": record.scene.test_every,
+        "alpha": record.scene.alpha,
         "system": record.name,
         **({} if record.preset is None else {"preset": record.preset}),
         "compare": list(record.compare),
@@ -209,7 +214,7 @@ def read_record(run: RunFolder) -> RunRecord:
     file = read_run_file(run.record)
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
-    source = SceneSource(file.scene, file.downscale, file.test_every)
+    source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha)
     return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare, file.preset)
 
 

@@ -31,6 +31,8 @@ class Photographs(NamedTuple):
     """[V, H, W, 3] uint8."""
     alphas: Array | None
     """[V, H, W] uint8, or None where the images are opaque."""
+    masks: Array | None = None
+    """[V, H, W] bool, which pixels count; None where all of them do."""
 
 
 class BatchOrder:
@@ -150,6 +152,11 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
                 f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
             )
+        if view.mask is not None and view.mask.shape != (height, width):
+            raise ValueError(
+                f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
+                f"got {list(view.mask.shape)}"
+            )
 
 
 def device_room() -> float:
@@ -165,9 +172,14 @@ def stack_views(views: list[View]) -> Photographs:
     if any(view.has_alpha for view in views):
         opaque = np.full(views[0].picture.size, 255, np.uint8)
         alphas = np.stack([own[..., 3] if own.shape[2] == 4 else opaque for own in pixels])
+    masks = None
+    if any(view.mask is not None for view in views):
+        whole = np.ones(views[0].picture.size, bool)
+        masks = np.stack([whole if view.mask is None else view.mask.read() for view in views])
     return Photographs(
         viewmats=np.stack([np.asarray(view.camera.viewmat) for view in views]),  # type: ignore[arg-type]
         Ks=np.stack([np.asarray(view.camera.K) for view in views]),  # type: ignore[arg-type]
         images=np.stack([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
         alphas=alphas,  # type: ignore[arg-type]
+        masks=masks,  # type: ignore[arg-type]
     )

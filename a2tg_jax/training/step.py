@@ -170,8 +170,9 @@ def _gradients(settings: StepSettings, stage: Stage, clock: Clock, state: TrainS
     has_geometry = any(term.has_geometry for term in stage.losses)
 
     def one_view(view):
-        viewmat, K, image, alpha, background = view
-        target = Target(Camera(viewmat, K, width, height), _over(image, alpha, background), background)
+        viewmat, K, image, alpha, mask, background = view
+        photograph = _black_outside(mask, _over(image, alpha, background))
+        target = Target(Camera(viewmat, K, width, height), photograph, background, mask)
 
         def loss(gaussians, params, probe):
             shown = dataclasses.replace(model, gaussians=gaussians, params=params)
@@ -180,15 +181,16 @@ def _gradients(settings: StepSettings, stage: Stage, clock: Clock, state: TrainS
                 has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, probe=probe,
                 statistic=stage.statistic,
             )  # fmt: skip
+            output = output._replace(color=_black_outside(mask, output.color))
             value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
-            error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
+            error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
             return value, (error, num_pairs, output.overflow)
 
         differentiate = jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)
         (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, probe)
         return _ViewGradients(value, -10 * jnp.log10(error), num_pairs, overflow, grads[:2], grads[2])
 
-    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, batch.images, batch.alphas, backgrounds))
+    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, batch.images, batch.alphas, batch.masks, backgrounds))
 
 
 def _over(image: Array, alpha: Array | None, background: Array) -> Array:
@@ -198,6 +200,17 @@ def _over(image: Array, alpha: Array | None, background: Array) -> Array:
         return color
     weight = alpha.astype(background.dtype)[..., None] / 255
     return weight * color + (1 - weight) * background[None, None, :]
+
+
+def _black_outside(mask: Array | None, color: Array) -> Array:
+    """An image [H, W, 3], black where pixels do not count: what is there reaches no loss term."""
+    return color if mask is None else jnp.where(mask[..., None], color, jnp.zeros_like(color))
+
+
+def _mean_over(mask: Array | None, values: Array) -> Array:
+    """Mean of values [H, W, 3] over the pixels that count, those that do not being 0."""
+    mean = jnp.mean(values)
+    return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
 
 
 def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:

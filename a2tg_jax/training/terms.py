@@ -24,6 +24,8 @@ class Target(NamedTuple):
     """[H, W, 3] the photograph, over the background where it is transparent."""
     background: Array
     """[3]."""
+    mask: Array | None = None
+    """[H, W] bool: which pixels count; None: all. Photograph and render are black where they do not."""
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]

@@ -1,0 +1,135 @@
+"""Masks on disk: 0 (black) excludes a pixel and all else keeps it, as with COLMAP and nerfstudio."""
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.images import resize_pixels
+from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.masks import Mask
+from a2tg_jax.data.pictures import Picture
+from a2tg_jax.data.scene import Scene, Shot, View
+
+FOLDER = "masks"
+"""Beside the folder of images."""
+AlphaMeaning = Literal["transparency", "mask"]
+"""What the alpha channel of photographs is: how much of the background shows, or a mask."""
+
+
+def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
+    """The mask of an image and the factor by which it is still to be downscaled; None where there is none.
+
+    Args:
+      images: the folder of the full images; masks lie in its sibling `masks`, or `masks_k` for a downscale of k.
+      name: path of the image below the folder; its mask is NAME.EXT.png, as COLMAP has it, NAME.png, or of its name.
+      downscale: k >= 1.
+    """
+    folder = images.with_name(FOLDER)
+    for candidate in (f"{name}.png", str(Path(name).with_suffix(".png")), name):
+        found = _at_scale(folder, candidate, downscale)
+        if found is not None:
+            return found
+    return None
+
+
+def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
+    """As `find_mask`, of a mask that a scene names.
+
+    Raises:
+      FileNotFoundError: if it is not there.
+    """
+    found = _at_scale(path.parent, path.name, downscale)
+    if found is None:
+        raise FileNotFoundError(f"{path}: no such mask, but the scene names it; put it there or remove its mask_path")
+    return found
+
+
+def load_mask(
+    found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray
+) -> Mask | None:
+    """The mask of a view, undistorted and downscaled as its photograph was; None for None.
+
+    A pixel counts where all that it is made of does.
+
+    Args:
+      found: file and factor, of `find_mask`.
+      lens: the photograph's camera.
+      photograph: as stored.
+      pixels: [H, W, ...] as the view has it.
+
+    Raises:
+      ValueError: naming the file, if it is no image, or neither of the photograph's size nor of its camera's.
+    """
+    if found is None:
+        return None
+    file, still_to_downscale = found
+    counts = read_pixels(file)[..., :3].any(axis=-1)
+    size, photograph_size = counts.shape[::-1], photograph.shape[1::-1]
+    if size not in (photograph_size, lens.size):
+        told = "x".join(map(str, size)), "x".join(map(str, photograph_size))
+        raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
+    planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
+    planes, _ = lens.undistort(planes, still_to_downscale)
+    return Mask.of(resize_pixels(planes, *pixels.shape[1::-1])[..., 0] == 255)
+
+
+def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) -> None:
+    """Tells of photographs without a mask where others have one, and refuses masks that leave nothing.
+
+    Args:
+      shots: all of the scene.
+      source: the input, as messages name it.
+      folder: where masks were looked for; a warning where it is there, but holds none for any photograph.
+
+    Raises:
+      ValueError: naming the photograph.
+    """
+    lacking = [shot.name for shot in shots if shot.mask is None]
+    if len(lacking) == len(shots):
+        if folder is not None and folder.is_dir():
+            message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
+            warnings.warn(message, stacklevel=3)
+        return
+    if lacking:
+        message = f"{source}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
+        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
+    for shot in shots:
+        if shot.mask is not None:
+            _check_left(shot.mask, shot.name, source)
+
+
+def alpha_as_mask(scene: Scene, source: str) -> Scene:
+    """The scene with the alpha of its photographs as masks: what is not opaque does not count.
+
+    Raises:
+      ValueError: naming a photograph of which nothing is left.
+    """
+
+    def masked(view: View) -> View:
+        if not view.has_alpha:
+            return view
+        picture, (height, width) = view.picture, view.picture.size
+        is_opaque = picture.read()[..., 3] == 255
+        mask = Mask.of(is_opaque if view.mask is None else is_opaque & view.mask.read())
+        _check_left(mask, view.name, source)
+        opaque = Picture((height, width, 3), lambda: picture.read()[..., :3], picture.is_held)
+        return dataclasses.replace(view, picture=opaque, mask=mask)
+
+    return dataclasses.replace(scene, train=tuple(map(masked, scene.train)), test=tuple(map(masked, scene.test)))
+
+
+def _at_scale(folder: Path, name: str, downscale: int) -> tuple[Path, int] | None:
+    smaller = folder.with_name(f"{folder.name}_{downscale}") / name
+    if downscale > 1 and smaller.is_file():
+        return smaller, 1
+    return (folder / name, downscale) if (folder / name).is_file() else None
+
+
+def _check_left(mask: Mask, name: str, source: str) -> None:
+    if mask.num == 0:
+        raise ValueError(f"{source}: the mask of {name} excludes every pixel; remove the photograph or mend the mask")

@@ -1,0 +1,41 @@
+"""Which pixels of a photograph count, kept small in memory."""
+
+import dataclasses
+import zlib
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Mask:
+    """[H, W] bool, True where a pixel counts, as compressed bits: those of a scene take less than one photograph."""
+
+    shape: tuple[int, int]
+    """(H, W)."""
+    num: int
+    """Pixels that count."""
+    data: bytes = dataclasses.field(repr=False)
+
+    @staticmethod
+    def of(counts: "np.ndarray | Mask") -> "Mask":
+        """The mask of an array [H, W]; a mask is returned as it is.
+
+        Raises:
+          ValueError: unless it is bool, [H, W].
+        """
+        if isinstance(counts, Mask):
+            return counts
+        if counts.ndim != 2 or counts.dtype != bool:
+            raise ValueError(f"a mask must be bool [H, W], True where pixels count; got {counts.dtype} {counts.shape}")
+        height, width = counts.shape
+        return Mask((height, width), int(counts.sum()), zlib.compress(np.packbits(counts).tobytes(), 1))
+
+    @property
+    def is_full(self) -> bool:
+        """Whether all pixels count."""
+        return self.num == self.shape[0] * self.shape[1]
+
+    def read(self) -> np.ndarray:
+        """[H, W] bool."""
+        bits = np.frombuffer(zlib.decompress(self.data), np.uint8)
+        return np.unpackbits(bits, count=self.shape[0] * self.shape[1]).view(bool).reshape(self.shape)

@@ -1,0 +1,214 @@
+"""Masks: how they are found and read, and that what they exclude reaches neither training nor metrics."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from skimage.metrics import structural_similarity
+from test_data_colmap import HEIGHT, WIDTH, dot_place, write_scene
+from test_data_transforms import FOCAL, SIZE, write_frames, write_json
+
+from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_scene, polish, psnr, ssim, synthetic_scene
+from a2tg_jax.metrics import load_lpips, lpips
+from a2tg_jax.training.start import initial_model
+
+NAMES = tuple(f"img_{index:02d}.png" for index in range(9))
+
+
+def write_mask(file, counts):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(counts, 255, 0).astype(np.uint8)).save(file)
+
+
+def left_half(width=WIDTH, height=HEIGHT):
+    """A mask that keeps the left half."""
+    return np.broadcast_to(np.arange(width) < width // 2, (height, width))
+
+
+def views_of(scene):
+    return (*scene.train, *scene.test)
+
+
+@pytest.mark.parametrize("called", ["{name}.png", "{stem}.png"])
+def test_masks_beside_the_images_of_colmap(tmp_path, called):
+    write_scene(tmp_path)
+    for name in NAMES:
+        write_mask(tmp_path / "masks" / called.format(name=name, stem=name.removesuffix(".png")), left_half())
+    for view in views_of(load_scene(tmp_path)):
+        np.testing.assert_array_equal(view.mask.read(), left_half())
+    for view in views_of(load_scene(tmp_path, downscale=4)):
+        np.testing.assert_array_equal(view.mask.read()[:, :15], True)
+        np.testing.assert_array_equal(view.mask.read()[:, 17:], False)
+
+
+def test_masks_at_the_size_of_smaller_images(tmp_path):
+    write_scene(tmp_path)
+    for name in NAMES:
+        for folder in ("images_2", "masks_2"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+        Image.open(tmp_path / "images" / name).resize((WIDTH // 2, HEIGHT // 2)).save(tmp_path / "images_2" / name)
+        write_mask(tmp_path / "masks_2" / name, left_half(WIDTH // 2, HEIGHT // 2))
+    for view in views_of(load_scene(tmp_path, downscale=2)):
+        np.testing.assert_array_equal(view.mask.read(), left_half(WIDTH // 2, HEIGHT // 2))
+
+
+def test_a_mask_is_undistorted_with_its_photograph(tmp_path):
+    """A mask that keeps the dot alone keeps it where the undistorted photograph shows it."""
+    write_scene(tmp_path, models=("OPENCV_FISHEYE",), num_views=4)
+    for name in NAMES[:4]:
+        photograph = np.asarray(Image.open(tmp_path / "images" / name))
+        write_mask(tmp_path / "masks" / name, photograph[..., 0] > 20)
+    for view in views_of(load_scene(tmp_path)):
+        assert 0 < view.mask.num < 120
+        np.testing.assert_allclose(dot_place(np.repeat(view.mask.read()[..., None], 3, 2)), dot_place(view.image), atol=0.7)
+
+
+def test_masks_that_keep_everything_are_none(tmp_path):
+    write_scene(tmp_path)
+    for name in NAMES:
+        write_mask(tmp_path / "masks" / name, np.ones((HEIGHT, WIDTH), bool))
+    assert all(view.mask is None for view in views_of(load_scene(tmp_path)))
+
+
+def test_what_is_wrong_with_masks_is_told(tmp_path):
+    write_scene(tmp_path)
+    write_mask(tmp_path / "masks" / "other.png", left_half())
+    with pytest.warns(UserWarning, match="masks: holds no mask of a photograph of the scene"):
+        load_scene(tmp_path)
+    write_mask(tmp_path / "masks" / NAMES[3], left_half())
+    with pytest.warns(UserWarning, match="8 of 9 photographs have no mask, such as img_00.png"):
+        load_scene(tmp_path)
+    write_mask(tmp_path / "masks" / NAMES[3], left_half(WIDTH, HEIGHT + 1))
+    with pytest.raises(ValueError, match=r"img_03.png: is 128x97, but its photograph is 128x96"):
+        load_scene(tmp_path)
+    for name in NAMES:
+        write_mask(tmp_path / "masks" / name, np.zeros((HEIGHT, WIDTH), bool))
+    with pytest.raises(ValueError, match=r"the mask of img_00.png excludes every pixel"):
+        load_scene(tmp_path)
+
+
+def test_mask_path_of_nerfstudio(tmp_path):
+    frames = write_frames(tmp_path)
+    for index, frame in enumerate(frames):
+        frame["mask_path"] = f"held/{index}.png"
+        write_mask(tmp_path / "held" / f"{index}.png", left_half(SIZE["w"], SIZE["h"]))
+    write_json(tmp_path, frames, **FOCAL, **SIZE)
+    with pytest.warns(UserWarning, match="random points"):
+        views = views_of(load_scene(tmp_path))
+    for view in views:
+        np.testing.assert_array_equal(view.mask.read(), left_half(SIZE["w"], SIZE["h"]))
+    (tmp_path / "held" / "3.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"3.png: no such mask, but the scene names it"):
+        load_scene(tmp_path)
+
+
+def test_alpha_is_transparency_or_a_mask(tmp_path):
+    frames = write_frames(tmp_path, alpha=True)
+    for frame in frames:
+        pixels = np.array(Image.open(tmp_path / frame["file_path"]))
+        pixels[..., 3] = np.minimum(2 * pixels[..., 3].astype(int), 255)
+        Image.fromarray(pixels).save(tmp_path / frame["file_path"])
+    write_json(tmp_path, frames, **FOCAL, **SIZE)
+    with pytest.warns(UserWarning, match="random points"):
+        transparent, masked = load_scene(tmp_path), load_scene(tmp_path, alpha="mask")
+    for before, after in zip(views_of(transparent), views_of(masked), strict=True):
+        assert before.mask is None and not after.has_alpha
+        np.testing.assert_array_equal(after.mask.read(), before.alpha == 255)
+        assert 0 < after.mask.num < 200
+        np.testing.assert_array_equal(after.image, before.image)
+    with pytest.raises(ValueError, match="alpha must be one of transparency, mask; got 'cut'"):
+        load_scene(tmp_path, alpha="cut")
+
+
+@pytest.fixture(scope="module")
+def masked():
+    """A scene with a mask of its own for each training view but one, and the same with noise where they exclude."""
+    scene = synthetic_scene(num_views=6, width=40, height=30, num_points=150)
+    rng = np.random.default_rng(0)
+
+    def with_mask(view):
+        mask = np.ones(view.picture.size, bool)
+        left, top = rng.integers(0, 20), rng.integers(0, 15)
+        mask[top : top + 12, left : left + 14] = False
+        return dataclasses.replace(view, mask=mask)
+
+    def with_noise(view):
+        noise = rng.integers(0, 256, view.image.shape, np.uint8)
+        return dataclasses.replace(view, picture=np.where(view.mask.read()[..., None], view.image, noise))
+
+    train = tuple(map(with_mask, scene.train[:-1]))
+    clean = dataclasses.replace(scene, train=(*train, scene.train[-1]))
+    return clean, dataclasses.replace(scene, train=(*map(with_noise, train), scene.train[-1]))
+
+
+def test_masked_pixels_do_not_reach_training(masked):
+    system = Gaussians2dMcmc(stage1_iterations=24, initial_gaussians=60, batch_size=2)
+    clean, noisy = (fit(scene, system, progress=False) for scene in masked)
+    jax.tree.map(np.testing.assert_array_equal, clean.model.gaussians, noisy.model.gaussians)
+    np.testing.assert_array_equal(clean.history.psnr, noisy.history.psnr)
+    unmasked = tuple(dataclasses.replace(view, mask=None) for view in masked[1].train)
+    other = fit(dataclasses.replace(masked[1], train=unmasked), system, progress=False)
+    assert np.abs(other.model.gaussians.sh - clean.model.gaussians.sh).max() > 1e-3
+
+    polished = [polish(clean.model, scene.train, num_steps=2).gaussians.sh for scene in masked]
+    np.testing.assert_array_equal(*polished)
+    assert np.abs(polished[0] - clean.model.gaussians.sh).max() > 1e-3
+    first, second = (evaluate(scene.train, clean.model).per_view for scene in masked)
+    assert first == second
+
+
+def test_a_view_counts_by_its_pixels(masked):
+    """The PSNR of a step is that of the pixels that count."""
+    scene = dataclasses.replace(masked[0], train=masked[0].train[:1])
+    system = Gaussians2dMcmc(stage1_iterations=1, initial_gaussians=60)
+    start = initial_model(scene, system)
+    logged = fit(scene, system, progress=False).history.psnr[0]
+    image = np.asarray(start.render(scene.train[0].camera).color)
+    view = scene.train[0]
+    error = (np.clip(image, 0, 1) - view.image / 255.0)[view.mask.read()]
+    np.testing.assert_allclose(logged, -10 * np.log10(np.mean(error**2)), atol=1e-4)
+
+
+def test_masks_of_another_size_are_refused(masked):
+    view = masked[0].train[0]
+    wrong = dataclasses.replace(masked[0], train=(dataclasses.replace(view, mask=view.mask.read()[1:]),))
+    with pytest.raises(ValueError, match=r"mask of view \S+ must be \[30, 40\], .* got \[29, 40\]"):
+        fit(wrong, Gaussians2dMcmc(stage1_iterations=1), progress=False)
+
+
+def oracle_ssim(image, target, mask):
+    """The mean over the windows that touch a pixel that counts, from scikit-image's map."""
+    black = np.where(mask[..., None], image, 0), np.where(mask[..., None], target, 0)
+    _, similarity = structural_similarity(
+        *black, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1, full=True
+    )
+    windows = np.lib.stride_tricks.sliding_window_view(mask, (11, 11)).any(axis=(2, 3))
+    return similarity[5:-5, 5:-5][windows].mean()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_metrics_of_the_pixels_that_count(x64, seed):
+    rng = np.random.default_rng(seed)
+    image, target = rng.uniform(0, 1, (2, 40, 36, 3))
+    mask = rng.uniform(0, 1, (40, 36)) < 0.9
+    mask[8:, 4:30] = False
+    error = (image - target)[mask]
+    np.testing.assert_allclose(psnr(image, target, mask), -10 * np.log10(np.mean(error**2)), rtol=1e-12)
+    np.testing.assert_allclose(ssim(image, target, mask), oracle_ssim(image, target, mask), rtol=1e-9)
+    everywhere = np.ones_like(mask)
+    for metric in (psnr, ssim):
+        np.testing.assert_allclose(metric(image, target, everywhere), metric(image, target), rtol=1e-12)
+
+
+def test_lpips_does_not_see_masked_pixels(shared):
+    weights = load_lpips(shared / "lpips" / "lpips_squeeze.npz")
+    rng = np.random.default_rng(0)
+    image, target = jnp.asarray(rng.uniform(0, 1, (2, 48, 48, 3)), jnp.float32)
+    mask = np.zeros((48, 48), bool)
+    mask[10:30, 10:30] = True
+    other = jnp.where(mask[..., None], image, target)
+    assert lpips(image, target, weights, mask) == lpips(other, target, weights, mask)
+    assert 0 < lpips(image, target, weights, mask) < lpips(image, target, weights)
