@@ -18,6 +18,7 @@ from a2tg_jax.compaction import loss_on_views as loss_on_views
 from a2tg_jax.compaction import measure_choices as measure_choices
 from a2tg_jax.compaction import smallest_within as smallest_within
 from a2tg_jax.cores import set_num_threads as set_num_threads
+from a2tg_jax.data import Mask as Mask
 from a2tg_jax.data import Picture as Picture
 from a2tg_jax.data import Scene as Scene
 from a2tg_jax.data import View as View

@@ -63,7 +63,9 @@ def test_a_mask_is_undistorted_with_its_photograph(tmp_path):
         write_mask(tmp_path / "masks" / name, photograph[..., 0] > 20)
     for view in views_of(load_scene(tmp_path)):
         assert 0 < view.mask.num < 120
-        np.testing.assert_allclose(dot_place(np.repeat(view.mask.read()[..., None], 3, 2)), dot_place(view.image), atol=0.7)
+        np.testing.assert_allclose(
+            dot_place(np.repeat(view.mask.read()[..., None], 3, 2)), dot_place(view.image), atol=0.7
+        )
 
 
 def test_masks_that_keep_everything_are_none(tmp_path):

@@ -1,6 +1,7 @@
 """Everything that turns input into a Scene: COLMAP, transforms.json, plain photographs, the built-in scene."""
 
 from a2tg_jax.data.load import load_scene as load_scene
+from a2tg_jax.data.masks import Mask as Mask
 from a2tg_jax.data.pictures import Picture as Picture
 from a2tg_jax.data.scene import Scene as Scene
 from a2tg_jax.data.scene import View as View

@@ -49,9 +49,7 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
     return found
 
 
-def load_mask(
-    found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray
-) -> Mask | None:
+def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray) -> Mask | None:
     """The mask of a view, undistorted and downscaled as its photograph was; None for None.
 
     A pixel counts where all that it is made of does.
