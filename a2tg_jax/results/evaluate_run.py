@@ -7,6 +7,7 @@ from pathlib import Path
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.evaluation import evaluate
+from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
@@ -16,6 +17,7 @@ from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.history import read_history
+from a2tg_jax.results.model_pictures import depth_picture, flight, learned_textures, normal_picture
 from a2tg_jax.results.pictures import (
     ERROR_GAIN,
     colored_by_resolution,
@@ -67,6 +69,8 @@ def evaluate_run(
     if main.textures is not None and not isinstance(main.appearance, Billboards):
         _write_texture_figures(run, main, plan[result.main].system, scene)
     save_ply(run.own(run.point_cloud), main)
+    _write_surface(run, main, plan[result.main].system, scene)
+    _write_flight(run, main, plan[result.main].system)
     _write_pictures(run, result, models, scene)
     return result
 
@@ -104,15 +108,34 @@ def _write_curves(run: RunFolder, plan: RunPlan, names: list[str]) -> None:
 
 
 def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
-    """figures/sizes.png and figures/resolutions.png, of the first view."""
+    """figures/sizes.png, textures.png, and resolutions.png, of the first view."""
     assert model.textures is not None
     _, layout = model.textures
+    learned = learned_textures(model)
+    if learned is not None:
+        save_picture(run.own(run.figures / "textures.png"), learned)
     save_figure(run.own(run.figures / "sizes.png"), sizes_figure(layout.sizes))
     colored = colored_by_resolution(model)
     camera = (*scene.test, *scene.train)[0].camera
     picture = to_uint8(Renderer(colored, settings=settings_of(system), has_geometry=False)(camera).color)
     num_levels = int(texel_levels(layout).max()) + 1
-    save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels))
+    save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels), is_transparent=True)
+
+
+def _write_surface(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
+    """figures/depth.png and normals.png, of the first view."""
+    camera = (*scene.test, *scene.train)[0].camera
+    output = Renderer(model, settings=settings_of(system))(camera)
+    save_picture(run.own(run.figures / "depth.png"), depth_picture(output))
+    save_picture(run.own(run.figures / "normals.png"), normal_picture(output, camera))
+
+
+def _write_flight(run: RunFolder, model: Model, system: System) -> None:
+    """figures/flight.webp, where there are cameras to fly past."""
+    moving = flight(model, settings_of(system))
+    if moving is not None:
+        with replacing(run.own(run.figures / "flight.webp")) as temporary:
+            temporary.write_bytes(moving)
 
 
 def _write_pictures(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> None:

@@ -17,6 +17,8 @@ from a2tg_jax.training import History
 
 COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66ccee")
 """Of the stages, in turn."""
+GREY = "#7a8088"
+"""Can be read on white and on black."""
 RUNNING_MEANS = 10
 """A running mean covers this share of a stage: a tenth."""
 CURVES = (
@@ -27,11 +29,11 @@ CURVES = (
 )
 
 
-def save_figure(path: Path, figure: Figure) -> None:
-    """Writes a PNG, whole or not at all."""
+def save_figure(path: Path, figure: Figure, *, is_transparent: bool = False) -> None:
+    """Writes a PNG, whole or not at all; on white, unless it is transparent."""
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+        figure.savefig(temporary, format="png", dpi=110, transparent=is_transparent)
 
 
 def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:
@@ -95,7 +97,7 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
 
 
 def resolutions_figure(picture: np.ndarray, num_levels: int) -> Figure:
-    """A view whose Gaussians are coloured by their number of texels, with a legend.
+    """A view whose Gaussians are coloured by their number of texels, with a legend; for any ground.
 
     Args:
       picture: uint8 [H, W, 3] render of the coloured model.
@@ -109,7 +111,9 @@ def resolutions_figure(picture: np.ndarray, num_levels: int) -> Figure:
     names = ["1 or none", *(str(2**level) for level in range(1, num_levels))]
     colors = zip(resolution_colors(num_levels), names, strict=True)
     handles = [Patch(color=color, label=name) for color, name in colors]
-    figure.legend(
-        handles=handles, title="texels per Gaussian", loc="outside lower center", ncols=num_levels, fontsize=9
-    )
+    legend = figure.legend(
+        handles=handles, title="texels per Gaussian", loc="outside lower center", ncols=num_levels, fontsize=9,
+        labelcolor=GREY, frameon=False,
+    )  # fmt: skip
+    legend.get_title().set_color(GREY)
     return figure

@@ -8,7 +8,7 @@
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
-      figures/*.png              curves, texture resolutions
+      figures/                   curves, texture resolutions, some textures, depth, normals, a flight
       point_cloud.ply            the Gaussians in the original world
       report.html                all of it on one page
 

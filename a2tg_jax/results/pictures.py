@@ -56,13 +56,23 @@ class Crop:
 
 
 def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> Crop:
-    """The square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`."""
+    """The square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`.
+
+    Squares whose error is above the picture's mean afterwards are left out, unless all are: there, both fail.
+    """
     height, width = target.shape[:2]
     side = max(8, min(height, width) // 4)
-    gain = np.sum(_squared_error(before, target) - _squared_error(after, target), axis=-1)
-    summed = uniform_filter(gain, size=side, mode="constant", origin=-(side // 2))
-    inside = summed[: max(1, height - side + 1), : max(1, width - side + 1)]
-    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+
+    def in_squares(error: np.ndarray) -> np.ndarray:
+        means = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
+        return means[: max(1, height - side + 1), : max(1, width - side + 1)]
+
+    errors = [np.sum(_squared_error(image, target), axis=-1) for image in (before, after)]
+    left_over = in_squares(errors[1])
+    gain = in_squares(errors[0] - errors[1])
+    is_good = left_over <= errors[1].mean()
+    best = np.where(is_good, gain, -np.inf) if is_good.any() else gain
+    top, left = np.unravel_index(int(best.argmax()), best.shape)
     return Crop(int(top), int(left), side)
 
 
@@ -117,9 +127,9 @@ def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def png_uri(path: Path) -> str:
-    """A PNG file as a data: URI."""
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+def file_uri(path: Path) -> str:
+    """An image file, by its suffix, as a data: URI."""
+    return f"data:image/{path.suffix[1:]};base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def resolution_colors(num_levels: int) -> np.ndarray:

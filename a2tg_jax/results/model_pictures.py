@@ -1,0 +1,125 @@
+"""Pictures of one model alone: its textures, what it knows of the surface, a flight past its cameras."""
+
+import io
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from matplotlib import colormaps
+from PIL import Image
+
+from a2tg_jax.appearance import Banded, Billboards, Textured
+from a2tg_jax.appearance.textured import shown_textures
+from a2tg_jax.cameras import Camera, resize_camera
+from a2tg_jax.gaussians import SH_C0
+from a2tg_jax.model import Model
+from a2tg_jax.paths import smooth_path
+from a2tg_jax.render import RenderOutput, RenderSettings
+from a2tg_jax.renderer import Renderer
+from a2tg_jax.results.pictures import to_uint8
+from a2tg_jax.texture import texture_arrays
+
+NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8
+CHECKER = (0.75, 0.55)
+"""Greys behind what is transparent."""
+LEAST_ALPHA = 0.5
+"""Where less is seen, there is no depth and no normal."""
+DEPTH_RANGE = 2, 98
+"""Percentiles of the depths that colours reach from and to."""
+FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
+
+
+def learned_textures(model: Model) -> np.ndarray | None:
+    """A sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians' colours.
+
+    They are those that add most to the picture: by the spread of their texels times the area of the Gaussian.
+
+    Returns:
+      uint8 [H, W, 4], transparent between the textures; None where no Gaussian has more than one texel.
+    """
+    inner = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
+    if model.textures is None or not isinstance(inner, Textured) or isinstance(inner, Billboards):
+        return None
+    textures, layout = model.textures
+    texels = [np.asarray(own) for own in texture_arrays(shown_textures(textures, layout, inner.options), layout)]
+    texels = texels[: model.num]
+    areas = np.exp(np.asarray(model.gaussians.log_scales)[: model.num].sum(axis=1))
+    spread = np.asarray([own.reshape(-1, 4).var(axis=0).sum() if own.size > 4 else 0.0 for own in texels])
+    order = [index for index in np.argsort(-areas * spread)[:NUM_TEXTURES] if spread[index] > 0]
+    if not order:
+        return None
+    colors = 0.5 + SH_C0 * np.asarray(model.gaussians.sh)[:, 0]
+    return _sheet([_on_checker(texels[index], colors[index]) for index in order])
+
+
+def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
+    """uint8 [h, w, 3] of a texture in its own proportions, on a chequered ground.
+
+    Args:
+      texels: [Tv, Tu, 4] RGB residual and alpha factor.
+      color: [3] of the Gaussian.
+    """
+    scale = TEXTURE_SIDE // max(texels.shape[:2])
+    large = np.kron(texels, np.ones((scale, scale, 1)))
+    y, x = np.indices(large.shape[:2]) // (TEXTURE_SIDE // 8)
+    ground = np.where((x + y) % 2, *CHECKER)[..., None]
+    alpha = np.clip(large[..., 3:], 0, 1)
+    return to_uint8(alpha * np.clip(color + large[..., :3], 0, 1) + (1 - alpha) * ground)
+
+
+def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
+    """Pictures in rows, each at the top left of its place."""
+    step = TEXTURE_SIDE + TEXTURE_MARGIN
+    rows, columns = -(-len(pictures) // TEXTURES_PER_ROW), min(len(pictures), TEXTURES_PER_ROW)
+    sheet = np.zeros((rows * step - TEXTURE_MARGIN, columns * step - TEXTURE_MARGIN, 4), np.uint8)
+    for index, picture in enumerate(pictures):
+        top, left = (step * place for place in divmod(index, TEXTURES_PER_ROW))
+        height, width = picture.shape[:2]
+        sheet[top : top + height, left : left + width, :3] = picture
+        sheet[top : top + height, left : left + width, 3] = 255
+    return sheet
+
+
+def depth_picture(output: RenderOutput) -> np.ndarray:
+    """uint8 [H, W, 3] of the depth, near bright; black where little or nothing is seen."""
+    alpha = np.asarray(output.alpha)
+    is_seen = alpha > LEAST_ALPHA
+    depth = np.asarray(output.depth) / np.where(is_seen, alpha, 1.0)
+    near, far = np.percentile(depth[is_seen], DEPTH_RANGE) if is_seen.any() else (0.0, 1.0)
+    nearness = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
+    return to_uint8(np.where(is_seen[..., None], colormaps["viridis"](nearness)[..., :3], 0.0))
+
+
+def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
+    """uint8 [H, W, 3] of the normals seen from the camera: red to the right, green up, blue towards it; black as
+    `depth_picture`."""
+    normal = np.asarray(output.normal) @ np.asarray(camera.viewmat)[:3, :3].T * (1, -1, -1)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    is_seen = (np.asarray(output.alpha) > LEAST_ALPHA)[..., None] & (length > 0)
+    return to_uint8(np.where(is_seen, 0.5 + 0.5 * normal / np.where(is_seen, length, 1.0), 0.0))
+
+
+def flight(model: Model, settings: RenderSettings) -> bytes | None:
+    """An animation (WebP) of a smooth flight past the model's cameras, small and short; None with fewer than two."""
+    cameras = [] if model.origin is None else list(model.origin.cameras)
+    if len(cameras) < 2:
+        return None
+    path = [_small(camera) for camera in smooth_path(cameras, FLIGHT_FRAMES)]
+    renderer = Renderer(model, cameras=path[::10], settings=settings, has_geometry=False)
+    return animation(renderer(camera).color for camera in path)
+
+
+def _small(camera: Camera) -> Camera:
+    """The camera with pictures of `FLIGHT_SIDE` at most."""
+    scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
+    return resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height)))
+
+
+def animation(images: Iterable[Array]) -> bytes:
+    """Images [H, W, 3] in [0, 1] as an animated WebP that begins anew at its end."""
+    first, *others = (Image.fromarray(to_uint8(jnp.asarray(image))) for image in images)
+    buffer = io.BytesIO()
+    duration = round(1000 / FLIGHT_PER_SECOND)
+    first.save(buffer, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=75, method=2)
+    return buffer.getvalue()
