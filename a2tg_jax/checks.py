@@ -47,6 +47,12 @@ def described(value: Any) -> str:
     return repr(value)
 
 
+def shortened(value: Any, most: int = 80) -> str:
+    """A value as an error tells it, on one line of bounded length; texts without quotes."""
+    text = " ".join((value if isinstance(value, str) else repr(value)).split())
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
 def short_repr(value: Any) -> str:
     """The `repr` of a dataclass that holds arrays."""
     fields = (f"{field.name}={described(getattr(value, field.name))}" for field in dataclasses.fields(value))

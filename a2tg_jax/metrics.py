@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import os
 import pathlib
-import zipfile
 from collections.abc import Mapping
 
 import jax
@@ -18,8 +17,9 @@ from jax import Array
 
 from a2tg_jax import losses
 from a2tg_jax.budget import BYTES_PER_FLOAT
-from a2tg_jax.checks import check_shape
+from a2tg_jax.checks import check_shape, shortened
 from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.npz import read_npz
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.texture import BYTES_PER_TEXEL, AtlasLayout
 
@@ -142,10 +142,9 @@ def _load_lpips(path: pathlib.Path) -> LpipsWeights:
     if not path.is_file():
         raise FileNotFoundError(f"there are no LPIPS weights at {path}: give the path of an .npz file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not an .npz archive of LPIPS weights") from error
+        arrays = read_npz(path)
+    except ValueError as error:
+        raise ValueError(f"{path} is not an .npz archive of LPIPS weights ({error})") from error
     network = "squeeze" if "features.3.squeeze.weight" in arrays else "alex"
     weights = LpipsWeights(network, arrays)
     _check_weights(path, weights)
@@ -158,12 +157,15 @@ def _check_weights(path: pathlib.Path, weights: LpipsWeights) -> None:
     try:
         features = jax.eval_shape(functools.partial(_FEATURES[weights.network], weights.arrays), image)
         linear = [weights.arrays[f"lin{i}.weight"] for i in range(LPIPS_LINEAR_LAYERS[weights.network])]
-    except (KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # What JAX makes of shapes that do not fit is of many types.
         raise ValueError(
-            f"{path} does not hold LPIPS weights of AlexNet or SqueezeNet (taken for {weights.network}): {error}"
+            f"{path} does not hold LPIPS weights of AlexNet or SqueezeNet (taken for {weights.network}): "
+            f"{shortened(str(error), 200)}"
         ) from error
     if [x.shape for x in linear] != [(1, feature.shape[-1], 1, 1) for feature in features]:
         raise ValueError(f"{path}: the linear layers do not fit the channels of {weights.network}")
+    if not all(np.isfinite(array).all() for array in weights.arrays.values()):
+        raise ValueError(f"{path}: weights must be finite; some are NaN or infinite")
 
 
 def _layer_distance(features: Array, linear: np.ndarray) -> Array:

@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
     {"control_groups"},
-    {"classes", "cores", "memory"},
+    {"classes", "cores", "memory", "npz", "json_text"},
     {"numerics", "startup", "bilinear", "checks"},
     {"sh", "cameras"},
     {"gaussians"},

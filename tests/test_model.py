@@ -207,7 +207,7 @@ def head(**values) -> str:
         (changed("means", lambda x: x[0, 0]), r"gaussians\.means must be \[N, 3\]"),
         (changed("sh", lambda x: x[:, :2]), r"gaussians\.sh must be \[7, 16, 3\]; got \[7, 2, 3\]"),
         (changed("quats", lambda x: x.astype(np.int32)), r"gaussians\.quats must be floats"),
-        (changed("quats", lambda x: x.astype(str)), "must be floats"),
+        (changed("quats", lambda x: x.astype(str)), "quats must be of plain numbers"),
         (edit(lambda header, arrays: arrays.pop("quats")), "lacks 'quats'"),
         (edit(lambda header, arrays: arrays.pop("appearance/texels")), "texels of textures is missing"),
         (changed("appearance/texels", lambda x: x[1:]), "disagree"),

@@ -8,14 +8,12 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.cameras import Camera
+from a2tg_jax.cameras import MAX_SKEW, Camera, check_calibration
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.pictures import Picture
 from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
-MAX_SKEW = 1e-2
-"""Largest deviation of a pose's rotation from an orthonormal matrix that still passes as rounding."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -205,6 +203,7 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
 def _view(shot: Shot, viewmat: np.ndarray) -> View:
     """The shot with its camera in the normalised world."""
     height, width = shot.pixels.shape[:2]
+    check_calibration(viewmat, shot.K, width, height, shot.name)
     camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height)
     mask = None if shot.mask is None or shot.mask.is_full else shot.mask
     return View(shot.name, camera, Picture.of(shot.pixels), mask)

@@ -8,6 +8,8 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.cameras import MAX_SKEW
+
 MIN_AXIS_SPREAD = 1e-3
 """Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""
 MIN_UP_LENGTH = 1e-3
@@ -49,6 +51,16 @@ class Similarity:
     def inverse(self) -> "Similarity":
         """The way back: brings results (points, lengths, directions, cameras) to the original world."""
         return Similarity(1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
+
+
+def check_similarity(similarity: Similarity, what: str) -> None:
+    """Raises ValueError, calling it `what`, unless its scale is positive, its rotation is one, and all is finite."""
+    scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
+    if not (0 < scale < np.inf and np.isfinite(translation).all()):
+        raise ValueError(f"{what} must have a positive scale and a finite translation; got {scale:g}, {translation}")
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW) and np.linalg.det(rotation) > 0
+    if not is_rotation:  # Also of NaN.
+        raise ValueError(f"{what} must have a rotation; got {np.asarray(rotation).tolist()}")
 
 
 def camera_centers(viewmats: np.ndarray) -> np.ndarray:

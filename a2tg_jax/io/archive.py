@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.checks import shortened
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.json_text import parse_json
+from a2tg_jax.npz import read_npz
 
 FORMAT = "a2tg-jax checkpoint"
 VERSION = 1
@@ -49,18 +52,21 @@ def read_archive(path: str | os.PathLike, *, format: str = FORMAT) -> tuple[dict
 def read_archive_header(path: str | os.PathLike, *, format: str = FORMAT) -> dict[str, Any]:
     """The header alone, without reading the arrays. Raises as `read_archive` does."""
     path = Path(path)
+    entries = _read_entries(path, format, lambda name: name == HEADER)
+    if HEADER not in entries:
+        raise _damaged(path, format, "it has no header")
     try:
-        entry = _read_entries(path, format, lambda name: name == HEADER)
-        header = json.loads(entry[HEADER].tobytes().decode(), parse_constant=_refuse)
-    except (KeyError, ValueError, RecursionError) as error:
-        raise _damaged(path, format) from error
+        header = parse_json(entries[HEADER].tobytes())
+    except ValueError as error:
+        raise _damaged(path, format, f"its header: {error}") from error
     if not isinstance(header, dict):
-        raise _damaged(path, format)
-    if header.get("format") != format:
-        raise ValueError(f"{path}: is an {header.get('format')}, not an {format}")
-    if header.get("version") != VERSION:
+        raise _damaged(path, format, "its header is no JSON object")
+    found, version = header.get("format"), header.get("version")
+    if found != format:
+        raise ValueError(f"{path}: is an {shortened(found)}, not an {format}")
+    if version != VERSION:
         raise ValueError(
-            f"{path}: is an {format} of version {header.get('version')}; this program reads version {VERSION}, "
+            f"{path}: is an {format} of version {shortened(version)}; this program reads version {VERSION}, "
             "so use the version of a2tg-jax that wrote it"
         )
     return header
@@ -71,16 +77,10 @@ def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such {format}")
     try:
-        with open(path, "rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            return {name: archive[name] for name in archive.files if is_wanted(name)}
-    except Exception as error:  # what a damaged zip raises goes from zlib.error to NotImplementedError and SyntaxError
-        raise _damaged(path, format) from error
+        return read_npz(path, is_wanted)
+    except ValueError as error:
+        raise _damaged(path, format, str(error)) from error
 
 
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not JSON")
-
-
-def _damaged(path: Path, format: str) -> ValueError:
-    return ValueError(f"{path}: is not an {format}, or is damaged")
+def _damaged(path: Path, format: str, reason: str) -> ValueError:
+    return ValueError(f"{path}: is not an {format}, or is damaged ({reason})")

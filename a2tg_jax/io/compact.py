@@ -24,6 +24,7 @@ from a2tg_jax.io.model import appearance_from_dict, appearance_to_dict, origin_a
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
 from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
+from a2tg_jax.json_text import parse_json
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Origin
 from a2tg_jax.sh_bands import MAX_DEGREE
@@ -215,7 +216,7 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
         raise ValueError("is damaged or cut off")
     if num_coded > len(rest) or num_text > _room(data):
         raise ValueError(f"announces a header of {num_coded} bytes, {num_text} unpacked")
-    header = json.loads(decode("zstd", rest[:num_coded], 1, num_text).tobytes())
+    header = parse_json(decode("zstd", rest[:num_coded], 1, num_text).tobytes())
     if not isinstance(header, dict):
         raise ValueError("has no header")
     return header, rest[num_coded:]

@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import appearance as built_in
-from a2tg_jax.appearance import Appearance, Banded, Plain, Textured
-from a2tg_jax.checks import check_shape
+from a2tg_jax.appearance import Appearance, Plain, Textured
+from a2tg_jax.checks import check_shape, shortened
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.structure import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Origin
 
@@ -40,11 +41,12 @@ def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] 
       header: JSON-able values to keep along; `read_archive_header` returns them.
 
     Raises:
-      ValueError: if a field of the Gaussians has another shape than it must have, or the options of the appearance
-        cannot be written as JSON.
+      ValueError: if `load_model` would refuse it, as it does numbers that are not finite, or the options of the
+        appearance cannot be written as JSON.
     """
     check_gaussians(model.gaussians, "model.gaussians")
     model = model.live
+    check_model(model)
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
     shown = model.appearance.arrays(model.params, model.layout)
     arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}
@@ -90,30 +92,11 @@ def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appea
         shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
         appearance = Textured() if shown else Plain()
     params, layout = appearance.from_arrays(shown)
-    check_rows(appearance, params, layout, gaussians)
     of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
     origin = origin_of(header["origin"], of_origin) if "origin" in header else None
-    return Model(gaussians, params, layout, appearance=appearance, origin=origin)
-
-
-def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaussians) -> None:
-    """Raises ValueError unless floats are shown, by as many rows as there are Gaussians, with bands above their own."""
-    if isinstance(appearance, Banded):
-        own, base = gaussians.sh_degree, layout.bands.base_degree
-        if own != base:
-            raise ValueError(f"Banded is of bands above degree {base}, but the Gaussians have degree {own}")
-        if layout.bands.num != gaussians.num:
-            raise ValueError(f"Banded is of {layout.bands.num} degrees, but there are {gaussians.num} Gaussians")
-        check_rows(appearance.inner, params.inner, layout.inner, gaussians)
-        return
-    num = gaussians.num
-    for leaf in jax.tree.leaves(params):
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise ValueError(f"the parameters of {type(appearance).__name__} must be floats; got {leaf.dtype}")
-    has_rows = not jax.tree.leaves(layout)
-    found = {leaf.shape[0] for leaf in jax.tree.leaves(params)} if has_rows else {getattr(layout, "num", num)}
-    if found - {num}:
-        raise ValueError(f"{type(appearance).__name__} is of {min(found - {num})} rows, but there are {num} Gaussians")
+    model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
+    check_model(model)
+    return model
 
 
 # Appearances
@@ -187,14 +170,18 @@ def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
 
 
 def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
-    """The origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape is wrong."""
+    """The origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape or a number is wrong."""
     names, (red, green, blue) = data["names"], data["background"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"origin/names must be texts; got {shortened(names)}")
     num = len(names)
     shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
     shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
     for name, shape in shapes.items():
         check_shape(ORIGIN + name, arrays[name], shape)
     viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[name] for name in shapes)
+    if not np.issubdtype(sizes.dtype, np.integer) or is_test.dtype != bool:
+        raise ValueError(f"origin/sizes must be integers, origin/is_test bool; got {sizes.dtype}, {is_test.dtype}")
     return Origin(
         viewmats=viewmats,
         Ks=Ks,

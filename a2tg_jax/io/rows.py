@@ -12,6 +12,7 @@ import numpy as np
 from a2tg_jax.appearance import Appearance, Banded, Plain, Textured
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.io.quantise import nearest_half_turn
+from a2tg_jax.io.structure import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Origin
 from a2tg_jax.sh import NUM_BASES
@@ -139,4 +140,6 @@ def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origi
         for degree, band in enumerate(rows.bands[base_degree + 1 :], base_degree + 1):
             arrays[f"band_{degree}"] = np.asarray(band, np.float32)
     params, layout = appearance.from_arrays(arrays)
-    return Model(gaussians, params, layout, appearance=appearance, origin=origin)
+    model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
+    check_model(model)
+    return model

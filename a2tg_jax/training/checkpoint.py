@@ -2,19 +2,23 @@
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.checks import shortened
+from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.structure import check_count, check_rows
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
 from a2tg_jax.training.options import System
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.state_check import check_history, check_is_ahead, check_state, find_stage
 from a2tg_jax.training.step import TrainState, initial_state
 
 
@@ -109,19 +113,39 @@ def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None)
     """
     header, arrays = read_archive(path)
     try:
-        options = system_from_dict(header["system"], str(path), system)
-        stage = options.stages()[header["stage"]]
-        shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
-        params, layout = stage.appearance.from_arrays(shown)
-        (gaussians,) = _filled((Gaussians(*range(5)),), arrays)  # type: ignore[arg-type]
-        template = _template(stage, gaussians, params, layout, header["is_ahead"])
-        gaussians, ((moments, *rest), history) = _filled(template, arrays)
-    except (KeyError, IndexError) as error:
+        return _checkpoint_of(header, arrays, str(path), system)
+    except KeyError as error:
         raise ValueError(f"{path}: the checkpoint lacks {error}; it is damaged or of another version") from error
-    gaussians, moments, (num_live, *rest) = jax.tree.map(jnp.asarray, (gaussians, moments, rest))
+    except (TypeError, IndexError, AttributeError, OverflowError) as error:
+        reason = shortened(str(error))
+        raise ValueError(f"{path}: the checkpoint is damaged or of another version ({reason})") from error
+    except ValueError as error:
+        reason = str(error) if str(path) in str(error) else f"{path}: {error}"
+        raise ValueError(reason) from error
+
+
+def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], where: str, system) -> Checkpoint:
+    options = system_from_dict(header["system"], where, system)
+    options.check()
+    stage = find_stage(options, header["stage"])
+    is_ahead = check_is_ahead(header["is_ahead"], stage)
+    (gaussians,) = _filled((Gaussians(*range(5)),), arrays)  # type: ignore[arg-type]
+    check_gaussians(gaussians)
+    shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
+    params, layout = stage.appearance.from_arrays(shown)
+    gaussians = jax.tree.map(jnp.asarray, gaussians)
+    check_rows(stage.appearance, params, layout, gaussians)
+    wanted = _wanted(stage, gaussians, params, layout, is_ahead)
+    kept = _rest(wanted), {field.name: 0 for field in dataclasses.fields(History)}
+    _, (rest, columns) = _filled((gaussians, kept), arrays)
+    moments, num_live, events, iteration, status = jax.tree.map(jnp.asarray, rest)
     model = Model(gaussians, params, layout, num_live, appearance=stage.appearance)
-    state = TrainState(model, moments, *rest)
-    return Checkpoint(options, header["stage"], state, History(**history), header.get("num_restored", 0))
+    state, history = TrainState(model, moments, events, iteration, status), History(**columns)
+    check_state(state, wanted, stage)
+    check_history(history)
+    num_restored = header.get("num_restored", 0)
+    check_count("num_restored", num_restored, stage.iterations)
+    return Checkpoint(options, header["stage"], state, history, num_restored)
 
 
 SHOWN = "shown/"
@@ -155,11 +179,9 @@ def _filled(template, arrays: dict[str, np.ndarray]):
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def _template(stage: Stage, gaussians: Gaussians, params, layout, is_ahead: list[bool]):
-    """A tree of the structure that was saved; its values mean nothing."""
-    gaussians = jax.tree.map(jnp.asarray, gaussians)
+def _wanted(stage: Stage, gaussians: Gaussians, params, layout, is_ahead: Sequence[bool]) -> TrainState:
+    """Shapes and dtypes of a state of a stage, of which some events may be past."""
     model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
     state = jax.eval_shape(lambda: initial_state(stage, model))
-    events = tuple(event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
-    rest = _rest(dataclasses.replace(state, events=events))
-    return gaussians, (rest, {field.name: 0 for field in dataclasses.fields(History)})
+    events = (event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
+    return dataclasses.replace(state, events=tuple(events))

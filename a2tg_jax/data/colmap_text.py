@@ -1,0 +1,100 @@
+"""Whether COLMAP's text files are whole: every line has as many words as it must have.
+
+pycolmap takes the word before where one is missing, and counts on without end where a count is wrong.
+"""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+from a2tg_jax.checks import shortened
+from a2tg_jax.data.colmap_binary import num_params_by_model
+
+Words = list[bytes]
+
+
+def check_text(path: Path) -> None:
+    """Refuses a text file of a model, one that `LINES` knows, unless all its lines are such.
+
+    Raises:
+      ValueError: naming the file and the line.
+    """
+    with open(path, "rb") as file:
+        lines = enumerate(file, 1)
+        for number, line in lines:
+            words = line.split()
+            if not words or words[0].startswith(b"#"):
+                continue
+            points = next(lines, (0, None))[1] if path.stem == "images" else b""
+            try:
+                if points is None or len(points.split()) % 3:
+                    raise ValueError("the line of its points is missing or cut off")
+                LINES[path.stem](words)
+            except (ValueError, IndexError) as error:
+                told = shortened(str(error)) if isinstance(error, ValueError) else "it is cut off"
+                raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
+
+
+def _check_camera(words: Words) -> None:
+    model = words[1].decode("ascii", "replace")
+    wanted = num_params_by_model().get(model)
+    if wanted is None:
+        raise ValueError(f"COLMAP knows no camera model {shortened(model)}")
+    if len(words) != 4 + wanted:
+        raise ValueError(f"{model} has {wanted} parameters; got {len(words) - 4}")
+    _check_numbers((words[0], *words[2:4]), words[4:])
+
+
+def _check_image(words: Words) -> None:
+    if len(words) < 10:
+        raise ValueError(f"an image has an id, a pose, a camera and a name, 10 words; got {len(words)}")
+    _check_numbers((words[0], words[8]), words[1:8])
+
+
+def _check_point(words: Words) -> None:
+    if len(words) < 8 or len(words) % 2:
+        raise ValueError(f"a point has 8 words, and pairs of its track; got {len(words)}")
+    _check_numbers((words[0], *words[4:7], *words[8:]), words[1:4])
+
+
+def _check_rig(words: Words) -> None:
+    rest = iter(words[2:])
+    for index in range(_count(words[1], len(words))):
+        sensor = list(itertools.islice(rest, 3 if index else 2))
+        has_pose = index > 0 and int(sensor[2]) != 0
+        pose = list(itertools.islice(rest, 7 if has_pose else 0))
+        _check_numbers(sensor[1:], pose)
+        if len(pose) < 7 * has_pose or len(sensor) < 2:
+            raise ValueError("it is cut off")
+    if next(rest, None) is not None:
+        raise ValueError("it goes on where it should end")
+
+
+def _check_frame(words: Words) -> None:
+    count = _count(words[9], len(words))
+    if len(words) != 10 + 3 * count:
+        raise ValueError(f"{count} data have {3 * count} words; got {len(words) - 10}")
+    _check_numbers((words[0], words[1]), words[2:9])
+
+
+LINES: dict[str, Callable[[Words], None]] = {
+    "cameras": _check_camera,
+    "images": _check_image,
+    "points3D": _check_point,
+    "rigs": _check_rig,
+    "frames": _check_frame,
+}
+"""What a line of a file must be."""
+
+
+def _count(word: bytes, most: int) -> int:
+    if not 0 <= int(word) <= most:
+        raise ValueError(f"it counts {int(word)} of what it lists")
+    return int(word)
+
+
+def _check_numbers(integers: Words | tuple[bytes, ...], floats: Words) -> None:
+    for word in integers:
+        int(word)
+    for word in floats:
+        float(word)

@@ -1,0 +1,62 @@
+"""Whether what was read from a checkpoint is a state that training can go on from. On the host."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from a2tg_jax.checks import shortened
+from a2tg_jax.io.structure import check_count, check_finite, check_like, check_model
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.step import EXPLODED, TrainState
+
+
+def find_stage(system: System, index: Any) -> Stage:
+    """The stage of a header's number. ValueError: there is none."""
+    stages = system.stages()
+    if type(index) is not int or not 0 <= index < len(stages):
+        raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
+    return stages[index]
+
+
+def check_is_ahead(is_ahead: Any, stage: Stage) -> Sequence[bool]:
+    """A header's list of the events that are still ahead. ValueError: it is none of this stage."""
+    if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
+        raise ValueError(f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}")
+    return is_ahead
+
+
+def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
+    """Raises ValueError, naming the leaf, unless a state is one of a stage.
+
+    Args:
+      state: what was read; its model has been made of arrays that fit each other.
+      wanted: shapes and dtypes of a state of that model.
+      stage: of both.
+    """
+    check_like("state.model.num_live", state.model.num_live, wanted.model.num_live)
+    for name in ("moments", "events", "iteration", "status"):
+        check_like(f"state.{name}", getattr(state, name), getattr(wanted, name))
+    check_model(state.model)
+    check_count("state.iteration", state.iteration, stage.iterations)
+    check_count("state.status", state.status, EXPLODED)
+    check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
+    check_finite("state.moments.mu", state.moments.mu)
+    check_finite("state.moments.nu", state.moments.nu, is_signed=False)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state.events):
+        if np.isnan(np.asarray(leaf)).any():
+            raise ValueError(f"state.events{jax.tree_util.keystr(path)} must be numbers; some are NaN")
+
+
+def check_history(history: Any) -> None:
+    """Raises ValueError, naming the column, unless its columns are numbers of one length; dB may be infinite."""
+    columns = {field.name: np.asarray(getattr(history, field.name)) for field in dataclasses.fields(history)}
+    num = columns["iteration"].shape
+    for name, column in columns.items():
+        if column.ndim != 1 or column.shape != num or column.dtype.kind not in "iuf":
+            raise ValueError(f"history.{name} must be numbers {list(num)}; got {column.dtype} {list(column.shape)}")
+        if np.isnan(column).any() or (name != "psnr" and not (np.isfinite(column) & (column >= 0)).all()):
+            raise ValueError(f"history.{name} must be finite and at least 0; some are not")
