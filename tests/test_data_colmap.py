@@ -241,7 +241,7 @@ def break_model_file(folder):
         (break_unreadable_image, ValueError, "img_04.png: cannot be read as an image"),
         (break_cut_off_image, ValueError, "img_04.png: cannot be read as an image"),
         (break_aspect, ValueError, "img_04.png: is 128x100, but its camera is 128x96"),
-        (break_model_file, ValueError, "cannot be read as a COLMAP model"),
+        (break_model_file, ValueError, "images.bin: is cut off or damaged: number 1 of 5 images"),
     ],
 )
 def test_bad_input_is_named(tmp_path, spoil, error, message):

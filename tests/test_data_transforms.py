@@ -295,7 +295,7 @@ def spoil_names(folder):
         (spoil_frames, ValueError, "lists no frames"),
         (spoil_image, FileNotFoundError, "03.png: no such image"),
         (spoil_points, FileNotFoundError, "sparse_pc.ply: no such point file"),
-        (spoil_ply, ValueError, "sparse_pc.ply: is not a PLY file of points"),
+        (spoil_ply, ValueError, "sparse_pc.ply: is not a PLY file"),
         (spoil_focal, ValueError, "images/00.png: has no focal length"),
         (spoil_pose, ValueError, "images/02.png: its pose is not a rigid motion"),
         (spoil_nan, ValueError, "images/02.png: its pose is not finite"),

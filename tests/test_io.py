@@ -129,7 +129,7 @@ def test_ply_of_a_model_is_in_its_original_world(tmp_path):
     [
         (lambda path: path.write_bytes(b"ply\nelement vertex -3\n"), "announces -3 of vertex"),
         (lambda path: path.write_bytes(b"not a ply\n"), "is not a PLY file"),
-        (lambda path: path.write_bytes(b"ply\nformat ascii 1.0\n"), "save it as binary_little_endian"),
+        (lambda path: path.write_bytes(path.read_bytes().replace(b"binary_little_endian", b"ascii")), "save it as"),
         (lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\n"), "header does not end"),
         (lambda path: path.write_bytes(path.read_bytes()[:-1]), "is cut off"),
         (lambda path: write_ply(path, ("x", "y", "z"), np.ones((2, 3))), "no attribute f_dc_0"),

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.data.colmap_binary import RECORDS, check_binary
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.colmap_text import check_text
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
-from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.pictures import Shelf
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
@@ -49,7 +51,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
         raise FileNotFoundError(f"{path}: has no sparse model; sparse/0 with cameras, images and points3D is wanted")
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
-    lenses = {key: Lens(camera) for key, camera in reconstruction.cameras.items()}
+    lenses = {key: checked_lens(camera, f"{model}: camera {key}") for key, camera in reconstruction.cameras.items()}
     shelf = Shelf(room)
     registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
     _log_unregistered(images_folder, len(registered))
@@ -104,24 +106,28 @@ def _model_suffix(folder: Path) -> str | None:
 
 def _read_model(model: Path) -> Any:
     """The pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
+    suffix = _model_suffix(model) or ".bin"
+    for file in (model / f"{kind}{suffix}" for kind in RECORDS):
+        if file.is_file():
+            (check_binary if suffix == ".bin" else check_text)(file)
     try:
-        with _with_points_file(model) as folder:
+        with _with_points_file(model, suffix) as folder:
             return pycolmap().Reconstruction(str(folder))
-    except (ValueError, RuntimeError, IndexError) as error:
+    except Exception as error:  # whatever pycolmap makes of C++'s
         reason = " ".join(str(error).split())
         raise ValueError(f"{model}: cannot be read as a COLMAP model ({reason}); export it again") from None
 
 
 @contextmanager
-def _with_points_file(model: Path) -> Iterator[Path]:
+def _with_points_file(model: Path, suffix: str) -> Iterator[Path]:
     """The model's folder, or, where points3D is missing, a temporary one like it with an empty points3D."""
-    suffix = _model_suffix(model) or ".bin"
     if (model / f"points3D{suffix}").is_file():
         yield model
         return
     with tempfile.TemporaryDirectory() as folder:
-        for file in model.glob(f"*{suffix}"):
-            (Path(folder) / file.name).write_bytes(file.read_bytes())
+        for file in (model / f"{kind}{suffix}" for kind in RECORDS):
+            if file.is_file():
+                (Path(folder) / file.name).write_bytes(file.read_bytes())
         (Path(folder) / f"points3D{suffix}").write_bytes(EMPTY_POINTS[suffix])
         yield Path(folder)
 

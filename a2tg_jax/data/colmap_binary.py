@@ -4,7 +4,7 @@ pycolmap never looks for the end of a file. Cut off, one makes it hang and eat m
 so that each file is walked through here first. Nothing is copied. The formats, little-endian, after a uint64 count:
 
     cameras   uint32 id, int32 model, uint64 width and height, the model's parameters as float64
-    images    uint32 id, 7 float64 of the pose, uint32 camera, the name and a zero byte, uint64 count of (2 float64, uint64)
+    images    uint32 id, 7 float64 of the pose, uint32 camera, the name, a zero, uint64 count of (2 float64, uint64)
     points3D  uint64 id, 3 float64, 3 bytes of colour, a float64 error, uint64 count of 2 uint32
     rigs      uint32 id, uint32 count of sensors: the first 8 bytes, each other 8, a byte, and 56 where that is not 0
     frames    uint32 id, uint32 rig, 7 float64, uint32 count of (int32, uint32, uint64)

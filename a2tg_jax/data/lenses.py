@@ -7,11 +7,16 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from a2tg_jax.cameras import check_intrinsics
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsics
 
 PINHOLE_TOLERANCE = 1e-3
 """Pixels by which a camera may differ from a pinhole, anywhere in its image, and still be taken for one."""
+LARGEST_DISTORTION = 1e6
+"""Of one parameter; those of a telephoto lens, whose angles are small, are large."""
+GRID, MARGIN = 9, 0.1
+"""Points along an axis at which an undistorted image is looked at, and how far outside the photograph they may lie."""
 ROWS_AT_ONCE = 128
 """Rows of an image that are undistorted together; bounds the memory."""
 
@@ -42,7 +47,7 @@ class Lens:
         """K [3, 3] and (width, height) of the undistorted image: same focal lengths, the largest area without blanks.
 
         Raises:
-          ValueError: if the model has no pinhole equivalent (panoramas).
+          ValueError: if the model has no pinhole equivalent (panoramas), or its distortion folds the image.
         """
         try:
             if self.is_pinhole:
@@ -50,7 +55,19 @@ class Lens:
             pinhole = pycolmap().undistort_camera(pycolmap().UndistortCameraOptions(), self.camera)
         except (ValueError, RuntimeError):  # COLMAP's own check that the model is perspective
             raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera") from None
-        return pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
+        K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
+        if not self._is_seen_in_order(K, *size):
+            raise ValueError(f"{self.camera.model.name} has a distortion that folds or loses the image")
+        return K, size
+
+    def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
+        """Whether what a pinhole K sees lies in the photograph, nearly, and is not turned over anywhere."""
+        x, y = (np.linspace(0.5, side - 0.5, GRID) for side in (width, height))
+        rays = _homogeneous(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)) @ np.linalg.inv(K).T
+        places = np.asarray(self.camera.img_from_cam(rays)).reshape(GRID, GRID, 2) / self.size
+        is_inside = ((places >= -MARGIN) & (places <= 1 + MARGIN)).all()  # False for NaN.
+        is_ordered = (np.diff(places[..., 0], axis=1) > 0).all() and (np.diff(places[..., 1], axis=0) > 0).all()
+        return bool(is_inside and is_ordered)
 
     def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """The pinhole image of a photograph, at the photograph's resolution divided by `downscale`.
@@ -90,6 +107,24 @@ class Lens:
         rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ np.linalg.inv(K).T
         places = np.asarray(self.camera.img_from_cam(rays)) * np.divide(image_size, self.size) - 0.5
         return places[:, ::-1].T.reshape(2, len(rows), width)
+
+
+def checked_lens(camera: Any, what: str) -> Lens:
+    """The lens of a pycolmap.Camera whose numbers a camera can have.
+
+    Raises:
+      ValueError: calling it `what`, if a number is NaN, infinite, or beyond the bounds of `check_intrinsics` and
+        `LARGEST_DISTORTION`.
+    """
+    params = np.asarray(camera.params, np.float64)
+    if not np.isfinite(params).all():
+        raise ValueError(f"{what}: its camera's parameters must be finite; got {params.tolist()}")
+    distortion = params[list(camera.extra_params_idxs())]
+    if distortion.size and np.abs(distortion).max() > LARGEST_DISTORTION:
+        raise ValueError(f"{what}: its distortion must lie within ±{LARGEST_DISTORTION:g}; got {distortion.tolist()}")
+    if len(camera.focal_length_idxs()):  # Panoramas have none.
+        check_intrinsics(camera.calibration_matrix(), camera.width, camera.height, what)
+    return Lens(camera)
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.cameras import MAX_SKEW, Camera, check_calibration
+from a2tg_jax.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.pictures import Picture
 from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
+FARTHEST = 1e5
+"""Of a camera from the middle of the scene, in units of the normalised world."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -137,6 +139,8 @@ def assemble_scene(
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
     centers = camera_centers(np.stack(list(viewmats.values())))
+    _check_distances(centers, shots, source)
+    cloud = cloud and _usable(cloud, source)
     if cloud is None or len(cloud.points) < 2:
         message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS} random points instead"
         warnings.warn(message, stacklevel=3)
@@ -179,8 +183,9 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
       ValueError: naming `what`, if the matrix is not finite or its rotation is not one.
     """
     rotation = viewmat[:3, :3]
-    if not np.isfinite(viewmat).all():
-        raise ValueError(f"{what}: its pose is not finite; remove it from the scene or correct the pose")
+    if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
+        found = "is not finite" if not np.isfinite(viewmat).all() else f"lies beyond ±{LARGEST_COORDINATE:g}"
+        raise ValueError(f"{what}: its pose {found}; remove it from the scene or correct the pose")
     left, singular_values, right = np.linalg.svd(rotation)
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
         raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
@@ -198,6 +203,26 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     for shot, following in itertools.pairwise(shots):
         if shot.name == following.name:
             raise ValueError(f"{source}: lists {shot.name} twice; remove one of the two")
+
+
+def _check_distances(centers: np.ndarray, shots: Sequence[Shot], source: str) -> None:
+    """Refuses cameras beyond all the others; half of them are within 1 of the origin."""
+    farthest = int(np.argmax(np.abs(centers).max(axis=1)))
+    if not np.abs(centers[farthest]).max() <= FARTHEST:
+        raise ValueError(
+            f"{source}: {shots[farthest].name} stands more than {FARTHEST:g} times as far away as half of the cameras; "
+            "remove it from the scene or correct the pose"
+        )
+
+
+def _usable(cloud: PointCloud, source: str) -> PointCloud:
+    """The points that are somewhere; others are left out with a warning."""
+    is_usable = (np.abs(cloud.points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+    if is_usable.all():
+        return cloud
+    message = f"{source}: {np.count_nonzero(~is_usable)} points are not finite, or beyond ±{LARGEST_COORDINATE:g}"
+    warnings.warn(f"{message}; they are left out", stacklevel=4)
+    return PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
 
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:

@@ -5,21 +5,23 @@ what was done to COLMAP's world before the file was written; poses and `ply_file
 it, so both are in the file's own world, which is the original world here.
 """
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from a2tg_jax.cameras import LONGEST_SIDE
+from a2tg_jax.checks import shortened
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
-from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
 from a2tg_jax.data.pictures import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
+from a2tg_jax.json_text import parse_json
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
@@ -27,6 +29,8 @@ BLENDER_HALF_SIDE = 1.3
 """The objects of the NeRF-synthetic scenes fit into the cube of ± this."""
 OPENCV_KEYS = ("k1", "k2", "p1", "p2")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+FILE_KEYS = ("file_path", "mask_path", "ply_file_path")
+SPLIT_KEYS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 logger = logging.getLogger(__name__)
@@ -87,14 +91,32 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    """The JSON object in a file, which has a non-empty list `frames`."""
+    """The JSON object in a file, which has a non-empty list `frames` of objects, and texts where files are named."""
     try:
-        meta = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        meta = parse_json(file.read_bytes(), allow_nan=True)  # Numbers are looked at where they are used.
+    except (OSError, ValueError) as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is wanted")
+    for number, frame in enumerate(meta["frames"]):
+        if not isinstance(frame, dict):
+            raise ValueError(f"{file}: frame {number} must be an object; got {shortened(frame)}")
+        _check_texts(file, frame)
+    _check_texts(file, meta)
     return meta
+
+
+def _check_texts(file: Path, values: dict[str, Any]) -> None:
+    """Raises ValueError unless what names files within the scene is text, or a list of texts."""
+    for key in FILE_KEYS:
+        if key in values and not (isinstance(values[key], str) and values[key]):
+            raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(values[key])}")
+        if key in values:
+            check_inside(file.parent, values[key])
+    for key in SPLIT_KEYS:
+        names = values.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
 
 
 def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) -> list[Shot]:
@@ -112,7 +134,6 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Sh
     """One frame; `frame` holds the file's global values too, under the frame's own."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-    check_inside(file.parent, frame["file_path"])
     path = file.parent / frame["file_path"]
     name = Path(frame["file_path"]).as_posix()
     # Only a folder of images below the scene has siblings of the form images_k.
@@ -143,7 +164,7 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
     """World to camera (OpenCV) from camera to world (OpenGL)."""
     try:
         pose = np.asarray(transform_matrix, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got shape {pose.shape}")
@@ -154,12 +175,27 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
 
 def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str) -> Lens:
     """The camera of a frame; sizes default to the image's, the principal point to the centre."""
-    width, height = int(frame.get("w") or pixels.shape[1]), int(frame.get("h") or pixels.shape[0])
+    width, height = _side(frame, "w", pixels.shape[1], what), _side(frame, "h", pixels.shape[0], what)
     fx, fy = _focal_lengths(frame, width, height, what)
     model, distortion = _distortion(frame, what)
-    center = [float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
-    params = [fx, fy, *center, *distortion]
-    return Lens(pycolmap().Camera(model=model, width=width, height=height, params=params))
+    params = [fx, fy, _number(frame, "cx", width / 2, what), _number(frame, "cy", height / 2, what), *distortion]
+    return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what)
+
+
+def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float:
+    """A number of a frame. ValueError: there is something else."""
+    value = frame.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{what}: {key} must be a number; got {shortened(value)}")
+    return float(value)
+
+
+def _side(frame: dict[str, Any], key: str, default: int, what: str) -> int:
+    """A side of the image in pixels; 0 and null stand for the image's own."""
+    side = _number(frame, key, default, what) if frame.get(key) else default
+    if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
+        raise ValueError(f"{what}: {key} must lie in 1..{LONGEST_SIDE} pixels; got {side:g}")
+    return int(side)
 
 
 def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) -> tuple[float, float]:
@@ -167,22 +203,24 @@ def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) ->
     lengths = {}
     for axis, size in (("x", width), ("y", height)):
         if f"fl_{axis}" in frame:
-            lengths[axis] = float(frame[f"fl_{axis}"])
+            lengths[axis] = _number(frame, f"fl_{axis}", 0.0, what)
         elif f"camera_angle_{axis}" in frame:
-            lengths[axis] = size / (2 * np.tan(float(frame[f"camera_angle_{axis}"]) / 2))
-    if not lengths or min(lengths.values()) <= 0:
-        raise ValueError(f"{what}: has no focal length; give fl_x or camera_angle_x, above 0")
+            angle = _number(frame, f"camera_angle_{axis}", 0.0, what)
+            lengths[axis] = size / (2 * np.tan(angle / 2)) if 0 < angle < np.pi else 0.0
+    if not lengths or not min(lengths.values()) > 0:
+        raise ValueError(f"{what}: has no focal length; give fl_x above 0, or camera_angle_x between 0 and pi")
     return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
 
 
 def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
     """COLMAP's model and its distortion parameters, which mean what nerfstudio's of the same names mean."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
-    values = {key: float(frame.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    values = {key: _number(frame, key, 0.0, what) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if model == "OPENCV_FISHEYE":
         return model, [values[key] for key in FISHEYE_KEYS]
     if model not in PERSPECTIVE_MODELS:
-        raise ValueError(f"{what}: has the camera_model {model}; a perspective one or OPENCV_FISHEYE is wanted")
+        wanted = "a perspective one or OPENCV_FISHEYE"
+        raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is wanted")
     if values["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
     return "FULL_OPENCV", [*(values[key] for key in OPENCV_KEYS), values["k3"], 0.0, 0.0, 0.0]

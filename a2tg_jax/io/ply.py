@@ -12,15 +12,16 @@ import dataclasses
 import os
 import warnings
 from pathlib import Path
-from typing import BinaryIO
 
 import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, Banded
+from a2tg_jax.data.ply_header import read_vertex_header
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.structure import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.sharing import LARGEST_OPACITY
 from a2tg_jax.transform import transform_gaussians
@@ -36,10 +37,7 @@ THICKNESS = 1e-3
 LEAST_OPACITY = 1e-6
 AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
 """Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
-NUMPY_TYPES = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")
-OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
-NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
-PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
+ENCODING = "binary_little_endian"
 
 
 def save_ply(
@@ -88,7 +86,7 @@ def save_ply(
         np.asarray(gaussians.quats),
     ]
     properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {gaussians.num}\n{properties}end_header\n"
+    header = f"ply\nformat {ENCODING} 1.0\nelement vertex {gaussians.num}\n{properties}end_header\n"
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
         file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
@@ -122,58 +120,35 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not a binary little-endian PLY, is cut off, or lacks an attribute.
+      ValueError: if it is not a binary little-endian PLY, is cut off, lacks an attribute, or a number is not finite.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such PLY file")
     with open(path, "rb") as file:
-        count, dtype = _read_header(file, path)
-        data = file.read(count * dtype.itemsize)
-    if len(data) < count * dtype.itemsize:
-        raise ValueError(f"{path}: is cut off; {count} vertices of {dtype.itemsize} bytes were announced")
-    return _gaussians_of(np.frombuffer(data, dtype, count), path)
-
-
-def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype]:
-    """Number of vertices and the type of one, with the file left at the first vertex."""
-    if file.readline().strip() != b"ply":
-        raise ValueError(f"{path}: is not a PLY file")
-    count: int | None = None
-    fields: list[tuple[str, str]] = []
-    elements: list[str] = []
-    while (words := file.readline().decode("ascii", "replace").split()) != ["end_header"]:
-        match words:
-            case []:
-                raise ValueError(f"{path}: its PLY header does not end")
-            case ["format", encoding, *_] if encoding != "binary_little_endian":
-                raise ValueError(f"{path}: is a PLY in {encoding}; save it as binary_little_endian")
-            case ["element", name, number]:
-                elements.append(name)
-                if not number.isdecimal():
-                    raise ValueError(f"{path}: announces {number} of {name}; a number is wanted")
-                count = int(number) if name == "vertex" else count
-            case ["property", kind, name] if elements == ["vertex"] and kind in PLY_TYPES:
-                fields.append((name, PLY_TYPES[kind]))
-            case ["property", *_] if elements == ["vertex"]:
-                raise ValueError(f"{path}: cannot read the vertex property '{' '.join(words[1:])}'")
-    if count is None or elements[0] != "vertex":
-        raise ValueError(f"{path}: vertices must be the first element of the PLY; it has {elements}")
-    return count, np.dtype(fields)
+        header = read_vertex_header(file, path)
+        if header.encoding != ENCODING:
+            raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
+        header.require(REQUIRED, "a PLY of 2D Gaussians")
+        vertices = header.read_binary(file)
+    gaussians = _gaussians_of(vertices, path)
+    try:
+        check_model(Model(gaussians))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return gaussians
 
 
 def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     """Gaussians from the structured array of the vertices."""
     names = vertices.dtype.names or ()
-    missing = [name for name in REQUIRED if name not in names]
-    if missing:
-        raise ValueError(f"{path}: has no attribute {', '.join(missing)}; a PLY of 2D Gaussians is wanted")
     rest = [name for name in SH_REST if name in names]
     if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
 
     def columns(wanted) -> np.ndarray:
-        return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
+        with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
+            return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
 
     sh = np.zeros((len(vertices), 1 + len(rest) // 3, 3), np.float32)
     sh[:, 0] = columns(SH_DEGREE0)
@@ -187,7 +162,7 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
         means=jnp.asarray(columns(MEANS)),
         quats=jnp.asarray(quats),
         log_scales=jnp.asarray(log_scales),
-        logit_opacities=jnp.asarray(vertices["opacity"].astype(np.float32)),
+        logit_opacities=jnp.asarray(columns(("opacity",))[:, 0]),
         sh=jnp.asarray(sh),
     )
 

@@ -1,0 +1,100 @@
+"""The header of PLY files whose first element is `vertex`, and the room that their vertices take."""
+
+import dataclasses
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from a2tg_jax.checks import shortened
+
+OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+LONGEST_LINE, MOST_LINES = 4096, 10_000
+MOST_DIGITS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class VertexHeader:
+    """What a PLY says of its vertices."""
+
+    path: Path
+    encoding: str
+    """One of `BYTE_ORDERS`."""
+    count: int
+    fields: dict[str, str]
+    """NumPy's name of the type of each property, in their order."""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of one vertex in a binary file."""
+        return np.dtype([(name, BYTE_ORDERS[self.encoding] + kind) for name, kind in self.fields.items()])
+
+    def require(self, names: Iterable[str], wanted: str) -> None:
+        """Raises ValueError unless the vertices have some properties."""
+        missing = [name for name in names if name not in self.fields]
+        if missing:
+            raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is wanted")
+
+    def read_binary(self, file: BinaryIO) -> np.ndarray:
+        """The vertices [count] of a binary file, structured. ValueError: it is cut off."""
+        dtype = self.dtype
+        self.check_room(file, dtype.itemsize)
+        return np.frombuffer(file.read(self.count * dtype.itemsize), dtype, self.count)
+
+    def check_room(self, file: BinaryIO, num_bytes: int) -> None:
+        """Raises ValueError if the rest of a file is less than that many bytes for each vertex."""
+        left = os.fstat(file.fileno()).st_size - file.tell()
+        if self.count * num_bytes > left:
+            raise ValueError(
+                f"{self.path}: is cut off; {self.count} vertices of {num_bytes} bytes were announced, and {left} bytes "
+                "are left; export it again"
+            )
+
+
+def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
+    """The header of a PLY, with the file left at its first vertex.
+
+    Raises:
+      ValueError: naming the file, if it is no PLY, its header does not end, vertices are not its first element, or a
+        property of them cannot be read.
+    """
+    encoding, count = "", 0
+    elements: list[str] = []
+    fields: dict[str, str] = {}
+    for words in _header_lines(file, path):
+        match words:
+            case ["format", encoding, *_] if encoding not in BYTE_ORDERS:
+                raise ValueError(f"{path}: is a PLY in {shortened(encoding)}; {', '.join(BYTE_ORDERS)} are known")
+            case ["element", name, number]:
+                elements.append(name)
+                if not number.isdecimal() or len(number) > MOST_DIGITS:
+                    raise ValueError(f"{path}: announces {shortened(number)} of {name}; a number is wanted")
+                count = int(number) if len(elements) == 1 else count
+            case ["property", kind, name] if elements == ["vertex"] and kind in PLY_TYPES and name not in fields:
+                fields[name] = PLY_TYPES[kind]
+            case ["property", *_] if elements == ["vertex"]:
+                raise ValueError(f"{path}: cannot read the vertex property '{shortened(' '.join(words[1:]))}'")
+    if elements[:1] != ["vertex"] or not encoding:
+        raise ValueError(f"{path}: vertices must be the first element of the PLY; it has {shortened(elements)}")
+    return VertexHeader(path, encoding, count, fields)
+
+
+def _header_lines(file: BinaryIO, path: Path) -> Iterator[list[str]]:
+    """The words of each line up to end_header."""
+    if file.readline(LONGEST_LINE).strip() != b"ply":
+        raise ValueError(f"{path}: is not a PLY file")
+    for _ in range(MOST_LINES):
+        line = file.readline(LONGEST_LINE)
+        words = line.decode("ascii", "replace").split()
+        if words == ["end_header"]:
+            return
+        if not line.endswith(b"\n"):
+            break
+        yield words
+    raise ValueError(f"{path}: its PLY header does not end")
