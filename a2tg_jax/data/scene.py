@@ -15,7 +15,7 @@ from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similari
 
 NUM_RANDOM_POINTS = 10_000
 FARTHEST = 1e5
-"""Of a camera from the middle of the scene, in units of the normalised world."""
+"""Of a camera from the middle of all, in units of their median."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,13 +133,13 @@ def assemble_scene(
     """
     shots = sorted([*train, *test], key=lambda shot: shot.name)
     _check_shots(shots, len(train), source)
+    _check_distances(shots, source)
     try:
         transform = normalizing_similarity(np.stack([shot.viewmat for shot in shots]))
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
     centers = camera_centers(np.stack(list(viewmats.values())))
-    _check_distances(centers, shots, source)
     cloud = cloud and _usable(cloud, source)
     if cloud is None or len(cloud.points) < 2:
         message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS} random points instead"
@@ -205,10 +205,12 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
             raise ValueError(f"{source}: lists {shot.name} twice; remove one of the two")
 
 
-def _check_distances(centers: np.ndarray, shots: Sequence[Shot], source: str) -> None:
-    """Refuses cameras beyond all the others; half of them are within 1 of the origin."""
-    farthest = int(np.argmax(np.abs(centers).max(axis=1)))
-    if not np.abs(centers[farthest]).max() <= FARTHEST:
+def _check_distances(shots: Sequence[Shot], source: str) -> None:
+    """Refuses a camera beyond all the others, which would move the origin to nowhere."""
+    centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    farthest = int(np.argmax(distances))
+    if 0 < FARTHEST * np.median(distances) < distances[farthest]:
         raise ValueError(
             f"{source}: {shots[farthest].name} stands more than {FARTHEST:g} times as far away as half of the cameras; "
             "remove it from the scene or correct the pose"
