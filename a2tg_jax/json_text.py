@@ -38,7 +38,7 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
         value = json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
     except RecursionError:
         raise ValueError("its brackets are nested too deeply") from None
-    _check_depth(value)
+    check_depth(value)
     return value
 
 
@@ -48,8 +48,11 @@ def _integer(digits: str) -> int:
     return int(digits)
 
 
-def _check_depth(value: Any) -> None:
-    """Level by level, as what is nested too deeply cannot be walked by recursion."""
+def check_depth(value: Any) -> None:
+    """Raises ValueError if lists and mappings are nested more than `DEEPEST` deep.
+
+    Goes level by level, as what is nested too deeply cannot be walked by recursion.
+    """
     level = [value]
     for _ in range(DEEPEST):
         level = [inner for held in level for inner in _held(held)]

@@ -7,7 +7,10 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from a2tg_jax.checks import shortened
+
 ConfigT = TypeVar("ConfigT")
+LARGEST_INTEGER = 2**64
 NONE = "None"
 """None in a format that has no word for it, such as TOML."""
 
@@ -32,13 +35,15 @@ def config_from_dict(
       ValueError: if a field is missing or unknown, or has a value of another type; the field is named.
     """
     if not isinstance(data, Mapping):
-        raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {data!r}")
+        raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {shortened(repr(data))}")
     hints = typing.get_type_hints(kind)
     given = given or {}
     names = [field.name for field in dataclasses.fields(kind) if field.name not in given]  # type: ignore[arg-type]
     for name in data:
         if name not in names:
-            raise ValueError(f"{_within(where, name)} is not a field of {kind.__name__}; {_instead(name, names)}")
+            raise ValueError(
+                f"{_within(where, shortened(name))} is not a field of {kind.__name__}; {_instead(name, names)}"
+            )
     optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
         if name not in data and name not in optional:
@@ -89,7 +94,7 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
     for alternative in alternatives:
         if _fits(alternative, value):
             return _converted(alternative, value)
-    raise ValueError(f"{where} must be {_told(hint)}; got {value!r}")
+    raise ValueError(f"{where} must be {_told(hint)}; got {shortened(repr(value))}")
 
 
 def _told(hint: Any) -> str:
@@ -106,6 +111,8 @@ def _fits(hint: Any, value: Any) -> bool:
         return isinstance(value, list) and all(map(_fits, _item_hints(hint, value), value))
     if isinstance(value, bool):
         return hint is bool
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        return False
     return isinstance(value, (int, float) if hint is float else hint)
 
 

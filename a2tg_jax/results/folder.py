@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.json_text import parse_json
 
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
@@ -183,8 +184,8 @@ def read_json(path: Path) -> Any:
       ValueError: if the file is damaged.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        return parse_json(path.read_bytes(), allow_nan=True)  # The PSNR of equal images is infinite.
+    except ValueError as error:
         raise ValueError(f"{path}: is not valid JSON: {error}") from error
 
 

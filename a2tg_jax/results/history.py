@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from a2tg_jax.checks import shortened
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.training import History
 
 NAMES = tuple(field.name for field in dataclasses.fields(History))
+INTEGERS = ("stage", "iteration", "num_gaussians")
+LARGEST = 1e15
 
 
 def write_history(path: Path, history: History) -> None:
@@ -23,14 +26,21 @@ def read_history(path: Path) -> History:
     """The history that `write_history` wrote.
 
     Raises:
-      ValueError: if the file has other columns.
+      ValueError: naming the file, if it has other columns, or a row is not one of numbers, of which only PSNR may be
+        infinite.
     """
     with open(path, newline="", encoding="utf-8") as file:
-        first, *rows = csv.reader(file)
-    if tuple(first) != NAMES:
-        raise ValueError(f"{path}: has the columns {', '.join(first)}; {', '.join(NAMES)} are wanted")
-    values = np.asarray(rows, np.float64).reshape(len(rows), len(NAMES))
-    integers = {"stage", "iteration", "num_gaussians"}
-    return History(
-        **{name: values[:, i].astype(np.int64 if name in integers else np.float64) for i, name in enumerate(NAMES)}
-    )
+        try:
+            first, *rows = [*csv.reader(file)] or [[]]
+            if tuple(first) != NAMES:
+                raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are wanted")
+            values = np.asarray([[float(word) for word in row] for row in rows]).reshape(len(rows), len(NAMES))
+            if np.isnan(values).any() or (np.abs(values[:, [name != "psnr" for name in NAMES]]) > LARGEST).any():
+                raise ValueError("has numbers that are not finite")
+        except (ValueError, csv.Error) as error:
+            raise ValueError(f"{path}: {shortened(str(error), 200)}; train the stage again") from error
+    return History(**{name: values[:, i].astype(_dtype(name)) for i, name in enumerate(NAMES)})
+
+
+def _dtype(name: str) -> type:
+    return np.int64 if name in INTEGERS else np.float64

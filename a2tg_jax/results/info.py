@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.appearance import Banded
+from a2tg_jax.checks import shortened
 from a2tg_jax.io.model import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, read_json
 from a2tg_jax.results.record import read_record, repeating_command
+
+SPLITS = ("test", "train")
 
 
 def describe_run(run: RunFolder) -> str:
@@ -17,7 +20,7 @@ def describe_run(run: RunFolder) -> str:
       ValueError: if a file of the run is damaged or of another version.
     """
     record = read_record(run)
-    measured = read_json(run.metrics)["models"] if run.metrics.is_file() else {}
+    measured = read_psnrs(run.metrics) if run.metrics.is_file() else {}
     compared = f", compared with {', '.join(record.compare)}" if record.compare else ""
     names = record.plan.names
     width = max(map(len, names))
@@ -31,7 +34,27 @@ def describe_run(run: RunFolder) -> str:
     return "\n".join(lines)
 
 
-def _describe_stage(run: RunFolder, name: str, measured: dict | None) -> str:
+def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
+    """The PSNR in a metrics.json: model → test or train → dB.
+
+    Raises:
+      ValueError: if there is anything else where they should be.
+    """
+    data = read_json(path)
+    models = data.get("models") if isinstance(data, dict) else None
+    if not isinstance(models, dict):
+        raise ValueError(f"{path}: has no models; a2tg eval writes it anew")
+    psnrs: dict[str, dict[str, float]] = {}
+    for name, model in models.items():
+        splits = {split: model[split] for split in SPLITS if split in model} if isinstance(model, dict) else None
+        found = None if splits is None else [isinstance(x, dict) and x.get("psnr") for x in splits.values()]
+        if splits is None or found is None or not all(type(psnr) in (int, float) for psnr in found):
+            raise ValueError(f"{path}: has no PSNR of {shortened(name)}; a2tg eval writes it anew")
+        psnrs[name] = {split: float(psnr) for split, psnr in zip(splits, found, strict=True)}  # type: ignore[arg-type]
+    return psnrs
+
+
+def _describe_stage(run: RunFolder, name: str, measured: dict[str, float] | None) -> str:
     if not run.model(name).is_file():
         return _progress(run.checkpoints(name))
     model = load_model(run.model(name))
@@ -43,8 +66,7 @@ def _describe_stage(run: RunFolder, name: str, measured: dict | None) -> str:
         sizes, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
         parts.append("textures " + ", ".join(f"{tv}×{tu}: {n:,}" for (tv, tu), n in zip(sizes, counts, strict=True)))
     if measured:
-        splits = [split for split in ("test", "train") if split in measured]
-        parts += [f"{split} {measured[split]['psnr']:.2f} dB" for split in splits]
+        parts += [f"{split} {psnr:.2f} dB" for split, psnr in measured.items()]
     return "; ".join(parts)
 
 

@@ -13,6 +13,7 @@ A configuration file says the same or less; what it leaves out has the value tha
 """
 
 import dataclasses
+import os
 import shlex
 import tomllib
 from pathlib import Path
@@ -20,10 +21,12 @@ from typing import Any
 
 import tomli_w
 
+from a2tg_jax.checks import shortened
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
+from a2tg_jax.json_text import check_depth
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
@@ -179,12 +182,13 @@ def read_run_file(path: Path) -> RunFile:
         raise FileNotFoundError(f"{path}: no such configuration file")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ValueError(f"{path}: is not valid TOML: {error}") from error
+        check_depth(table)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
     file = config_from_dict(RunFile, {**config_to_dict(RunFile()), **table}, f"{path}:")
     if file.scene is None or file.scene == SYNTHETIC:
         return file
-    return dataclasses.replace(file, scene=str((path.parent / file.scene).resolve()))
+    return dataclasses.replace(file, scene=os.path.realpath(path.parent / file.scene))  # Also of links in a circle.
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:

@@ -144,10 +144,11 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], where:
     check_state(state, wanted, stage)
     check_history(history)
     num_restored = header.get("num_restored", 0)
-    check_count("num_restored", num_restored, stage.iterations)
+    check_count("num_restored", num_restored, MOST_RESTORED)
     return Checkpoint(options, header["stage"], state, history, num_restored)
 
 
+MOST_RESTORED = 2**31 - 1
 SHOWN = "shown/"
 """Names of the arrays of what splats show begin so."""
 

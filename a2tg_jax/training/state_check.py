@@ -58,5 +58,7 @@ def check_history(history: Any) -> None:
     for name, column in columns.items():
         if column.ndim != 1 or column.shape != num or column.dtype.kind not in "iuf":
             raise ValueError(f"history.{name} must be numbers {list(num)}; got {column.dtype} {list(column.shape)}")
-        if np.isnan(column).any() or (name != "psnr" and not (np.isfinite(column) & (column >= 0)).all()):
-            raise ValueError(f"history.{name} must be finite and at least 0; some are not")
+        if np.isnan(column).any() or (name != "psnr" and np.isinf(column).any()):
+            raise ValueError(f"history.{name} must be finite; some are not")
+        if name not in ("loss", "psnr") and (column < 0).any():
+            raise ValueError(f"history.{name} must be at least 0; some are below")

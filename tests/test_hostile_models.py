@@ -1,0 +1,379 @@
+"""Models, checkpoints and weights whose arrays do not fit each other, or whose files lie: refused, in one line."""
+
+import dataclasses
+import io
+import pickle
+import tracemalloc
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import a2tg_jax as a2tg
+from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.io.archive import FORMAT as CHECKPOINT
+from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.model import FORMAT as MODEL
+from a2tg_jax.io.model import load_model, save_model
+from a2tg_jax.io.ply import load_ply, save_ply
+from a2tg_jax.io.structure import check_model, check_places
+from a2tg_jax.json_text import parse_json
+from a2tg_jax.metrics import load_lpips
+from a2tg_jax.model import Model
+from a2tg_jax.npz import read_npz
+from a2tg_jax.origin import Origin
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.training import Checkpoint, History, load_checkpoint, save_checkpoint
+from a2tg_jax.training.step import initial_state
+
+NUM = 12
+
+
+def some_gaussians():
+    rng = np.random.default_rng(0)
+    return init_from_points(rng.normal(size=(NUM, 3)), rng.uniform(size=(NUM, 3)), sh_degree=0)
+
+
+def some_origin():
+    cameras = [a2tg.Camera(jnp.eye(4), jnp.diag(jnp.asarray([40.0, 40.0, 1.0])), 32, 24) for _ in range(2)]
+    return Origin.of_cameras(cameras, ["a.png", "b.png"])
+
+
+def some_model(system=None):
+    """Of the last stage of a system."""
+    stage = (system or a2tg.A2tg(sh_degree=0)).stages()[-1]
+    gaussians = some_gaussians()
+    params, layout = stage.appearance.allocate(jax.random.key(0), gaussians)
+    return Model(gaussians, params, layout, appearance=stage.appearance, origin=some_origin())
+
+
+def some_checkpoint(system):
+    model = some_model(system)
+    live = Model(model.gaussians, model.params, model.layout, jnp.int32(NUM - 2), appearance=model.appearance)
+    stages = system.stages()
+    history = History.empty().with_point(len(stages), 1, 0.5, 20.0, NUM, 0.1, 2.0)
+    return Checkpoint(system, len(stages) - 1, initial_state(stages[-1], live), history)
+
+
+def spoiled(path, format, change):
+    """A file whose header and arrays went through a function."""
+    header, arrays = read_archive(path, format=format)
+    kept = {name: value for name, value in header.items() if name not in ("format", "version")}
+    change(kept, arrays)
+    write_archive(path, kept, arrays, format=format)
+
+
+def refused(load, path, match):
+    with pytest.raises(ValueError, match=match) as caught:
+        load(path)
+    assert path.name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def with_number(name, value, place=0):
+    def change(_, arrays):
+        arrays[name] = arrays[name].copy()
+        arrays[name].reshape(-1)[place] = value
+
+    return change
+
+
+def with_array(name, function):
+    return lambda _, arrays: arrays.update({name: function(arrays[name])})
+
+
+def with_header(**values):
+    return lambda header, _: header.update(values)
+
+
+GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", [*GAUSSIANS, "appearance/texels"])
+def test_models_with_numbers_that_are_not_finite(tmp_path, name, value):
+    path = tmp_path / "m.npz"
+    save_model(path, some_model())
+    spoiled(path, MODEL, with_number(name, value))
+    refused(load_model, path, "must be finite; some are NaN or infinite")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_number("log_scales", 100.0), "logarithms of finite scales"),
+        (lambda _, a: a.update({name: a[name].astype(np.float16) for name in GAUSSIANS}), "must be float32 or float64"),
+        (with_array("appearance/texels", lambda x: x.astype(np.float16)), "must be floats, float32 or float64"),
+        (with_array("quats", lambda x: x[1:]), r"quats must be \[12, 4\]"),
+        (with_array("appearance/sizes", lambda x: x + 400), "sizes must be integers"),
+        (with_number("origin/Ks", np.nan), r"camera a\.png: its focal lengths"),
+        (with_number("origin/Ks", 1e30), r"camera a\.png: its focal lengths"),
+        (with_number("origin/Ks", np.inf, 2), r"camera a\.png: its principal point"),
+        (with_number("origin/Ks", 5.0, 8), r"camera a\.png: its K must be upper triangular"),
+        (with_number("origin/viewmats", np.nan), r"camera a\.png: its pose must be finite"),
+        (with_number("origin/viewmats", 1e13, 3), r"camera a\.png: its pose must be finite"),
+        (with_number("origin/viewmats", 7.0), r"camera a\.png: its pose must be a rigid motion"),
+        (with_number("origin/sizes", 10**9), r"camera a\.png: its image must have sides"),
+        (with_number("origin/sizes", -3), r"camera a\.png: its image must have sides"),
+        (with_array("origin/sizes", lambda x: x.astype(float)), "sizes must be integers"),
+        (with_array("origin/is_test", lambda x: x.astype(int)), "is_test bool"),
+        (with_number("origin/scale", 0.0), "positive scale"),
+        (with_number("origin/scale", np.inf), "positive scale"),
+        (with_number("origin/rotation", 3.0), "must have a rotation"),
+        (with_number("origin/translation", np.nan), "finite translation"),
+        (with_header(origin={"names": ["a", 5], "background": [0, 0, 0]}), "names must be texts"),
+        (with_header(origin={"names": ["a", "b"], "background": [0, 0, 1e400]}), "finite|JSON"),
+    ],
+)  # fmt: skip
+def test_models_that_no_camera_sees(tmp_path, change, message):
+    path = tmp_path / "m.npz"
+    save_model(path, some_model())
+    try:
+        spoiled(path, MODEL, change)
+    except ValueError as error:  # Not even written: JSON knows no infinity.
+        assert "JSON" in str(error)
+        return
+    refused(load_model, path, message)
+
+
+def test_what_would_not_load_is_not_saved(tmp_path):
+    model = some_model()
+    origin = Origin.of_cameras([a2tg.Camera(jnp.eye(4), jnp.zeros((3, 3)), 4, 4)])
+    with pytest.raises(ValueError, match="focal lengths"):
+        save_model(tmp_path / "m.npz", dataclasses.replace(model, origin=origin))
+    assert not list(tmp_path.iterdir())
+
+
+def test_textures_lie_within_their_buckets_and_apart():
+    """Native loops read where the layout says."""
+    textures = Textures((jnp.zeros((4, 1, 1, 4)), jnp.zeros((2, 2, 1, 4))))
+
+    def layout(bucket, row):
+        return AtlasLayout(jnp.asarray(bucket, jnp.int32), jnp.asarray(row, jnp.int32), ((1, 1), (2, 1)))
+
+    check_places(textures, layout([0, 0, 1], [0, 3, 1]))
+    for bucket, row, message in [
+        ([0, 0, 1], [0, 4, 1], "beyond theirs"),
+        ([0, 0, 1], [0, -1, 1], "beyond theirs"),
+        ([0, 0, 2], [0, 1, 1], "layout.bucket must lie below 2"),
+        ([0, -1, 1], [0, 1, 1], "layout.bucket must lie below 2"),
+        ([0, 0, 1], [2, 2, 0], "a row of its own"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            check_places(textures, layout(bucket, row))
+        with pytest.raises(ValueError, match=message):
+            model = some_model()
+            check_model(Model(model.gaussians[:3], textures, layout(bucket, row), appearance=model.appearance))
+
+
+# Checkpoints
+
+MU, EVENTS = "[1][0][0].mu[0].means", "[1][0][2]"
+
+
+@pytest.fixture(scope="module", params=["a2tg", "bytewise", "gaussians-2d"])
+def checkpoint_file(request, tmp_path_factory):
+    system = {
+        "a2tg": a2tg.A2tg(sh_degree=0),
+        "bytewise": Bytewise(),
+        "gaussians-2d": a2tg.Gaussians2d(sh_degree=0),
+    }[request.param]  # fmt: skip
+    path = tmp_path_factory.mktemp(request.param) / "c.npz"
+    save_checkpoint(path, some_checkpoint(system))
+    return path
+
+
+@pytest.fixture
+def checkpoint(checkpoint_file, tmp_path):
+    path = tmp_path / "c.npz"
+    path.write_bytes(checkpoint_file.read_bytes())
+    return path
+
+
+def test_a_whole_checkpoint_loads(checkpoint):
+    found = load_checkpoint(checkpoint)
+    assert found.iteration == 0 and found.model.num == NUM - 2
+
+
+def test_every_array_of_another_shape_is_refused(checkpoint):
+    """Whichever it is: of Gaussians, what they show, moments, events, counters, history."""
+    _, arrays = read_archive(checkpoint)
+    whole = checkpoint.read_bytes()
+    assert len(arrays) > 20
+    for name in arrays:
+        for change in (lambda x: x[..., None], lambda x: x.ravel()[1:] if x.size > 1 else np.append(x, x)):
+            checkpoint.write_bytes(whole)
+            spoiled(checkpoint, CHECKPOINT, with_array(name, change))
+            with pytest.raises(ValueError, match=r"c\.npz: "):
+                load_checkpoint(checkpoint)
+        checkpoint.write_bytes(whole)
+        spoiled(checkpoint, CHECKPOINT, lambda _, a, name=name: a.pop(name))
+        with pytest.raises(ValueError, match=r"c\.npz: "):
+            load_checkpoint(checkpoint)
+
+
+def test_every_array_of_nan_is_refused(checkpoint):
+    _, arrays = read_archive(checkpoint)
+    whole = checkpoint.read_bytes()
+    floats = [name for name, array in arrays.items() if array.size and array.dtype.kind == "f"]
+    assert len(floats) > 10
+    for name in floats:
+        checkpoint.write_bytes(whole)
+        spoiled(checkpoint, CHECKPOINT, with_number(name, np.nan))
+        with pytest.raises(ValueError, match=r"c\.npz: .*NaN|must be finite"):
+            load_checkpoint(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_header(stage=-1), r"stage must be a number in 0\.\."),
+        (with_header(stage=7), r"stage must be a number in 0\.\."),
+        (with_header(stage=True), r"stage must be a number in 0\.\."),
+        (with_header(stage="0"), r"stage must be a number in 0\.\."),
+        (with_header(is_ahead=[True] * 9), "is_ahead must say"),
+        (with_header(is_ahead=3), "is_ahead must say"),
+        (with_header(is_ahead=[1]), "is_ahead must say"),
+        (with_header(system=3), "damaged or of another version"),
+        (with_header(system={"name": ["a2tg"], "options": {}}), "damaged|not known here"),
+        (with_header(system={"name": "os:system", "options": {}}), "not known here"),
+        (with_header(num_restored=-2), "num_restored must be a whole number"),
+        (with_header(num_restored="many"), "num_restored must be a whole number"),
+        (with_array("[1][0][1]", lambda x: x + 1000), "num_live must be a whole number in 0..12; got"),
+        (with_array("[1][0][1]", lambda x: x - 1000), "num_live must be a whole number in 0..12; got"),
+        (with_array("[1][0][3]", lambda x: x + 10**9), "iteration must be a whole number in"),
+        (with_array("[1][0][3]", lambda x: x - 1), "iteration must be a whole number in"),
+        (with_array("[1][0][4]", lambda x: x + 9), "status must be a whole number in 0..4"),
+        (with_array("[1][0][0].count", lambda x: x - 9), "count must be a whole number in"),
+        (with_number("[1][0][0].nu[0].quats", -1.0), "must be at least 0; some are negative"),
+        (with_array(MU, lambda x: x.astype(np.int32)), "must be float32; got int32"),
+        (with_array("[1][1]['iteration']", lambda x: x - 5), "history.iteration must be at least 0"),
+    ],
+)
+def test_checkpoints_out_of_range(checkpoint, change, message):
+    spoiled(checkpoint, CHECKPOINT, change)
+    refused(load_checkpoint, checkpoint, message)
+
+
+# Archives that lie
+
+
+def member(dtype="<f4", shape="(3,)", data=b"\0" * 12, header=None):
+    """The bytes of an .npy that says anything of itself."""
+    text = header or f"{{'descr': {dtype!r}, 'fortran_order': False, 'shape': {shape}, }}"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + data
+
+
+def archive(path, compression=zipfile.ZIP_STORED, **members):
+    with zipfile.ZipFile(path, "w", compression) as file:
+        for name, data in members.items():
+            file.writestr(f"{name}.npy", data)
+
+
+def pickled():
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray([{"a": 1}], object), allow_pickle=True)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (member(shape="(10000000000,)"), "claims the shape"),
+        (member(shape=f"({2**62}, {2**62})"), "claims the shape"),
+        (member(shape="(2,)"), "claims the shape"),
+        (member(shape="(-3,)"), "has no shape"),
+        (member(shape="(3.0,)"), "has no shape"),
+        (member(shape="3"), "has no shape"),
+        (member(shape="(" + "0," * 40 + ")", data=b""), "has no shape"),
+        (member(dtype="|O"), "must be of plain numbers"),
+        (member(dtype="<U3"), "must be of plain numbers"),
+        (member(dtype="<c8"), "must be of plain numbers"),
+        (member(dtype="<f16"), "must be of plain numbers"),
+        (member(header="[" * 3000), ""),
+        (member(header="{'descr': __import__('os').system('true'), 'fortran_order': False, 'shape': (3,)}"), ""),
+        (member(header="{'shape': (3,)}"), "descr"),
+        (b"\x93NUMPY\x09\x00" + b"\0" * 40, "version"),
+        (b"\x93NUMPY\x02\x00" + b"\xff" * 40, "has a header of"),
+        (pickle.dumps([1]), ""),
+        (pickled(), "must be of plain numbers"),
+        (b"", ""),
+    ],
+)
+def test_arrays_that_lie_are_refused_before_room_is_made(tmp_path, data, message):
+    path = tmp_path / "a.npz"
+    archive(path, a=data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=message or None) as caught:
+            read_npz(path)
+        assert tracemalloc.get_traced_memory()[1] < 4e6 and "\n" not in str(caught.value)
+    finally:
+        tracemalloc.stop()
+
+
+def test_archives_that_unpack_to_too_much_are_refused(tmp_path):
+    zeros = member(shape=f"({10**7},)", data=bytes(4 * 10**7))
+    archive(tmp_path / "a.npz", zipfile.ZIP_DEFLATED, a=zeros)
+    with pytest.raises(ValueError, match="would take more than the file may hold"):
+        read_npz(tmp_path / "a.npz")
+    archive(tmp_path / "b.npz", a=zeros)
+    assert read_npz(tmp_path / "b.npz")["a"].shape == (10**7,)
+
+
+def test_arrays_come_back_as_numpy_reads_them(tmp_path):
+    arrays = {
+        "c": np.arange(24.0).reshape(2, 3, 4), "f": np.asfortranarray(np.arange(6, dtype=np.int16).reshape(2, 3)),
+        "big": np.arange(3, dtype=">f8"), "scalar": np.asarray(True), "none": np.zeros((0, 4), np.uint8),
+    }  # fmt: skip
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    found = read_npz(tmp_path / "a.npz", lambda name: name != "c")
+    assert set(found) == set(arrays) - {"c"}
+    for name, array in found.items():
+        np.testing.assert_array_equal(array, arrays[name])
+        assert array.dtype == arrays[name].dtype.newbyteorder("=") and array.flags.writeable
+
+
+@pytest.mark.parametrize(
+    "text", ["NaN", "[Infinity]", "1e999", "[" * 10**5, "[" * 70 + "]" * 70, "1" * 26, "{", b"\xff\xfe\xfd", ""]
+)
+def test_json_that_is_none_is_one_error(text):
+    with pytest.raises(ValueError):
+        parse_json(text)
+
+
+def test_json_of_pythons_own_library_is_read():
+    assert np.isnan(parse_json("NaN", allow_nan=True)) and parse_json("[1e999]", allow_nan=True) == [np.inf]
+    assert parse_json(b'\xef\xbb\xbf{"a": [1, -2.5e3, 18446744073709551616]}') == {"a": [1, -2500.0, 2**64]}
+
+
+# PLY and weights
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_ply_with_numbers_that_are_not_finite(tmp_path, value):
+    path = tmp_path / "g.ply"
+    save_ply(path, some_gaussians())
+    data = bytearray(path.read_bytes())
+    data[-4:] = np.float32(value).tobytes()
+    path.write_bytes(bytes(data))
+    refused(load_ply, path, r"gaussians\.quats must be finite")
+
+
+@pytest.mark.parametrize("count", [2**64 - 1, 2 * 10**9, 13])
+def test_ply_that_claims_more_than_there_is(tmp_path, count):
+    path = tmp_path / "g.ply"
+    save_ply(path, some_gaussians())
+    path.write_bytes(path.read_bytes().replace(b"element vertex 12", f"element vertex {count}".encode()))
+    refused(load_ply, path, "is cut off")
+
+
+def test_lpips_weights_of_nan_are_refused(tmp_path):
+    path = tmp_path / "w.npz"
+    archive(path, **{"features.0.weight": member(), "lin0.weight": member()})
+    refused(load_lpips, path, "does not hold LPIPS weights")
+    archive(path, a=member(shape="(5,)"))
+    with pytest.raises(ValueError, match=r"is not an \.npz archive of LPIPS weights"):
+        load_lpips(path)
