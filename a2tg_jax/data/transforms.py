@@ -109,10 +109,10 @@ def _read_json(file: Path) -> dict[str, Any]:
 def _check_texts(file: Path, values: dict[str, Any]) -> None:
     """Raises ValueError unless what names files within the scene is text, or a list of texts."""
     for key in FILE_KEYS:
-        if key in values and not (isinstance(values[key], str) and values[key]):
-            raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(values[key])}")
-        if key in values:
-            check_inside(file.parent, values[key])
+        name = values.get(key)
+        if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
+            raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(name)}")
+        check_inside(file.parent, name or "")
     for key in SPLIT_KEYS:
         names = values.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -154,7 +154,6 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Sh
 def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
     """The mask that a frame names, or else that of its image in a folder `masks` beside the folder `images`."""
     if frame.get("mask_path"):
-        check_inside(file.parent, frame["mask_path"])
         return named_mask(file.parent / frame["mask_path"], downscale)
     images = file.parent / "images"
     return find_mask(images, str(image.relative_to(images)), downscale) if image.is_relative_to(images) else None
