@@ -26,6 +26,10 @@ PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 that would leave the statistic no time to settle."""
 
 
+USUAL_SHARE = 0.25
+"""Of the Gaussians that grow, where that is not said."""
+
+
 class ReallocateResult(NamedTuple):
     """What `reallocate` returns."""
 
@@ -82,6 +86,14 @@ class Upscale(HostEvent):
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
         return iterations_at(fractions, num_iterations, "texture.upscale_at")
+
+    def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
+        if self.select == "budget":
+            return max(num_bytes, bytes_of(self.budget_mb or 0.0))
+        # Most who grow have grown before; how many pass a threshold is not known.
+        share = self.fraction if self.select == "fraction" else USUAL_SHARE
+        texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
+        return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
     def init(self, model: Model) -> GradientStatistics:
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)

@@ -126,6 +126,10 @@ class Event:
         """How many Gaussians the event can reach from `num`: so many rows are allocated (host)."""
         return num
 
+    def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
+        """About how many bytes it leaves of a model of `num` Gaussians that has so many, for forecasts (host)."""
+        return num_bytes
+
 
 class StepEvent(Event):
     """Happens inside the step, at fixed shapes."""

@@ -81,6 +81,9 @@ class AdaptDegrees(HostEvent):
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return iterations_at(self.at, num_iterations, "view_dependence.at")
 
+    def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
+        return max(num_bytes, bytes_of(self.budget_mb))
+
     def init(self, model: Model) -> ViewDependence:
         return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
 

@@ -104,6 +104,16 @@ def test_memory_takes_as_many_photographs_as_it_has_room_for(tmp_path):
     store.close()
 
 
+def test_all_batches_have_opacities_and_masks_where_one_has(tmp_path):
+    views = list(load(write_scene(tmp_path / "scene", alpha=True), 0).train)
+    views[0] = dataclasses.replace(views[0], mask=np.eye(32, 40, dtype=bool))
+    store = PhotoStore(tuple(views), BatchOrder(tuple(views), 1, 0), len(views), room=0)
+    batches = [store.batch(iteration)[0] for iteration in range(1, len(views) + 1)]
+    store.close()
+    assert sum(int(batch.masks.sum()) == 32 for batch in batches) == 1
+    assert sum(bool((batch.alphas == 255).all()) for batch in batches) == 1
+
+
 def test_room_must_not_be_negative(tmp_path):
     with pytest.raises(ValueError, match=r"room must be at least 0 bytes; got -1"):
         load_scene(tmp_path, room=-1)

@@ -51,8 +51,11 @@ class SceneSource:
     alpha: AlphaMeaning = "transparency"
     """What the alpha channel of photographs is: the transparency of what they show, or a mask."""
 
-    def load(self) -> Scene:
+    def load(self, room: int | None = None) -> Scene:
         """The scene in its normalised world.
+
+        Args:
+          room: bytes of memory for photographs that are read from files, as in `load_scene`.
 
         Raises:
           FileNotFoundError, ValueError: as `load_scene` does.
@@ -60,7 +63,7 @@ class SceneSource:
         if self.path == SYNTHETIC:
             width, height = SYNTHETIC_SIZE
             return synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=self.test_every)
-        return load_scene(self.path, downscale=self.downscale, test_every=self.test_every, alpha=self.alpha)
+        return load_scene(self.path, downscale=self.downscale, test_every=self.test_every, alpha=self.alpha, room=room)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -69,6 +69,25 @@ class BatchOrder:
         return [batches[index] for index in rng.permutation(len(batches))]
 
 
+class BatchPlan(NamedTuple):
+    """How the photographs come to the device."""
+
+    is_resident: bool
+    """All of them stay there."""
+    batch_bytes: int
+    """Of the largest batch."""
+    num_ahead: int
+    """Batches that are made ready before they are wanted, where not all stay."""
+
+
+def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None) -> BatchPlan:
+    """Whether photographs stay on the device, or how many batches are made ready. Arguments as `PhotoStore`'s."""
+    fits = sum(view.picture.nbytes for view in views) <= (device_room() if room is None else room)
+    batch_bytes = batch_size * max(view.picture.nbytes for view in views)
+    num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
+    return BatchPlan(fits and all(view.picture.is_held for view in views), batch_bytes, num_ahead)
+
+
 class PhotoStore:
     """The photographs of a stage's iterations: on the device while all of them fit there, else brought to it batch by
     batch, made ready by threads that know the order. Close it when the stage is over."""
@@ -81,12 +100,10 @@ class PhotoStore:
         room: bytes of the device that they may take; None: `DEVICE_SHARE` of it.
         """
         self._views, self._order, self._last = views, order, last
-        fits = sum(view.picture.nbytes for view in views) <= (device_room() if room is None else room)
-        self.is_resident = fits and all(view.picture.is_held for view in views)
+        plan = plan_batches(views, len(order.indices(1)), room)
+        self.is_resident, self.num_ahead = plan.is_resident, plan.num_ahead
         self._stacks: dict[tuple[int, int], tuple[Photographs, dict[int, int]]] = {}
-        largest = max(view.picture.nbytes for view in views) * len(order.indices(1))
-        self.num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(largest, 1))))
-        self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices]), self.num_ahead)
+        self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices], views), self.num_ahead)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
         """Photographs among which those of an iteration, all of one size, are; and where among them, int32.
@@ -165,15 +182,22 @@ def device_room() -> float:
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 
 
-def stack_views(views: list[View]) -> Photographs:
-    """Views of one image size, stacked on the host."""
+def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Photographs:
+    """Views of one image size, stacked on the host.
+
+    Args:
+      views: those to stack.
+      among: all the views; where one of that size has opacities or a mask the stack has, so that every stack of it is
+        of one structure. None: `views`.
+    """
+    alike = [view for view in among or views if view.picture.size == views[0].picture.size]
     pixels = [view.picture.read() for view in views]
     alphas = None
-    if any(view.has_alpha for view in views):
+    if any(view.has_alpha for view in alike):
         opaque = np.full(views[0].picture.size, 255, np.uint8)
         alphas = np.stack([own[..., 3] if own.shape[2] == 4 else opaque for own in pixels])
     masks = None
-    if any(view.mask is not None for view in views):
+    if any(view.mask is not None for view in alike):
         whole = np.ones(views[0].picture.size, bool)
         masks = np.stack([whole if view.mask is None else view.mask.read() for view in views])
     return Photographs(

@@ -148,6 +148,7 @@ class StageRun:
                     iteration += 1
                     self._log(iteration, info)
                     bar.update(info, self.history)
+                bar.tell_pace(iteration)
                 if iteration == stop:
                     self._host_events(iteration)
                 is_asked = is_stopped() and iteration > first

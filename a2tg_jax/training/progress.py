@@ -1,11 +1,42 @@
 """The progress bar of training."""
 
+import datetime
+import time
+from collections.abc import Callable
+
 from tqdm import tqdm
 
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.step import StepInfo
 
 MOMENTUM = 0.95
+TIMED_SECONDS, TIMED_STEPS = 2.0, 3
+"""Least of steps that are timed before it is said how long the rest will take."""
+
+
+class Pace:
+    """How long a stage will take, told once, when some steps beyond the first, which are compiled, have been timed."""
+
+    def __init__(self, total: int, now: Callable[[], float] = time.perf_counter):
+        """Args:
+        total: the last iteration.
+        now: a clock in seconds.
+        """
+        self._total, self._now = total, now
+        self._start: tuple[int, float] | None = None
+        self._is_told = False
+
+    def told(self, done: int) -> str | None:
+        """A text after some iterations, or None; the first call begins the timing."""
+        now = self._now()
+        if self._start is None:
+            self._start = done, now
+        steps, seconds = done - self._start[0], now - self._start[1]
+        if self._is_told or steps < TIMED_STEPS or seconds < TIMED_SECONDS:
+            return None
+        self._is_told = True
+        left = datetime.timedelta(seconds=round((self._total - done) * seconds / steps))
+        return f"{1e3 * seconds / steps:,.0f} ms an iteration, about {left} for the other {self._total - done:,}"
 
 
 class ProgressBar:
@@ -16,7 +47,7 @@ class ProgressBar:
             desc=f"{title} (compiling)", initial=done, total=total, disable=not is_shown, unit="it",
             dynamic_ncols=True, mininterval=0.5,
         )  # fmt: skip
-        self._title = title
+        self._title, self._pace = title, Pace(total)
         self._loss: float | None = None
         self._psnr = 0.0
 
@@ -25,6 +56,12 @@ class ProgressBar:
 
     def __exit__(self, *_) -> None:
         self._bar.close()
+
+    def tell_pace(self, done: int) -> None:
+        """Says once, after some steps that were launched together, how long the others will take."""
+        told = self._pace.told(done)
+        if told is not None and not self._bar.disable:
+            self._bar.write(f"{self._title}: {told}")
 
     def update(self, info: StepInfo, history: History) -> None:
         """Counts one iteration; loss and PSNR are running means."""

@@ -18,7 +18,7 @@ KEY_OF_PARAMETERS = 0x7E8E1
 
 def initial_model(scene: Scene, system: System) -> Model:
     """Gaussians at the scene's points, as many as the first stage has room for."""
-    num = _initial_number(scene, system)
+    num = initial_number(scene, system)
     opacity, sh_degree = system.initial_opacity, system.initial_sh_degree
     return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=opacity, sh_degree=sh_degree))
 
@@ -29,16 +29,21 @@ def check_start(scene: Scene, system: System) -> None:
     Raises:
       ValueError: naming the options to change.
     """
-    first, num = system.stages()[0], min(_initial_number(scene, system), len(scene.points))
+    first, num = system.stages()[0], min(initial_number(scene, system), len(scene.points))
     for event in first.events:
         event.num_rows(num, first.iterations)
 
 
-def _initial_number(scene: Scene, system: System) -> int:
+def initial_number(scene: Scene, system: System) -> int:
     """How many points the first stage has room for, of those that are asked for."""
     num = system.initial_gaussians or len(scene.points)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
+
+
+def num_rows(stage: Stage, num: int) -> int:
+    """Rows that a stage allocates for `num` Gaussians: for all that its events can add."""
+    return max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
 
 
 def padded(model: Model, stage: Stage, system: System) -> Model:
@@ -50,7 +55,7 @@ def padded(model: Model, stage: Stage, system: System) -> Model:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
     """
     num = model.gaussians.num
-    room = max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
+    room = num_rows(stage, num)
     gaussians = _with_rows(model.gaussians, room)
     params, layout = model.params, model.layout
     if model.appearance != stage.appearance or room > num:
@@ -76,12 +81,16 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
     num = room - gaussians.num
     if num == 0:
         return gaussians
-    dtype = gaussians.means.dtype
-    empty = Gaussians(
+    empty = no_rows(num, gaussians.sh.shape[1], gaussians.means.dtype)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
+
+
+def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:
+    """Rows that do not exist yet."""
+    return Gaussians(
         means=jnp.zeros((num, 3), dtype),
         quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),
         log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE, dtype),
         logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE, dtype),
-        sh=jnp.zeros((num, *gaussians.sh.shape[1:]), dtype),
+        sh=jnp.zeros((num, num_coefficients, 3), dtype),
     )
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)

@@ -1,0 +1,153 @@
+"""What a whole run will take, memory, disk and time, told before it; and the refusal of what cannot fit."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+
+import jax
+
+from a2tg_jax.cores import num_threads
+from a2tg_jax.data import Scene
+from a2tg_jax.memory import memory_limit
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.training import System
+from a2tg_jax.training.forecast import (
+    COMPILER,
+    FIRST_PROGRAM,
+    FURTHER_PROGRAM,
+    FURTHER_STAGE,
+    MB,
+    PROCESS,
+    STATES,
+    Bytes,
+    StageForecast,
+    forecast_stages,
+    held_bytes,
+    largest_view,
+)
+
+REPORT = 250 * MB
+"""What evaluation, figures and the report compile and import."""
+EVALUATION_PER_PIXEL = 105
+"""Bytes of a view that is rendered, compared and drawn."""
+KEPT_STATES = 3
+"""Checkpoints of a stage on disk while a new one is written."""
+PICTURE_PER_PIXEL = 2
+"""Bytes on disk of each picture of a sheet."""
+ROUGHLY = 2.0
+"""Factor by which the time may be shorter or longer."""
+OPTIONS = {
+    "program": "--max-memory, for the program itself takes most",
+    "photographs": "--downscale, or --batch-size",
+    "model": "--densify.cap, --memory-budget, --batch-size or --sh-degree",
+    "pixels": "--downscale",
+}
+"""What to change where most of the memory is for one thing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunForecast:
+    """What a run will take, about."""
+
+    phases: Mapping[str, Bytes]
+    """Memory at the peak of each stage, by name, and of the evaluation."""
+    disk_bytes: float
+    """In the run folder."""
+    seconds: float
+    """Of training, on CPUs; 0 where that is not known before."""
+
+    @property
+    def peak(self) -> tuple[str, Bytes]:
+        """The phase that takes most memory, and what."""
+        return max(self.phases.items(), key=lambda item: item[1].total)
+
+    def told(self, limit: float) -> str:
+        """Lines for a user."""
+        phase, needed = self.peak
+        parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
+        lines = [
+            f"memory: about {_told(needed.total)} at the peak ({phase}: {parts}); {_told(limit)} may be used",
+            f"disk: about {_told(self.disk_bytes)} in the run folder",
+        ]
+        if self.seconds:
+            least, most = (_duration(self.seconds * factor) for factor in (1 / ROUGHLY, ROUGHLY))
+            cores = num_threads()
+            lines.append(
+                f"time: very roughly {least} to {most} of training on {cores} core{'s' if cores > 1 else ''}; "
+                "the first steps of each stage tell it better"
+            )
+        return "\n".join(lines)
+
+    def check(self, limit: float) -> None:
+        """Refuses what cannot fit.
+
+        Args:
+          limit: bytes that may be used.
+
+        Raises:
+          ValueError: naming the options to change.
+        """
+        phase, needed = self.peak
+        if needed.total <= limit:
+            return
+        largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
+        parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
+        raise ValueError(
+            f"the run would take about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
+            f"used: change {OPTIONS[largest]}, or allow more with --max-memory"
+        )
+
+
+def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
+    """What the run will take (host; nothing is compiled)."""
+    is_host = jax.default_backend() == "cpu"
+    stages = _stages(scene, plan)
+    resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
+    for name, stage in stages.items():
+        resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
+        compiling = max(COMPILER - stage.bytes.pixels, 0)
+        phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
+    shown = Bytes(
+        program=(resident + REPORT) if is_host else 0,
+        photographs=held_bytes(scene) if is_host else 0,
+        model=sum(stage.model_bytes for stage in stages.values()),
+        pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
+    )
+    seconds = sum(stage.seconds for stage in stages.values()) if is_host else 0
+    return RunForecast({**phases, "evaluation": shown}, _disk_bytes(scene, plan, list(stages.values())), seconds)
+
+
+def allowed_memory(max_memory: float | None) -> float:
+    """Bytes that a run may use: what is asked for, or what the machine, or its accelerator, has available (host)."""
+    if max_memory is not None:
+        return max_memory
+    stats = jax.local_devices()[0].memory_stats() or {}
+    return stats.get("bytes_limit", 0) or memory_limit()
+
+
+def _stages(scene: Scene, plan: RunPlan) -> dict[str, StageForecast]:
+    """Of every stage that is trained, by name."""
+    systems: dict[int, tuple[System, list[StageForecast]]] = {}
+    for planned in plan.stages:
+        if id(planned.system) not in systems:
+            systems[id(planned.system)] = planned.system, list(forecast_stages(scene, planned.system))
+    return {planned.name: systems[id(planned.system)][1][planned.index] for planned in plan.stages}
+
+
+def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) -> float:
+    """Of checkpoints, models, and pictures of the test views."""
+    views = scene.test or scene.train
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    num_pictures = 3 + max(1, len(plan.chains) - 1)
+    kept = sum((KEPT_STATES * STATES + 1) * stage.model_bytes for stage in stages)
+    return kept + PICTURE_PER_PIXEL * num_pictures * pixels
+
+
+def _told(num_bytes: float) -> str:
+    return f"{num_bytes / 1e9:.1f} GB" if num_bytes >= 1e9 else f"{math.ceil(num_bytes / 1e6)} MB"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{math.ceil(seconds)} s"
+    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,167 @@
+"""What a run will take, told before it: beside what XLA says, what training allocates, and what is refused."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import a2tg_jax as a2tg
+from a2tg_jax import memory
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.cameras import resize_camera
+from a2tg_jax.classes import classes_of
+from a2tg_jax.data import Picture
+from a2tg_jax.results import forecast
+from a2tg_jax.results.forecast import RunForecast, allowed_memory, forecast_run
+from a2tg_jax.results.plan import plan_run
+from a2tg_jax.training import SYSTEMS
+from a2tg_jax.training.forecast import Bytes, forecast_stages, stage_bytes
+from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.progress import Pace
+from a2tg_jax.training.start import initial_model
+from a2tg_jax.training.step import StepSettings, jitted_step
+
+MB = 10**6
+
+
+def scene_of(width, height, num_views=4):
+    """The built-in scene with pictures of another size, which take no memory."""
+    made = a2tg.synthetic_scene(num_views=num_views, width=24, height=16, num_points=200)
+    shape = (height, width, 3)
+    picture = Picture(shape, lambda: np.zeros(shape, np.uint8), is_held=True)
+    resized = lambda views: tuple(  # noqa: E731
+        dataclasses.replace(view, camera=resize_camera(view.camera, width, height), picture=picture) for view in views
+    )
+    return dataclasses.replace(made, train=resized(made.train), test=resized(made.test))
+
+
+def run_of(scene, system):
+    return forecast_run(scene, plan_run({"a": system}))
+
+
+@pytest.mark.parametrize(("width", "height", "num"), [(480, 360, 300), (32, 24, 40_000)])
+def test_a_step_needs_what_xla_says(width, height, num):
+    points = np.random.default_rng(0).normal(size=(num, 3)).astype(np.float32)
+    scene = dataclasses.replace(scene_of(width, height), points=points, colors=np.full_like(points, 0.5))
+    system = a2tg.Gaussians2dMcmc(stage1_iterations=4, densify=a2tg.McmcConfig(cap=num))
+    run = StageRun(scene, system, 0, initial_model(scene, system))
+    photographs, views = run.photographs.batch(1)
+    settings = StepSettings(run._settings((height, width)), system.background)
+    args = (settings, run.stage, run.clock, run.state, photographs, views, run.scene_scale, run.key)
+    lowered = jitted_step()._jitted.lower(classes_of((args, {})), *args)
+    said = lowered.compile().memory_analysis()
+    expected = stage_bytes(scene, system, run.stage, num, run.model.num_bytes)
+    state = 4 * run.model.num_bytes
+    step = expected.model - state + expected.pixels
+    assert 0.75 < step / said.temp_size_in_bytes < 1.33, (step, said.temp_size_in_bytes)
+    assert sum(leaf.nbytes for leaf in jax.tree.leaves(run.state)) < 1.01 * state
+
+
+def test_rows_and_bytes_are_those_that_training_reaches():
+    scene = scene_of(24, 16)
+    system = a2tg.A2tg(
+        stage1_iterations=12, stage2_iterations=12, initial_gaussians=60, densify=a2tg.McmcConfig(cap=66),
+        texture=a2tg.TextureConfig(fraction=0.5, upscale_at=(0.3, 0.6)),
+    )  # fmt: skip
+    first, second = forecast_stages(scene, system)
+    assert (first.num_rows, second.num_rows) == (66, 66)
+    assert first.model_bytes == 232 * 66
+    assert second.model_bytes == 232 * 66 + 16 * 66 * (0.5 + 0.5 * 16)
+    assert (first.num_programs, second.num_programs) == (1, 3)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_budget_is_the_size_of_what_is_left(name):
+    preset = type(a2tg.find_system(name)).preset("smoke")
+    system = dataclasses.replace(preset, memory_budget="0.3MB", initial_gaussians=100)
+    *_, last = forecast_stages(a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=2000), system)
+    assert 0.5 * 0.3 * MB < last.model_bytes < 1.1 * 0.3 * MB
+
+
+@pytest.mark.parametrize(
+    ("event", "expected"),
+    [
+        (Upscale("fraction", 0.25, at=(0.2,), cap=4), 100 * (232 + 16 * 1.75)),
+        (Upscale("threshold", threshold=1e-5, at=(0.2, 0.4), cap=4), 100 * (232 + 16 * 4.75)),
+        (Upscale("budget", budget_mb=0.05, at=(0.2,)), 50_000),
+    ],
+)
+def test_textures_grow_to(event, expected):
+    assert event.most_bytes(100 * 248, 100, 60) == expected
+
+
+def test_more_of_anything_takes_more():
+    scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc(densify=a2tg.McmcConfig(cap=50_000))
+    before = run_of(scene, system).peak[1].total
+    changes = ({"batch_size": 4}, {"densify": a2tg.McmcConfig(cap=200_000)}, {"sh_degree": 0})
+    one, two, three = (run_of(scene, dataclasses.replace(system, **change)).peak[1].total for change in changes)
+    assert one > before and two > before and three < before
+    assert run_of(scene_of(1200, 800), system).peak[1].total > before
+    geometry = dataclasses.replace(system, loss=a2tg.LossConfig(normal_weight=0.1))
+    assert run_of(scene_of(2400, 1600), geometry).peak[1].total > run_of(scene_of(2400, 1600), system).peak[1].total
+
+
+def test_photographs_on_disk_take_what_is_read_ahead():
+    scene = scene_of(1200, 800, num_views=40)
+    on_disk = tuple(dataclasses.replace(v, picture=dataclasses.replace(v.picture, is_held=False)) for v in scene.train)
+    system = a2tg.Gaussians2dMcmc()
+    held = run_of(scene, system).peak[1].photographs
+    lazy = run_of(dataclasses.replace(scene, train=on_disk, test=()), system).peak[1].photographs
+    assert held > 39 * 1200 * 800 * 3 > lazy > 1200 * 800 * 3
+
+
+def forecast_with(**sizes):
+    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("photographs", "--downscale"),
+        ("model", "--densify.cap"),
+        ("pixels", "--downscale"),
+        ("program", "--max-memory"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_option_to_change(name, option):
+    found = forecast_with(**{"program": 1e6, "photographs": 1e6, "model": 1e6, "pixels": 1e6, name: 5e9})
+    with pytest.raises(ValueError, match=rf"5.0 GB of memory \(a-gaussians: .*4.0 GB may be used: change {option}"):
+        found.check(4e9)
+    found.check(5.1e9)
+
+
+def test_what_is_told():
+    told = forecast_with(program=0.5e9, photographs=1e9, model=2e6, pixels=0).told(8e9)
+    assert "about 1.5 GB at the peak (a-gaussians: program 500 MB, photographs 1.0 GB, model 2 MB" in told
+    assert "8.0 GB may be used" in told and "about 3 MB in the run folder" in told
+    assert "very roughly 5 min to 20 min" in told
+    assert "time" not in dataclasses.replace(forecast_with(), seconds=0).told(8e9)
+
+
+def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
+    class Device:
+        def memory_stats(self):
+            return {"bytes_limit": 6 * 10**9}
+
+    scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc()
+    monkeypatch.setattr(forecast.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(forecast.jax, "local_devices", lambda: [Device()])
+    found = run_of(scene, system)
+    assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
+    assert found.peak[1].program == 0 and found.seconds == 0
+
+
+def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):
+    monkeypatch.setattr(forecast, "memory_limit", lambda: 123 * MB)
+    assert allowed_memory(None) == 123 * MB and allowed_memory(1.0) == 1
+    assert memory.memory_limit() > MB
+
+
+def test_the_pace_is_told_once_when_enough_was_timed():
+    seconds = iter([10.0, 10.5, 12.5, 13.0, 30.0])
+    pace = Pace(1000, lambda: next(seconds))
+    assert pace.told(10) is None  # those of the compilation
+    assert pace.told(20) is None
+    assert pace.told(60) == "50 ms an iteration, about 0:00:47 for the other 940"
+    assert pace.told(70) is None
