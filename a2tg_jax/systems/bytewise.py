@@ -11,7 +11,7 @@ from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.gaussians import floats_per_gaussian
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.splitting import SplitByGradient
-from a2tg_jax.systems.stage1 import QUICK, QUICK_TEXELS, SMOKE, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
@@ -114,11 +114,10 @@ class Bytewise(System):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        quick = DetailTextureConfig(rate=QUICK_TEXELS)
         return {
             "paper": cls(),
-            "quick": cls(**QUICK, densify=CapConfig(QUICK_CAP), texture=quick),
-            "smoke": cls(**SMOKE, stage2_iterations=120, densify=CapConfig(SMOKE_CAP), texture=quick),
+            "quick": cls(**QUICK, densify=CapConfig(QUICK_CAP)),
+            "smoke": cls(**SMOKE, stage2_iterations=120, densify=CapConfig(SMOKE_CAP)),
         }
 
     def check(self) -> None:
