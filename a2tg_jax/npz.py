@@ -10,12 +10,15 @@ from typing import IO, Any
 
 import numpy as np
 
+from a2tg_jax.checks import shortened
+
 LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
 """What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
 LONGEST_HEADER = 10_000
 """Bytes of what an array says of itself."""
 CHUNK = 1 << 24
+LONGEST_REASON = 200
 
 
 def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, np.ndarray]:
@@ -30,7 +33,7 @@ def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda 
             with zipfile.ZipFile(file) as archive:
                 return _read_arrays(archive, FREE_ROOM + LARGEST_RATIO * Path(path).stat().st_size, is_wanted)
         except Exception as error:  # what a damaged zip raises goes from zlib.error to NotImplementedError
-            raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
+            raise ValueError(shortened(str(error) or type(error).__name__, LONGEST_REASON)) from error
 
 
 def _read_arrays(archive: zipfile.ZipFile, room: int, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:

@@ -12,9 +12,9 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
     {"control_groups"},
-    {"classes", "cores", "memory", "npz", "json_text"},
+    {"classes", "cores", "memory", "json_text"},
     {"numerics", "startup", "bilinear", "checks"},
-    {"sh", "cameras"},
+    {"sh", "cameras", "npz"},
     {"gaussians"},
     {"geometry", "sharing", "gradient_statistics", "budget"},
     {"texture", "tiles", "data"},

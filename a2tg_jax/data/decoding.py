@@ -11,9 +11,12 @@ from contextlib import contextmanager
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.checks import shortened
+
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
 BITS_PER_SAMPLE = 258
 """A tag of TIFF."""
+LONGEST_REASON = 200
 MAX_PIXELS = 128_000_000
 """Width × height of the largest picture that is decoded, which takes up to 1 GB."""
 
@@ -54,7 +57,7 @@ def _opened(path: str | os.PathLike) -> Iterator[Image.Image]:
     except PictureRefused:
         raise
     except Exception as error:  # what a damaged picture raises goes from SyntaxError to RuntimeError and struct.error
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
         raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
 
 

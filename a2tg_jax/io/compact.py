@@ -16,11 +16,19 @@ from typing import Any, Self
 import numpy as np
 
 from a2tg_jax.appearance import Banded
+from a2tg_jax.checks import shortened
 from a2tg_jax.gaussians import check_gaussians
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.coders import Choice, decode, encode
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.model import appearance_from_dict, appearance_to_dict, origin_arrays, origin_of, origin_to_dict
+from a2tg_jax.io.model import (
+    LONGEST_REASON,
+    appearance_from_dict,
+    appearance_to_dict,
+    origin_arrays,
+    origin_of,
+    origin_to_dict,
+)
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
 from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
@@ -130,9 +138,10 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
     try:
         return _decoded(data)
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{where}: the compact scene is damaged or of another version ({error!r})") from error
+        reason = shortened(repr(error))
+        raise ValueError(f"{where}: the compact scene is damaged or of another version ({reason})") from error
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise ValueError(f"{where}: {shortened(str(error), LONGEST_REASON)}") from error
 
 
 def bytes_by_part(data: bytes) -> dict[str, int]:

@@ -28,6 +28,8 @@ from a2tg_jax.origin import Origin
 
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
+LONGEST_REASON = 500
+"""Characters of what is wrong with a file: it may say anything of itself."""
 APPEARANCE, ORIGIN = "appearance/", "origin/"
 """What the names of their arrays begin with."""
 
@@ -75,10 +77,11 @@ def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance
         return _model_of(header, arrays, appearances)
     except KeyError as error:
         raise ValueError(f"{os.fspath(path)}: the model lacks {error}; it is damaged or of another version") from error
-    except (TypeError, IndexError, AttributeError) as error:
-        raise ValueError(f"{os.fspath(path)}: the model is damaged or of another version ({error})") from error
+    except (TypeError, IndexError, AttributeError, OverflowError) as error:
+        reason = shortened(str(error))
+        raise ValueError(f"{os.fspath(path)}: the model is damaged or of another version ({reason})") from error
     except ValueError as error:
-        raise ValueError(f"{os.fspath(path)}: {error}") from error
+        raise ValueError(f"{os.fspath(path)}: {shortened(str(error), LONGEST_REASON)}") from error
 
 
 def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances) -> Model:

@@ -12,6 +12,7 @@ import numpy as np
 from a2tg_jax.checks import shortened
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.model import LONGEST_REASON
 from a2tg_jax.io.structure import check_count, check_rows
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
@@ -120,8 +121,8 @@ def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None)
         reason = shortened(str(error))
         raise ValueError(f"{path}: the checkpoint is damaged or of another version ({reason})") from error
     except ValueError as error:
-        reason = str(error) if str(path) in str(error) else f"{path}: {error}"
-        raise ValueError(reason) from error
+        reason = shortened(str(error), LONGEST_REASON)
+        raise ValueError(reason if str(path) in reason else f"{path}: {reason}") from error
 
 
 def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], where: str, system) -> Checkpoint:

@@ -1,0 +1,342 @@
+"""Changes of files, at random: of bytes under any format, and of what a format holds, sealed again where it is sealed.
+
+Each takes the bytes of a sound file and a generator, and gives other bytes. Imports nothing that it tests.
+"""
+
+import copy
+import io
+import json
+import re
+import struct
+import zipfile
+import zlib
+
+import numpy as np
+import zstandard
+
+INTEGERS = (0, 1, -1, 127, 255, 256, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**64 - 1)
+FLOATS = (np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 1e-300, 1e30, 1e300, -1e300, 1e9)
+WORDS = (
+    "nan", "inf", "-inf", "1e400", "-1", "0", "1e-400", "4294967296", "18446744073709551615", "1" * 401, "many", "",
+    "0x10", "1_0", "\0", "٣", "9" * 40, "-0", "1.5", "[", "{", '"', "..", "../../x", "/etc/passwd", "a" * 5000,
+)  # fmt: skip
+NESTED = 100_000
+START_OF_TEXT = 128
+"""Where the bytes begin in an .npy that NumPy writes."""
+
+
+def of_bytes(data, rng):
+    """One to three changes of bytes, wherever they are."""
+    for _ in range(rng.integers(1, 4)):
+        data = BYTE_CHANGES[rng.integers(len(BYTE_CHANGES))](bytearray(data), rng)
+    return bytes(data)
+
+
+def of_text(data, rng):
+    """One to three changes of words or lines."""
+    text = data.decode("utf-8", "replace")
+    for _ in range(rng.integers(1, 4)):
+        text = TEXT_CHANGES[rng.integers(len(TEXT_CHANGES))](text, rng)
+    return text.encode("utf-8", "surrogatepass")
+
+
+def of_json(data, rng):
+    """One to three changes of what a JSON text says."""
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):  # After an earlier change.
+        return of_text(data, rng)
+    for _ in range(rng.integers(1, 4)):
+        value = changed_value(value, rng)
+    deep = "[" * NESTED + "]" * NESTED
+    return json.dumps(value).replace('"NESTED"', deep).replace('"DIGITS"', "7" * 5000).encode()
+
+
+def of_npz(data, rng):
+    """One or two changes of the arrays of an archive, or of its header, or of what an array says of itself."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    for _ in range(rng.integers(1, 3)):
+        ENTRY_CHANGES[rng.integers(len(ENTRY_CHANGES))](entries, rng)
+    return zipped(entries, zipfile.ZIP_DEFLATED if rng.random() < 0.1 else zipfile.ZIP_STORED)
+
+
+def of_compact(data, rng):
+    """A change of the header of a compact scene, or of its body, under a right checksum."""
+    head = struct.Struct("<8sHIII")
+    magic, version, num_coded, num_text, _ = head.unpack_from(data)
+    rest = data[head.size :]
+    text, body = zstandard.ZstdDecompressor().decompress(rest[:num_coded], num_text), rest[num_coded:]
+    if rng.random() < 0.6:
+        text = of_json(text, rng)
+    else:
+        body = of_bytes(body, rng)
+    coded = zstandard.ZstdCompressor().compress(text)
+    rest = coded + body
+    return head.pack(magic, version, len(coded), len(text), zlib.crc32(rest)) + rest
+
+
+def of_png(data, rng):
+    """A change of a chunk of a PNG, under a right checksum."""
+    chunks, at = [], 8
+    while at < len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + length]))
+        at += 12 + length
+    index = int(rng.integers(len(chunks))) if rng.random() < 0.5 else 0
+    kind, content = chunks[index]
+    chunks[index] = kind, of_bytes(content, rng) if content else content
+    sealed = (
+        struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        for kind, content in chunks
+    )
+    return data[:8] + b"".join(sealed)
+
+
+# Bytes
+
+
+def _place(data, rng, width=1):
+    """Headers stand in front."""
+    most = max(1, len(data) - width)
+    return int(rng.integers(min(most, 200) if rng.random() < 0.5 else most))
+
+
+def _slice(data, rng):
+    start = _place(data, rng)
+    return start, start + int(rng.integers(1, max(2, min(len(data) - start, 64))))
+
+
+def _flip(data, rng):
+    if data:
+        data[_place(data, rng)] ^= 1 << int(rng.integers(8))
+    return data
+
+
+def _set(data, rng):
+    if data:
+        data[_place(data, rng)] = rng.integers(256)
+    return data
+
+
+def _write_integer(data, rng):
+    width, order = int(rng.choice([1, 2, 4, 8])), "<>"[rng.integers(2)]
+    value = int(INTEGERS[rng.integers(len(INTEGERS))]) & (2 ** (8 * width) - 1)
+    at = _place(data, rng, width)
+    data[at : at + width] = value.to_bytes(width, "little" if order == "<" else "big")
+    return data
+
+
+def _write_float(data, rng):
+    kind = "<f" if rng.random() < 0.5 else "<d"
+    with np.errstate(over="ignore"):
+        value = np.float32(FLOATS[rng.integers(len(FLOATS))]) if kind == "<f" else FLOATS[rng.integers(len(FLOATS))]
+    packed = struct.pack(kind, value)
+    at = _place(data, rng, len(packed))
+    data[at : at + len(packed)] = packed
+    return data
+
+
+def _cut(data, rng):
+    return data[: _place(data, rng) if rng.random() < 0.5 else int(rng.integers(len(data) + 1))]
+
+
+def _delete(data, rng):
+    start, end = _slice(data, rng)
+    del data[start:end]
+    return data
+
+
+def _repeat(data, rng):
+    start, end = _slice(data, rng)
+    data[start:start] = data[start:end]
+    return data
+
+
+def _insert(data, rng):
+    at = _place(data, rng)
+    data[at:at] = rng.bytes(int(rng.integers(1, 64)))
+    return data
+
+
+def _fill(data, rng):
+    start, end = _slice(data, rng)
+    data[start:end] = (b"\0" if rng.random() < 0.5 else b"\xff") * len(data[start:end])
+    return data
+
+
+def _swap(data, rng):
+    start, end = _slice(data, rng)
+    other = _place(data, rng, end - start)
+    data[start:end], data[other : other + end - start] = data[other : other + end - start], data[start:end]
+    return data
+
+
+BYTE_CHANGES = (_flip, _set, _write_integer, _write_float, _cut, _delete, _repeat, _insert, _fill, _swap)
+
+
+# Texts
+
+
+def _replace_word(text, rng):
+    words = [*re.finditer(r"[^\s,\[\]{}=\"]+", text)]
+    if not words:
+        return text
+    word = words[rng.integers(len(words))]
+    return text[: word.start()] + str(WORDS[rng.integers(len(WORDS))]) + text[word.end() :]
+
+
+def _change_lines(text, rng):
+    lines = text.split("\n")
+    first, second = (int(rng.integers(len(lines))) for _ in range(2))
+    match rng.integers(4):
+        case 0:
+            del lines[first]
+        case 1:
+            lines.insert(second, lines[first])
+        case 2:
+            lines[first], lines[second] = lines[second], lines[first]
+        case 3:
+            lines = lines[: first + 1]
+    return "\n".join(lines)
+
+
+def _change_text_bytes(text, rng):
+    return of_bytes(text.encode("utf-8", "surrogatepass"), rng).decode("utf-8", "replace")
+
+
+TEXT_CHANGES = (_replace_word, _replace_word, _change_lines, _change_text_bytes)
+
+
+# JSON
+
+
+def strange(rng):
+    """A value of a type that was not asked for."""
+    values = (
+        None, True, False, "", "x", [], {}, [[]], [1, 2], {"a": 1}, 0, -1, 1.5, 1e308, 10**400, 2**64, "NESTED",
+        "DIGITS", float("nan"), float("inf"), "../../x.png", "/etc/passwd", "a" * 10_000, "\0", "\ud800", [0] * 1000,
+        -1e9,
+    )  # fmt: skip
+    return copy.deepcopy(values[rng.integers(len(values))])
+
+
+def changed_value(value, rng):
+    """A value of which one part, anywhere in it, is another."""
+    if isinstance(value, dict | list) and value and rng.random() < 0.85:
+        keys = list(value) if isinstance(value, dict) else range(len(value))
+        key = keys[int(rng.integers(len(keys)))]
+        chance = rng.random()
+        if chance < 0.1:
+            value.pop(key)
+        elif chance < 0.2 and isinstance(value, list):
+            value.insert(int(rng.integers(len(value))), copy.deepcopy(value[key]))
+        elif chance < 0.2:
+            value[f"{key}x"] = value.pop(key)
+        else:
+            value[key] = changed_value(value[key], rng)
+        return value
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    if is_number and rng.random() < 0.4:
+        return value * float(rng.choice([-1, 0, 1e3, 1e-3, 1e30, 1 + 1e-3]))
+    return strange(rng)
+
+
+# Archives
+
+
+def zipped(entries, compression=zipfile.ZIP_STORED):
+    """The bytes of an archive."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def packed(array):
+    """The bytes of an .npy."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=True)
+    return buffer.getvalue()
+
+
+def _any_array(entries, rng):
+    names = [name for name in entries if name != "header.npy"]
+    name = names[int(rng.integers(len(names)))]
+    try:
+        return name, np.load(io.BytesIO(entries[name]), allow_pickle=False)
+    except ValueError:  # After an earlier change.
+        return name, np.zeros(3)
+
+
+def _change_numbers(entries, rng):
+    name, array = _any_array(entries, rng)
+    array = array.copy()
+    if array.size and array.dtype.kind in "iuf":
+        values = FLOATS if array.dtype.kind == "f" else [v for v in INTEGERS if v <= np.iinfo(array.dtype).max]
+        value = values[rng.integers(len(values))]
+        with np.errstate(all="ignore"):
+            number = np.asarray(value).astype(array.dtype)
+        places = slice(None) if rng.random() < 0.2 else rng.integers(array.size, size=int(rng.integers(1, 4)))
+        array.reshape(-1)[places] = number
+    entries[name] = packed(array)
+
+
+def _change_shape(entries, rng):
+    name, array = _any_array(entries, rng)
+    changes = (
+        lambda x: x[1:] if x.ndim else x[None], lambda x: x[..., None], np.ravel, np.transpose, lambda x: x[None],
+        lambda x: x[:0] if x.ndim else x, lambda x: np.concatenate([x, x]) if x.ndim else np.stack([x, x]),
+        lambda x: x.reshape(-1)[:1], lambda x: np.repeat(x, 2, axis=-1) if x.ndim else x,
+    )  # fmt: skip
+    entries[name] = packed(np.asarray(changes[rng.integers(len(changes))](array)))
+
+
+def _change_dtype(entries, rng):
+    name, array = _any_array(entries, rng)
+    kind = str(rng.choice(["f8", "f2", ">f4", "i4", "u1", "i8", "?", "U5", "c8", "O", "S3"]))
+    with np.errstate(all="ignore"):
+        entries[name] = packed(np.nan_to_num(array).astype(kind) if kind in ("i4", "u1", "i8") else array.astype(kind))
+
+
+def _move_entries(entries, rng):
+    names = list(entries)
+    first, second = (names[int(rng.integers(len(names)))] for _ in range(2))
+    match rng.integers(4):
+        case 0:
+            del entries[first]
+        case 1:
+            entries[first], entries[second] = entries[second], entries[first]
+        case 2:
+            entries[f"{first}x"] = entries.pop(first)
+        case 3:
+            entries[f"../../{first}"] = entries[first]
+
+
+def _change_header(entries, rng):
+    if "header.npy" in entries:
+        text = entries["header.npy"][START_OF_TEXT:]  # A short .npy of bytes; what is wrong with it now goes.
+        change = of_json if rng.random() < 0.8 else of_bytes
+        entries["header.npy"] = packed(np.frombuffer(change(text, rng), np.uint8))
+
+
+def _lie(entries, rng):
+    """Another shape or dtype in what an array says of itself, of the same length."""
+    name, _ = _any_array(entries, rng)
+    data = entries[name]
+    length = int.from_bytes(data[8:10], "little")
+    text = of_text(data[10 : 10 + length], rng)[:length].ljust(length)
+    entries[name] = data[:10] + text + data[10 + length :]
+
+
+def _change_entry_bytes(entries, rng):
+    names = list(entries)
+    name = names[int(rng.integers(len(names)))]
+    entries[name] = of_bytes(entries[name], rng)
+
+
+ENTRY_CHANGES = (
+    _change_numbers, _change_numbers, _change_shape, _change_shape, _change_dtype, _move_entries, _change_header,
+    _change_header, _lie, _change_entry_bytes,
+)  # fmt: skip

@@ -1,0 +1,102 @@
+"""Sound files for every reader that is tried with changed ones."""
+
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+from fuzz_readers import PICTURES
+from PIL import Image
+from small_models import some_checkpoint, some_model
+from test_data_colmap import CAMERAS
+from test_data_colmap import write_scene as write_colmap
+from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
+
+import a2tg_jax as a2tg
+from a2tg_jax import save_compact, save_model, save_ply
+from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.folder import write_json as write_run_json
+from a2tg_jax.results.history import write_history
+from a2tg_jax.results.record import RunRecord, SceneSource, write_record
+from a2tg_jax.systems.bbsplat import BBSplat
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.supergaussians import SuperGaussians
+from a2tg_jax.training import History, save_checkpoint
+
+SYSTEMS = {
+    "a2tg": lambda: a2tg.A2tg(sh_degree=0),
+    "bytewise": Bytewise,
+    "supergaussians": lambda: SuperGaussians(sh_degree=0),
+    "bbsplat": lambda: BBSplat(sh_degree=0),
+    "gaussians-2d": lambda: a2tg.Gaussians2d(sh_degree=0),
+}
+NUM_VIEWS = 4
+
+
+def write_seeds(folder: Path) -> None:
+    """A folder for each name of `READERS`."""
+    _write_scenes(folder)
+    _write_pictures(folder / "pictures")
+    for name in ("models", "compact", "checkpoints", "gaussians", "lpips"):
+        (folder / name).mkdir()
+    for name, system in SYSTEMS.items():
+        model = some_model(system())
+        save_model(folder / "models" / f"{name}.npz", model)
+        if name in ("a2tg", "bytewise"):
+            save_compact(folder / "compact" / f"{name}.a2tgz", model)
+        save_checkpoint(folder / "checkpoints" / f"{name}.npz", some_checkpoint(system()))
+    save_ply(folder / "gaussians" / "gaussians.ply", some_model())
+    save_ply(folder / "gaussians" / "third.ply", some_model(), third_scale=True)
+    _write_lpips(folder / "lpips" / "squeeze.npz")
+    _write_run(folder / "run")
+    jax.clear_caches()
+
+
+def _write_scenes(folder: Path) -> None:
+    models = tuple(CAMERAS)
+    for text, name in ((False, "colmap"), (True, "colmap-text")):
+        write_colmap(folder / name, models=models, num_views=NUM_VIEWS, num_points=6, text=text)
+    frames = write_frames(folder / "nerfstudio", NUM_VIEWS)
+    write_ply(folder / "nerfstudio" / "points.ply")
+    write_json(folder / "nerfstudio", frames, ply_file_path="points.ply", k1=0.01, **FOCAL, **SIZE)
+    (folder / "blender").mkdir()
+    write_blender(folder / "blender")
+    (folder / "points").mkdir()
+    for name, encoding in (("ascii", "ascii"), ("little", "binary_little_endian"), ("big", "binary_big_endian")):
+        write_ply(folder / "points" / f"{name}.ply", encoding)
+
+
+def _write_pictures(folder: Path) -> None:
+    folder.mkdir()
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
+    for kind in PICTURES:
+        Image.fromarray(pixels).save(folder / f"picture.{kind}")
+
+
+def _write_lpips(file: Path) -> None:
+    """SqueezeNet's layout, with all weights alike."""
+    shapes = {"features.0": (64, 3, 3)}
+    inputs = 64
+    for index, squeezed in {3: 16, 4: 16, 6: 32, 7: 32, 9: 48, 10: 48, 11: 64, 12: 64}.items():
+        shapes[f"features.{index}.squeeze"] = (squeezed, inputs, 1)
+        shapes[f"features.{index}.expand1x1"] = (4 * squeezed, squeezed, 1)
+        shapes[f"features.{index}.expand3x3"] = (4 * squeezed, squeezed, 3)
+        inputs = 8 * squeezed
+    arrays = {f"{name}.weight": np.ones((out, of, side, side), np.float32) for name, (out, of, side) in shapes.items()}
+    arrays |= {f"{name}.bias": np.zeros(out, np.float32) for name, (out, _, _) in shapes.items()}
+    for index, channels in enumerate([64, 128, 256, 384, 384, 512, 512]):
+        arrays[f"lin{index}.weight"] = np.ones((1, channels, 1, 1), np.float32)
+    np.savez(file, **arrays)
+
+
+def _write_run(folder: Path) -> None:
+    run: RunFolder = create_run(folder)
+    write_record(run, RunRecord(SceneSource(str(folder.parent / "colmap")), "a2tg", a2tg.A2tg.preset("smoke")))
+    quality = {"test": {"psnr": 30.0, "ssim": 0.9}, "train": {"psnr": 31.0, "ssim": 0.9}}
+    write_run_json(run.own(run.metrics), {"scene": "x", "models": {"a2tg-textures": {**quality, "num_gaussians": 12}}})
+    save_model(run.own(run.model("a2tg-textures")), some_model())
+    history = History.empty()
+    for iteration in range(1, 6):
+        history = history.with_point(1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
+    write_history(run.own(folder / "history" / "a.csv"), history)
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)

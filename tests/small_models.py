@@ -1,0 +1,40 @@
+"""A model and a checkpoint of every system, of a dozen Gaussians, made without training."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import a2tg_jax as a2tg
+from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.training import Checkpoint, History
+from a2tg_jax.training.step import initial_state
+
+NUM = 12
+
+
+def some_gaussians():
+    rng = np.random.default_rng(0)
+    return init_from_points(rng.normal(size=(NUM, 3)), rng.uniform(size=(NUM, 3)), sh_degree=0)
+
+
+def some_origin():
+    cameras = [a2tg.Camera(jnp.eye(4), jnp.diag(jnp.asarray([40.0, 40.0, 1.0])), 32, 24) for _ in range(2)]
+    return Origin.of_cameras(cameras, ["a.png", "b.png"])
+
+
+def some_model(system=None):
+    """Of the last stage of a system."""
+    stage = (system or a2tg.A2tg(sh_degree=0)).stages()[-1]
+    gaussians = some_gaussians()
+    params, layout = stage.appearance.allocate(jax.random.key(0), gaussians)
+    return Model(gaussians, params, layout, appearance=stage.appearance, origin=some_origin())
+
+
+def some_checkpoint(system):
+    model = some_model(system)
+    live = Model(model.gaussians, model.params, model.layout, jnp.int32(NUM - 2), appearance=model.appearance)
+    stages = system.stages()
+    history = History.empty().with_point(len(stages), 1, 0.5, 20.0, NUM, 0.1, 2.0)
+    return Checkpoint(system, len(stages) - 1, initial_state(stages[-1], live), history)

@@ -1,0 +1,109 @@
+"""500 changed files go through every reader (tests/fuzz.py tries more), and whoever watches them is watched."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import fuzz
+import numpy as np
+import pytest
+from fuzz_mutate import of_bytes, of_json, of_text
+from fuzz_readers import READERS
+from fuzz_worker import outcome
+
+NUM_CASES = 500
+MOST_MEGABYTES = 300
+
+
+def test_changed_files_are_read_or_refused(tmp_path):
+    counts = fuzz.run(fuzz.Worker(tmp_path), range(NUM_CASES))
+    assert not counts["bad"], counts["bad"]
+    assert sum(sum(found.values()) for found in counts["readers"].values()) == NUM_CASES
+    assert set(counts["readers"]) == {reader.name for reader in READERS}
+    assert counts["most_megabytes"] < MOST_MEGABYTES
+    totals = {kind: sum(found.get(kind, 0) for found in counts["readers"].values()) for kind in fuzz.WELL}
+    assert totals["read"] > 20 and totals["refused"] > 200
+
+
+def raising(error):
+    def read():
+        raise error
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("read", "kind"),
+    [
+        (lambda: None, "read"),
+        (raising(ValueError("x.npz: is damaged")), "refused"),
+        (raising(FileNotFoundError("x.npz")), "refused"),
+        (raising(ValueError("x\ny")), "many lines"),
+        (raising(ValueError("x" * 10_000)), "many lines"),
+        (raising(ValueError()), "many lines"),
+        (raising(KeyError("x")), "other error"),
+        (raising(RecursionError()), "other error"),
+        (raising(SystemExit()), "other error"),
+        (raising(MemoryError()), "memory"),
+        (raising(AssertionError()), "taken for sound"),
+    ],
+)
+def test_outcomes_are_told_apart(read, kind):
+    assert outcome(read)[0] == kind
+
+
+@pytest.mark.parametrize(
+    ("code", "found"),
+    [
+        ("open('inside/x', 'w').close()", ""),
+        ("open('outside', 'w').close()", "wrote open"),
+        ("import os; os.mkdir('outside')", "wrote os.mkdir"),
+        ("import os; os.rename('inside/y', 'inside/z')", ""),
+        ("import os; os.rename('inside/y', 'outside')", "wrote os.rename"),
+        ("import os; os.remove('x')", "wrote os.remove"),
+        ("import subprocess; subprocess.run(['true'])", "ran subprocess.Popen"),
+        ("import pickle; pickle.loads(b'cos\\ngetcwd\\n.')", "ran pickle.find_class"),
+        ("import os; os.system('true')", "ran os.system"),
+    ],
+)
+def test_what_a_reader_does_besides_is_seen(tmp_path, code, found):
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "x").touch()
+    (tmp_path / "inside" / "y").touch()
+    script = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from fuzz_worker import Watch
+watch = Watch(Path("inside"))
+watch.is_on = True
+{code}
+watch.is_on = False
+print("; ".join(watch.taken()))
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert found in done.stdout if found else not done.stdout.strip()
+
+
+def test_a_worker_that_ends_or_does_not_answer_is_started_again(tmp_path):
+    worker = fuzz.Worker(tmp_path)
+    try:
+        worker.start()
+        worker.seconds = 0.0
+        assert worker.ask(0, READERS[0].files[0])["kind"] == "hang"
+        worker.seconds = fuzz.SECONDS_A_CASE
+        worker.start()
+        worker._process.kill()
+        assert worker.ask(0, READERS[0].files[0])["kind"] == "crash -9"
+        worker.start()
+        assert worker.ask(0, READERS[0].files[0])["kind"] == "read"
+    finally:
+        worker.stop()
+
+
+def test_a_case_is_the_same_every_time_and_a_change_changes():
+    text, data = b'{"a": [1, 2.5, {"b": "c"}]}', bytes(range(200))
+    for change, sound in ((of_bytes, data), (of_text, text), (of_json, text)):
+        changed = [change(sound, np.random.default_rng(seed)) for seed in range(30)]
+        assert changed == [change(sound, np.random.default_rng(seed)) for seed in range(30)]
+        assert sum(found != sound for found in changed) > 20
