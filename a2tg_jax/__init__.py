@@ -75,6 +75,7 @@ from a2tg_jax.render import plan_render as plan_render
 from a2tg_jax.render import render_appearance as render_appearance
 from a2tg_jax.render import render_image as render_image
 from a2tg_jax.renderer import Renderer as Renderer
+from a2tg_jax.shrinking import shrink_textures as shrink_textures
 from a2tg_jax.startup import configure_cpu as configure_cpu
 from a2tg_jax.systems.a2tg import A2tg as A2tg
 from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig

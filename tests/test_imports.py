@@ -33,6 +33,7 @@ LAYERS = (
     {"least_squares"},
     {"training"},
     {"systems", "evaluation", "compaction"},
+    {"shrinking"},
     {"results"},
     {"cli"},
 )
