@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import itertools
 import os
 import shlex
 import sys
@@ -14,17 +15,21 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from a2tg_jax.data import Scene, run_sfm
+from a2tg_jax import signals
+from a2tg_jax.arguments import parse
+from a2tg_jax.data import run_sfm
 from a2tg_jax.data.mask_files import AlphaMeaning
-from a2tg_jax.metrics import load_lpips
+from a2tg_jax.results.checks import check_apart, check_weights
+from a2tg_jax.results.claim import opened
 from a2tg_jax.results.compress import compress, compression_text
 from a2tg_jax.results.evaluate_run import evaluate_run
-from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
+from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import (
     DEFAULT_SYSTEM,
     SYNTHETIC,
+    OnNan,
     RunFile,
     RunRecord,
     SceneSource,
@@ -33,15 +38,15 @@ from a2tg_jax.results.record import (
     read_run_file,
     write_record,
 )
-from a2tg_jax.results.summary import summary_text
-from a2tg_jax.results.train_run import train_run
+from a2tg_jax.results.summary import RunResult, summary_text
+from a2tg_jax.results.whole_run import begin_run, go_on
 from a2tg_jax.startup import configure_cpu
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import SYSTEMS, System
-from a2tg_jax.training.start import check_start
 
 BASELINE = "gaussians-2d-mcmc"
+BROKEN_PIPE = 128 + 13
 DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
     stage2_iterations=250,
@@ -77,11 +82,11 @@ class Demo:
     out: Path = Path("runs/demo")
     """Run folder."""
     overwrite: bool = False
-    """Replace an earlier run in that folder."""
+    """Replace an earlier run in that folder; it is kept until the new one has its report."""
 
     def run(self) -> None:
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
-        _begin(record, self.out, overwrite=self.overwrite)
+        _tell(begin_run(record, self.out, overwrite=self.overwrite), self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +100,8 @@ class Train:
       a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
       a2tg train --config runs/fox/run.toml --out runs/again
 
-    A checkpoint is written every tenth of a stage and at least every 500 iterations; the newest two are kept.
+    A checkpoint is written every tenth of a stage, at least every 500 iterations, and when the program is stopped by
+    Ctrl-C or SIGTERM; the newest two are kept until the stage is finished.
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
@@ -118,20 +124,28 @@ class Train:
     """Also train this system, to compare with: with the options above and below, where it has any of that name."""
     baseline: bool = False
     """Short for --compare gaussians-2d-mcmc: the same iterations without textures."""
+    on_nan: OnNan = "stop"
+    """Where a loss or gradient is not finite, or a loss explodes: stop, or restore the newest checkpoint and go on with
+    the views in another order."""
     resume: bool = False
     """Go on from the newest checkpoint in the run folder."""
     overwrite: bool = False
-    """Replace an earlier run in that folder."""
+    """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: Path | None = None
     """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
-        if self.resume:
-            run = self._resumed()
-            _train_and_report(run, read_record(run).scene.load(), self.lpips_weights)
-        else:
-            _begin(self.record, self.out, overwrite=self.overwrite, lpips_weights=self.lpips_weights)
+        weights = self.lpips_weights
+        if not self.resume:
+            _tell(begin_run(self.record, self.out, overwrite=self.overwrite, lpips_weights=weights), self.out)
+            return
+        if self.overwrite:
+            raise ValueError("--resume goes on with a run and --overwrite replaces it: give one of them")
+        check_weights(weights)
+        with opened(self.out) as run:
+            record = self._resumed(run)
+            _tell(go_on(run, record.scene.load(), lpips_weights=weights), self.out)
 
     @property
     def record(self) -> RunRecord:
@@ -139,13 +153,10 @@ class Train:
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
         source = SceneSource(path, self.downscale, self.test_every, self.alpha)
-        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset)
+        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset, self.on_nan)
 
-    def _resumed(self) -> RunFolder:
-        """The existing run folder, after a check that no flag contradicts it."""
-        if self.overwrite:
-            raise ValueError("--resume goes on with a run and --overwrite deletes it: give one of them")
-        run = open_run(self.out)
+    def _resumed(self, run: RunFolder) -> RunRecord:
+        """The record of an existing run, after a check that no flag contradicts it; with what is compared besides."""
         kept, asked = read_record(run), self.record
         if asked.scene.path != kept.scene.path:
             raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
@@ -155,11 +166,11 @@ class Train:
             advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
             raise ValueError(f"--resume takes every number from {run.record}; {advice}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
-        if compare != kept.compare:
-            more = dataclasses.replace(kept, compare=compare)
-            more.check()
-            write_record(run, more)
-        return run
+        record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
+        record.check()
+        if record != kept:
+            write_record(run, record)
+        return record
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,12 +184,13 @@ class Eval:
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
     lpips_weights: Path | None = None
-    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it, what stands in metrics.json of the same models is
+    kept."""
 
     def run(self) -> None:
-        run = open_run(self.folder)
-        print(summary_text(evaluate_run(run, lpips_weights=self.lpips_weights)))
-        print(f"report: {run.report}")
+        check_weights(self.lpips_weights)
+        with opened(self.folder) as run:
+            _tell(evaluate_run(run, lpips_weights=self.lpips_weights), self.folder)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,6 +276,7 @@ class Sfm:
     """Scene folder to make: images and sparse model, ready for a2tg train."""
 
     def run(self) -> None:
+        check_apart(self.out, self.photos)
         found = run_sfm(self.photos, self.out)
         print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
         print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
@@ -282,7 +295,8 @@ def main(argv: Sequence[str] | None = None) -> int:
       argv: arguments without the program's name; None: those of the process.
 
     Returns:
-      The exit code: 0, 2 after a user's error (one line on stderr), 130 when interrupted.
+      The exit code: 0, 2 after a user's error (one line on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after
+      SIGHUP, 141 where nobody reads what is printed.
     """
     name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     if name in ("-h", "--help", "--version"):
@@ -296,15 +310,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # Where the modules of one's own systems are.
-    command: Command | None = None
     try:
-        command = _parse(name, arguments)
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), signals.raised():
             warnings.showwarning = _show_warning
-            command.run()
-    except KeyboardInterrupt:
-        print(f"\na2tg: interrupted{_how_to_go_on(command)}", file=sys.stderr)
-        return 130
+            _parse(name, arguments).run()
+            sys.stdout.flush()
+    except KeyboardInterrupt as stop:
+        stopped = stop if isinstance(stop, signals.Stopped) else signals.Stopped(signals.CTRL_C)
+        print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
+        return stopped.exit_code
+    except BrokenPipeError:
+        # What is left in the buffer is not to be tried again when the process ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
     except (ValueError, OSError) as error:
         if os.environ.get("A2TG_DEBUG"):
             raise
@@ -322,22 +340,23 @@ def _parse(name: str, arguments: list[str]) -> Command:
     """The command that the arguments ask for. System, preset and file are looked at first: they decide the defaults.
 
     Raises:
-      ValueError, FileNotFoundError: if there is no such system, preset or file, or the file is wrong.
+      ValueError, FileNotFoundError: if there is no such system, preset or file, or the file or an argument is wrong.
     """
     kind = COMMANDS[name]
-    options: dict[str, Any] = {"prog": f"a2tg {name}", "description": inspect.getdoc(kind), "args": arguments}
+    options: dict[str, Any] = {"description": inspect.getdoc(kind)}
     if kind is Train:
         options["default"] = _train_defaults(arguments)
-    return tyro.cli(kind, **options)
+    return parse(kind, f"a2tg {name}", arguments, **options)
 
 
 def _train_defaults(arguments: list[str]) -> Train:
     """What is not said on the command line: from the file; when a run is resumed, from its own."""
     path = _value_of("--config", arguments)
     system, preset = _value_of("--system", arguments), _value_of("--preset", arguments)
-    own = RunFolder(Path(_value_of("--out", arguments))).record
-    if not path and "--resume" in arguments and own.is_file() and not preset:
-        path = str(own)
+    out = _value_of("--out", arguments)
+    if out and "--resume" in arguments and "--overwrite" not in arguments:
+        with opened(out) as run:
+            path = path if path or preset else str(run.record)
     file = read_run_file(Path(path)) if path else RunFile()
     if preset or (system and system != file.system):
         # The numbers of the file are those of another preset or system.
@@ -351,13 +370,14 @@ def _train_defaults(arguments: list[str]) -> Train:
         test_every=file.test_every,
         alpha=file.alpha,
         compare=file.compare,
+        on_nan=file.on_nan,
         options=file.chosen(path),
     )
 
 
 def _value_of(flag: str, arguments: list[str]) -> str:
     """The value after `flag`, as "--flag value" or "--flag=value"; empty without it."""
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for word, following in itertools.pairwise([*arguments, ""]):
         if word == flag:
             return following
         if word.startswith(flag + "="):
@@ -365,38 +385,10 @@ def _value_of(flag: str, arguments: list[str]) -> str:
     return ""
 
 
-def _begin(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None = None) -> None:
-    """Makes the run folder, once all about the new run has been checked, and trains."""
-    record.check()
-    if lpips_weights is not None:
-        load_lpips(lpips_weights)
-    check_free(out, overwrite=overwrite)
-    scene = record.scene.load()
-    for system in record.systems.values():
-        check_start(scene, system)
-    run = create_run(out, overwrite=overwrite)
-    write_record(run, record)
-    _train_and_report(run, scene, lpips_weights)
-
-
-def _train_and_report(run: RunFolder, scene: Scene, lpips_weights: Path | None) -> None:
-    """Trains what is not trained yet, evaluates, and says where the report is."""
-    train_run(run, scene)
-    print(summary_text(evaluate_run(run, scene, lpips_weights=lpips_weights)))
-    print(f"report: {run.report}")
-
-
-def _how_to_go_on(command: Command | None) -> str:
-    """Where the newest checkpoint is and how to resume, if the command was training."""
-    if not isinstance(command, Demo | Train):
-        return ""
-    run = RunFolder(command.out)
-    if not run.record.is_file():
-        return ""
-    checkpoints = [path for name in read_record(run).plan.names for path in run.checkpoints(name)]
-    again = shlex.join(["a2tg", "train", "--out", str(command.out), "--resume"])
-    last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
-    return f"; {last}; go on with: {again}"
+def _tell(result: RunResult, folder: Path) -> None:
+    """The figures, and where the report is."""
+    print(summary_text(result))
+    print(f"report: {RunFolder(folder).report}")
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:

@@ -291,11 +291,16 @@ class Mcmc(StepEvent):
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         """The cap, or, where growth from `num` does not reach half of it, what it reaches, rounded up to few shapes."""
+        num = self.grown(num, num_iterations)
+        return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
+
+    def grown(self, num: int, num_iterations: int) -> int:
+        """How many Gaussians it makes of `num` (host)."""
         times = self.times(num_iterations)
         for iteration in range(times.every, times.last + 1, times.every):
             if num < self.cap and iteration >= times.first:
                 num = min(self.cap, max(num + 1, num + num // 20))
-        return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
+        return num
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))

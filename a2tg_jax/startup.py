@@ -84,9 +84,13 @@ def compilation_cache_folder() -> Path:
 
     It lies in `cache_folder()` and may be deleted at any time.
     """
+    return cache_folder() / f"jaxlib-{jax.lib.__version__}-{processor_key()}"
+
+
+def processor_key() -> str:
+    """A short text that processors share for which the same code is made."""
     processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
-    key = hashlib.sha256(processor.encode()).hexdigest()[:12]
-    return cache_folder() / f"jaxlib-{jax.lib.__version__}-{key}"
+    return hashlib.sha256(processor.encode()).hexdigest()[:12]
 
 
 def _processor_features() -> frozenset[str]:

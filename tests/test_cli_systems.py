@@ -37,6 +37,7 @@ def folder(tmp_path_factory):
             interrupting.setattr(train_run_module, "save_checkpoint", save_and_interrupt)
             sizes = ["--downscale", "6", "--initial-gaussians", "60", "--stage1-iterations", "10"]
             codes = [cli.main(["train", "synthetic", *MINE, "--out", "run", *sizes, "--contrast-weight", "0.2"])]
+        shutil.copytree("run", "interrupted")
         left = [path.name for path in RunFolder(Path("run")).checkpoints("Toy-rings")]
         codes.append(cli.main(["train", "--out", "run", "--resume"]))
         yield folder, codes, left
@@ -54,7 +55,7 @@ def inside(folder, monkeypatch):
 def test_interrupted_and_resumed(folder, inside):
     _, codes, left = folder
     assert codes == [130, 0]
-    assert left == ["Toy-rings-000001.npz"]
+    assert left == ["Toy-rings-0000000001.npz"]
     record = tomllib.loads(inside.record.read_text())
     assert (record["system"], record["options"]["contrast_weight"]) == ("my_toy:Toy", 0.2)
     measured = json.loads(inside.metrics.read_text())["models"]["Toy-rings"]
@@ -95,6 +96,7 @@ def test_numbers_edited_between_two_attempts_are_refused(inside, tmp_path, capsy
     copy.record.write_text(copy.record.read_text().replace("contrast_weight = 0.2", "contrast_weight = 0.3"))
     assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2
     assert "Toy-rings.npz was made with another contrast_weight than run.toml says" in capsys.readouterr().err
-    copy.model("Toy-rings").unlink()
-    assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2
-    assert "Toy-rings-000010.npz was made with another contrast_weight than" in capsys.readouterr().err
+    stopped = RunFolder(shutil.copytree("interrupted", tmp_path / "stopped"))
+    shutil.copy(copy.record, stopped.record)
+    assert cli.main(["train", "--out", str(stopped.path), "--resume"]) == 2
+    assert "Toy-rings-0000000001.npz was made with another contrast_weight than" in capsys.readouterr().err

@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
     {"control_groups"},
     {"classes", "cores", "memory", "json_text"},
-    {"numerics", "startup", "bilinear", "checks"},
+    {"numerics", "startup", "bilinear", "checks", "signals", "arguments"},
+    {"machine"},
     {"sh", "cameras", "npz"},
     {"gaussians"},
     {"geometry", "sharing", "gradient_statistics", "budget"},

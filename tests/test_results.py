@@ -19,7 +19,7 @@ from a2tg_jax.metrics import psnr
 from a2tg_jax.paths import smooth_path
 from a2tg_jax.render import render_image
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
-from a2tg_jax.results.folder import create_run, open_run
+from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.pictures import error_picture, largest_gain, resolution_colors, side_by_side, to_uint8
 from a2tg_jax.results.plan import plan_run
@@ -31,6 +31,7 @@ from a2tg_jax.results.record import (
     repeating_command,
     write_record,
 )
+from a2tg_jax.results.replacement import OLD, drop_old, set_aside
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, minutes, per_view_json, summary_text
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.bbsplat import BBSplat
@@ -107,9 +108,9 @@ def test_existing_folder_is_refused(tmp_path):
     (tmp_path / "photo.jpg").touch()
     for overwrite in (False, True):
         with pytest.raises(FileExistsError, match="is not empty and not a run folder"):
-            create_run(tmp_path, overwrite=overwrite)
+            check_free(tmp_path, overwrite=overwrite)
     with pytest.raises(FileExistsError, match="is a file"):
-        create_run(tmp_path / "photo.jpg", overwrite=True)
+        check_free(tmp_path / "photo.jpg", overwrite=True)
 
 
 def test_folder_of_a_run_that_never_began_is_free(tmp_path):
@@ -132,7 +133,9 @@ def test_overwrite_deletes_only_what_runs_write(tmp_path):
         path.touch()
     with open(run.marker, "a", encoding="utf-8") as file:
         file.write("../outside.txt\n\nmodels\n")
-    create_run(run.path, overwrite=True)
+    set_aside(run)
+    assert RunFolder(run.path / OLD).model(NAMES[0]).is_file()
+    drop_old(run)
     left = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert sorted(left) == sorted([*foreign, run.marker])
 
@@ -144,7 +147,7 @@ def test_a_scene_is_never_overwritten(tmp_path):
         path.parent.mkdir(exist_ok=True)
         path.touch()
     with pytest.raises(FileExistsError, match="not a run folder"):
-        create_run(tmp_path, overwrite=True)
+        check_free(tmp_path, overwrite=True)
     assert all(path.is_file() for path in photographs)
 
 

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
-from a2tg_jax.data.scene import Scene
+from a2tg_jax.data.scene import Scene, check_test_every
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 
 
@@ -52,8 +52,7 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
     """The scene as it lies on disk."""
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
-    if test_every < 0 or test_every == 1:
-        raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
+    check_test_every(test_every)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene folder")
     if room is not None and room < 0:

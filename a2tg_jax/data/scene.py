@@ -162,6 +162,12 @@ def assemble_scene(
     )
 
 
+def check_test_every(test_every: int) -> None:
+    """Raises ValueError unless some views are left for training."""
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
+
+
 def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
     """(train, test): shots 0, k, 2k, … of the name-sorted ones are the test; k = 0 keeps none for it."""
     ordered = sorted(shots, key=lambda shot: shot.name)

@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from a2tg_jax.data import patterns
 from a2tg_jax.data.lighting import light
 from a2tg_jax.data.pictures import Picture
-from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth
+from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, check_test_every, every_kth
 from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
 
 TARGET = np.array([0.0, 0.1, 0.45])
@@ -53,6 +53,7 @@ def synthetic_scene(
             f"the synthetic scene needs at least 2 views, 2 points and images of a pixel; "
             f"got num_views={num_views}, num_points={num_points}, {width}x{height}, downscale={downscale}"
         )
+    check_test_every(test_every)
     rng = np.random.default_rng(seed)
     surfaces = light(still_life(rng), rng)
     size = round(width / downscale), round(height / downscale)

@@ -1,6 +1,7 @@
 """A compact file of a run's model, or of any: the smallest that loses little, and a table of what was tried."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -57,16 +58,20 @@ def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -
 
     Raises:
       FileNotFoundError: if there is no such model.
-      ValueError: if a compact file cannot hold it, or nothing loses so little.
+      ValueError: if a compact file cannot hold it, nothing loses so little, or `out` is a folder or the model.
     """
     run = open_run(source) if source.is_dir() else None
     path, settings = (source, RenderSettings()) if run is None else _last_model(run)
     model = load_model(path)
     check_kind(model.appearance)
+    out = path.with_suffix(SUFFIX) if out is None else out
+    if not 0 <= max_loss < math.inf:
+        raise ValueError(f"max_loss must be a number of dB of at least 0; got {max_loss}")
+    if out.is_dir() or out.resolve() == path.resolve():
+        raise ValueError(f"out must be a file other than the model, or a new one; got {out}")
     losses = _losses(model, None if run is None else _scene_of(run), settings)
     trials = measure_choices(model, list(losses.values()))
     chosen = smallest_within(model, list(losses.values()), max_loss, trials)
-    out = path.with_suffix(SUFFIX) if out is None else out
     if run is not None and out == path.with_suffix(SUFFIX):
         run.own(out)
     with replacing(out) as temporary:

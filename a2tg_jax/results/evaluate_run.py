@@ -1,5 +1,6 @@
 """Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.history import read_history
+from a2tg_jax.results.kept_lpips import sha256_of, with_kept_lpips
 from a2tg_jax.results.model_pictures import depth_picture, flight, learned_textures, normal_picture
 from a2tg_jax.results.pictures import (
     ERROR_GAIN,
@@ -46,7 +48,7 @@ def evaluate_run(
     Args:
       run: an opened run folder with one finished stage at least.
       scene: its scene, if it is loaded already.
-      lpips_weights: a weights file for LPIPS; None leaves it out.
+      lpips_weights: a weights file for LPIPS; None keeps what was measured of the same models earlier, if anything.
 
     Raises:
       FileNotFoundError: if no stage is finished, or the scene or the weights are not where they were.
@@ -58,10 +60,15 @@ def evaluate_run(
         raise FileNotFoundError(f"{run.path} has no finished stage yet; go on with a2tg train … --resume")
     scene = scene or record.scene.load()
     measured = {
-        name: _measure(model, scene, plan[name].system, _seconds(run, name), lpips_weights)
+        name: dataclasses.replace(
+            _measure(model, scene, plan[name].system, _seconds(run, name), lpips_weights),
+            sha256=sha256_of(run.model(name)),
+        )
         for name, model in models.items()
     }
-    result = RunResult(scene.name, record, plan, measured)
+    if lpips_weights is None:
+        measured = with_kept_lpips(run, measured)
+    result = RunResult(scene.name, record, plan, measured, is_lpips_kept=lpips_weights is None)
     write_json(run.own(run.metrics), metrics_json(result))
     write_json(run.own(run.per_view), per_view_json(result))
     main = models[result.main]

@@ -3,7 +3,7 @@
     RUN/
       .a2tg-run                  the marker: this program made the folder, and what it wrote there
       run.toml                   the scene, the system with every number, the systems compared: repeats the run
-      checkpoints/NAME-*.npz     the newest two of each stage, to resume from
+      checkpoints/NAME-*.npz     the newest two of the stage that is being trained, to resume from
       models/NAME.npz            what each finished stage left behind, with cameras, world and background
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       metrics.json, per_view.json
@@ -11,6 +11,8 @@
       figures/                   curves, texture resolutions, some textures, depth, normals, a flight
       point_cloud.ply            the Gaussians in the original world
       report.html                all of it on one page
+      diverged/NAME-*.npz        the state before a step whose numbers were not finite, a checkpoint
+      .a2tg-old/                 the run that this one replaces, until this one has its report
 
 NAME is that of a stage, such as `a2tg-gaussians` or `a2tg-textures`: the system's, and the stage's in it (`plan`).
 """
@@ -28,6 +30,7 @@ from a2tg_jax.json_text import parse_json
 
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
+DAMAGED = ".damaged"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +48,10 @@ class RunFolder:
         name = path.relative_to(self.path).as_posix()
         if name not in self.written():
             self.path.mkdir(parents=True, exist_ok=True)
-            is_new = not self.marker.is_file()
             with open(self.marker, "a", encoding="utf-8") as file:
-                file.write(f"{MARKER}\n{name}\n" if is_new else f"{name}\n")
+                file.write(f"{name}\n" if os.fstat(file.fileno()).st_size else f"{MARKER}\n{name}\n")
+                file.flush()
+                os.fsync(file.fileno())
         return path
 
     def written(self) -> list[str]:
@@ -56,12 +60,34 @@ class RunFolder:
         Raises:
           ValueError: if the marker is not this program's.
         """
-        if not self.marker.is_file():
+        if not self.marker.is_file() or not self.marker.stat().st_size:
             return []
-        first, *names = self.marker.read_text(encoding="utf-8").splitlines() or [""]
+        first, *names = self.marker.read_text(encoding="utf-8").splitlines()
         if first != MARKER:
             raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with --out")
         return names
+
+    def own_files(self, names: list[str]) -> list[Path]:
+        """Those of the names that are files within the folder, besides the marker."""
+        paths = [self.path / name for name in dict.fromkeys(names)]
+        root = self.path.resolve()
+        # A line that a crash has cut off may name a folder.
+        return [p for p in paths if p != self.marker and p.is_file() and p.resolve().is_relative_to(root)]
+
+    def clear(self) -> None:
+        """Deletes what runs wrote into their folder, and the folders that are empty then. The marker stays, empty."""
+        for path in self.own_files(self.written()):
+            path.unlink(missing_ok=True)
+            if path.parent != self.path and not any(path.parent.iterdir()):
+                path.parent.rmdir()
+        if self.marker.is_file():
+            os.truncate(self.marker, 0)
+            self.own(self.marker)
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run wrote more into it than its record."""
+        return any(path != self.record for path in self.own_files(self.written()))
 
     @property
     def record(self) -> Path:
@@ -98,18 +124,32 @@ class RunFolder:
         return self.path / "history" / f"{name}.csv"
 
     def checkpoint(self, name: str, iteration: int) -> Path:
-        return self.path / "checkpoints" / f"{name}-{iteration:06d}.npz"
+        return self.path / "checkpoints" / f"{name}-{iteration:010d}.npz"
+
+    def diverged(self, name: str, iteration: int) -> Path:
+        return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
 
     def checkpoints(self, name: str) -> list[Path]:
         """The checkpoints of a stage, oldest first."""
-        pattern = re.compile(re.escape(name) + r"-\d{6,}\.npz")
-        found = (self.path / "checkpoints").glob(f"{glob.escape(name)}-*.npz")
-        return sorted((path for path in found if pattern.fullmatch(path.name)), key=iteration_of)
+        return self._checkpoints(name, "")
+
+    def set_damaged_aside(self, checkpoint: Path) -> Path:
+        """Renames a checkpoint that cannot be read, so that it is not one of the newest any more."""
+        aside = checkpoint.with_name(checkpoint.name + DAMAGED)
+        os.replace(checkpoint, self.own(aside))
+        return aside
 
     def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
-        """Deletes all checkpoints of a stage but the newest `keep`."""
-        for path in self.checkpoints(name)[: -keep or None]:
+        """Deletes all checkpoints of a stage but the newest `keep`; where none is kept, damaged ones too."""
+        old = self.checkpoints(name)[: -keep or None]
+        for path in old if keep else [*old, *self._checkpoints(name, DAMAGED)]:
             path.unlink()
+
+    def _checkpoints(self, name: str, ending: str) -> list[Path]:
+        pattern = re.compile(re.escape(name) + r"-(\d{6,})\.npz" + re.escape(ending))
+        found = (self.path / "checkpoints").glob(f"{glob.escape(name)}-*.npz{ending}")
+        matches = [(match, path) for path in found if (match := pattern.fullmatch(path.name))]
+        return [path for _, path in sorted(matches, key=lambda pair: int(pair[0][1]))]
 
 
 def iteration_of(checkpoint: Path) -> int:
@@ -118,7 +158,7 @@ def iteration_of(checkpoint: Path) -> int:
 
 
 def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """Refuses a folder that `create_run` would refuse, without touching it.
+    """Refuses a folder that a new run must not be made in, without touching it.
 
     Raises:
       FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a
@@ -139,21 +179,17 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
         )
 
 
-def create_run(path: str | os.PathLike, *, overwrite: bool = False) -> RunFolder:
+def create_run(path: str | os.PathLike) -> RunFolder:
     """A new run folder, made with its parents.
 
     Args:
       path: where; an existing folder must be empty, or hold no more than the run.toml of a run that never began.
-      overwrite: delete first what an earlier run wrote there, as its marker lists it, and nothing else. Check all that
-        the new run needs before.
 
     Raises:
       FileExistsError: as `check_free` does.
     """
-    check_free(path, overwrite=overwrite)
+    check_free(path)
     run = RunFolder(Path(path))
-    if overwrite:
-        _clear(run)
     run.path.mkdir(parents=True, exist_ok=True)
     run.own(run.marker)
     return run
@@ -187,16 +223,3 @@ def read_json(path: Path) -> Any:
         return parse_json(path.read_bytes(), allow_nan=True)  # The PSNR of equal images is infinite.
     except ValueError as error:
         raise ValueError(f"{path}: is not valid JSON: {error}") from error
-
-
-def _clear(run: RunFolder) -> None:
-    """Deletes what runs wrote into their folder, and the folders that are empty then; the marker last."""
-    for name in run.written():
-        path = run.path / name
-        is_inside = path.resolve().is_relative_to(run.path.resolve())
-        # A line that a crash has cut off may name a folder.
-        if is_inside and path != run.marker and not path.is_dir():
-            path.unlink(missing_ok=True)
-            if path.parent != run.path and path.parent.is_dir() and not any(path.parent.iterdir()):
-                path.parent.rmdir()
-    run.marker.unlink(missing_ok=True)

@@ -35,8 +35,13 @@ def render_frames(
 
     Raises:
       FileNotFoundError: if that stage is not finished.
-      ValueError: if the run has no such stage, or there are no test views and these are wanted.
+      FileExistsError: if `out` is a file.
+      ValueError: if no frame is wanted, the run has no such stage, or there are no test views and these are wanted.
     """
+    if num_frames < 1:
+        raise ValueError(f"the number of frames must be at least 1; got {num_frames}")
+    if out.exists() and not out.is_dir():
+        raise FileExistsError(f"{out} is a file; choose a folder for the frames with --out")
     plan = read_record(run).plan
     planned = plan[plan.main[-1] if name is None else name]
     if not run.model(planned.name).is_file():

@@ -9,6 +9,7 @@ from a2tg_jax.checks import shortened
 from a2tg_jax.io.model import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, read_json
 from a2tg_jax.results.record import read_record, repeating_command
+from a2tg_jax.results.replacement import old_run
 
 SPLITS = ("test", "train")
 
@@ -31,6 +32,9 @@ def describe_run(run: RunFolder) -> str:
         *(f"model    {name:<{width}}  {_describe_stage(run, name, measured.get(name))}" for name in names),
         f"report   {run.report if run.report.is_file() else 'none yet: a2tg eval writes it'}",
     ]
+    old = old_run(run)
+    if old is not None:
+        lines.append(f"replaces a run that is kept in {old.path} until this one has its report")
     return "\n".join(lines)
 
 

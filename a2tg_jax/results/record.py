@@ -17,7 +17,7 @@ import os
 import shlex
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tomli_w
 
@@ -36,6 +36,8 @@ SYNTHETIC = "synthetic"
 SYNTHETIC_SIZE = (208, 156)
 """Small enough for two cores to train on in minutes."""
 DEFAULT_SYSTEM = "a2tg"
+OnNan = Literal["stop", "restore"]
+"""Training ends with an error, or goes on from the newest checkpoint with the views in another order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +81,8 @@ class RunRecord:
     """Names of the systems that are trained beside it, with its options where they have options of these names."""
     preset: str | None = None
     """What other options of these systems start from."""
+    on_nan: OnNan = "stop"
+    """What is done where a loss or gradient is not finite, or a loss explodes."""
 
     @property
     def systems(self) -> dict[str, System]:
@@ -131,6 +135,7 @@ class RunFile:
     system: str = DEFAULT_SYSTEM
     preset: str | None = None
     compare: tuple[str, ...] = ()
+    on_nan: OnNan = "stop"
     options: dict = dataclasses.field(default_factory=dict)
 
     def chosen(self, where: str) -> System:
@@ -205,6 +210,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "system": record.name,
         **({} if record.preset is None else {"preset": record.preset}),
         "compare": list(record.compare),
+        "on_nan": record.on_nan,
         "options": _without_none(config_to_dict(record.system), start),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n{tomli_w.dumps(table)}"
@@ -222,7 +228,7 @@ def read_record(run: RunFolder) -> RunRecord:
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha)
-    return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare, file.preset)
+    return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare, file.preset, file.on_nan)
 
 
 def repeating_command(run: RunFolder) -> str:

@@ -38,6 +38,8 @@ class ModelResult:
     """That exist in the buffers only."""
     seconds: float
     """Training time of this stage."""
+    sha256: str = ""
+    """Of the model's file."""
 
     @property
     def shown(self) -> Evaluation:
@@ -55,6 +57,8 @@ class RunResult:
     plan: RunPlan
     models: Mapping[str, ModelResult]
     """By the names of their stages."""
+    is_lpips_kept: bool = False
+    """Whether LPIPS is that of an earlier measurement of the same models."""
 
     @property
     def main(self) -> str:
@@ -141,7 +145,8 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
     for block in _blocks(names, columns, width or shutil.get_terminal_size().columns):
         lines += ["", *aligned([names, *block])] if lines else aligned([names, *block])
     if result.lpips_network:
-        lines.append(f"LPIPS with {result.lpips_network}")
+        kept = ", kept from an earlier measurement of the same models" if result.is_lpips_kept else ""
+        lines.append(f"LPIPS with {result.lpips_network}{kept}")
     lines += budget_lines(result)
     lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
     return "\n".join(lines)
@@ -192,10 +197,10 @@ def _model_json(measured: ModelResult) -> dict[str, Any]:
         for split, found in (("train", measured.train), ("test", measured.test))
         if found is not None
     }
-    counts = {
-        name: getattr(measured, name)
-        for name in ("num_gaussians", "num_texels", "num_bytes", "num_published_bytes", "num_padding_bytes", "seconds")
-    }
+    names = (
+        "num_gaussians", "num_texels", "num_bytes", "num_published_bytes", "num_padding_bytes", "seconds", "sha256"
+    )  # fmt: skip
+    counts = {name: getattr(measured, name) for name in names}
     return {**quality, **counts, "frames_per_second": measured.shown.frames_per_second}
 
 

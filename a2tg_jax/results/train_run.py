@@ -1,80 +1,195 @@
 """Training in a run folder: stage after stage, with checkpoints, and from where an earlier attempt stopped."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.model import FORMAT, load_model, save_model
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.machine import this_machine
+from a2tg_jax.results.folder import RunFolder, iteration_of
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
-from a2tg_jax.results.record import read_record
-from a2tg_jax.training import Checkpoint, StageResult, System, fit_stage, load_checkpoint, save_checkpoint
+from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
+from a2tg_jax.results.replacement import set_aside
+from a2tg_jax.training import (
+    Checkpoint,
+    DivergedError,
+    StageResult,
+    System,
+    fit_stage,
+    load_checkpoint,
+    save_checkpoint,
+)
+from a2tg_jax.training.loop import IsStopped, never
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Iterations."""
+MOST_RESTORED = 5
+"""So often a stage goes back because it diverged, each time with another order of the views."""
 
 
-def train_run(run: RunFolder, scene: Scene, *, progress: bool = True) -> None:
+def train_run(
+    run: RunFolder,
+    scene: Scene,
+    *,
+    replaced_by: RunRecord | None = None,
+    progress: bool = True,
+    is_stopped: IsStopped = never,
+) -> None:
     """Trains every stage that the run's record asks for and that is not finished yet.
 
-    A stage goes on from its newest checkpoint. When it ends, its history and its model are written.
+    A stage goes on from its newest checkpoint. When it ends, its history and its model are written, and its checkpoints
+    deleted.
 
     Args:
       run: a run folder with its record.
       scene: the scene of the record.
+      replaced_by: what takes the place of the run that is in the folder, which is set aside at the first checkpoint.
       progress: show a progress bar.
+      is_stopped: asked between steps. Once it says True, there is a checkpoint and a KeyboardInterrupt.
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other numbers
         than the record's.
     """
-    for planned in read_record(run).plan.stages:
-        model = run.model(planned.name)
-        if model.is_file():
-            _check_model(model, planned)
+    record = replaced_by or read_record(run)
+    for planned in record.plan.stages:
+        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped)
+        if replaced_by is not None:
+            result = training.train(replaced_by)
+        elif run.model(planned.name).is_file():
+            _check_model(run.model(planned.name), planned)
+            run.drop_old_checkpoints(planned.name, keep=0)
             continue
-        result = _train_stage(run, planned, scene, progress)
+        else:
+            result = training.train()
+        replaced_by = None
         write_history(run.own(run.history(planned.name)), result.history)
-        save_model(run.own(model), result.model, {"system": system_to_dict(planned.system)})
+        save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
+        run.drop_old_checkpoints(planned.name, keep=0)
 
 
-def _train_stage(run: RunFolder, planned: PlannedStage, scene: Scene, progress: bool) -> StageResult:
-    """One stage from its newest checkpoint, or from its beginning."""
-    name, system = planned.name, planned.system
-    newest = run.checkpoints(name)[-1:]
-    resume = _load_checkpoint(newest[0], planned) if newest else None
+@dataclasses.dataclass(frozen=True)
+class _Training:
+    """One stage in a run folder."""
 
-    def keep(checkpoint: Checkpoint) -> None:
-        save_checkpoint(run.own(run.checkpoint(name, checkpoint.iteration)), checkpoint)
-        run.drop_old_checkpoints(name)
+    run: RunFolder
+    planned: PlannedStage
+    scene: Scene
+    on_nan: OnNan
+    progress: bool
+    is_stopped: IsStopped
 
-    return fit_stage(
-        scene,
-        system,
-        planned.index,
-        None if planned.start is None else load_model(run.model(planned.start)),
-        resume=resume,
-        on_checkpoint=keep,
-        checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, planned.stage.iterations // 10)),
-        progress=progress,
-        title=name,
-    )
+    def train(self, replaced_by: RunRecord | None = None) -> StageResult:
+        """From its newest checkpoint, or from its beginning; again from there where it diverges and may."""
+        keep = _Keeper(self.run, self.planned.name, replaced_by)
+        num_restored = None
+        while True:
+            resume = None if keep.replaced_by is not None else _newest_checkpoint(self.run, self.planned)
+            try:
+                return self._train(resume, keep, num_restored)
+            except DivergedError as error:
+                is_own = keep.replaced_by is None
+                num_restored = self._restored(error, self.run.checkpoints(self.planned.name) if is_own else [])
+
+    def _train(self, resume: Checkpoint | None, keep: "_Keeper", num_restored: int | None) -> StageResult:
+        planned = self.planned
+        return fit_stage(
+            self.scene,
+            planned.system,
+            planned.index,
+            None if planned.start is None else load_model(self.run.model(planned.start)),
+            resume=resume,
+            on_checkpoint=keep,
+            checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, planned.stage.iterations // 10)),
+            progress=self.progress,
+            title=planned.name,
+            is_stopped=self.is_stopped,
+            num_restored=num_restored,
+        )
+
+    def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:
+        """Keeps the state before the step, and says which order of the views is next.
+
+        Raises:
+          ValueError: if the run is to stop then, or has gone back often enough.
+        """
+        before, run = error.checkpoint, self.run
+        path = run.own(run.diverged(self.planned.name, before.iteration))
+        save_checkpoint(path, before)
+        told, count = f"{error}, in {path}", before.num_restored + 1
+        if self.on_nan == "stop":
+            raise ValueError(f"{told}; --on-nan restore would take the views in another order") from error
+        if count > MOST_RESTORED:
+            raise ValueError(f"{told}; the stage went back {MOST_RESTORED} times already") from error
+        back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
+        warnings.warn(
+            f"{told}; the stage goes back to {back} and takes the views in another order ({count} of {MOST_RESTORED} "
+            "times)",
+            stacklevel=4,
+        )
+        return count
 
 
-def _load_checkpoint(path: Path, planned: PlannedStage) -> Checkpoint:
-    """A checkpoint of a stage, after a check that it was made with the same numbers so far."""
-    checkpoint = load_checkpoint(path, system=type(planned.system))
-    _check_unchanged(path, checkpoint.system, planned)
-    return dataclasses.replace(checkpoint, system=planned.system)
+class _Keeper:
+    """Writes checkpoints. The first of a run that replaces another sets that one aside."""
+
+    def __init__(self, run: RunFolder, name: str, replaced_by: RunRecord | None):
+        self.run, self.name, self.replaced_by = run, name, replaced_by
+
+    def __call__(self, checkpoint: Checkpoint) -> None:
+        if self.replaced_by is not None:
+            set_aside(self.run)
+        save_checkpoint(self.run.own(self.run.checkpoint(self.name, checkpoint.iteration)), checkpoint)
+        if self.replaced_by is not None:
+            # Last: a folder without a record is one in which the old run is put back.
+            write_record(self.run, self.replaced_by)
+            self.replaced_by = None
+        self.run.drop_old_checkpoints(self.name)
+
+
+def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
+    """The newest checkpoint of a stage that can be read, after a check that it was made with the same numbers so far.
+
+    Raises:
+      ValueError: if there are some, and none can be read.
+    """
+    paths = run.checkpoints(planned.name)[::-1]
+    damages: list[ValueError] = []
+    for path in paths:
+        try:
+            checkpoint = load_checkpoint(path, system=type(planned.system))
+        except ValueError as error:
+            damages.append(error)
+            continue
+        _check_unchanged(path, checkpoint.system, planned)
+        for damaged, damage in zip(paths, damages, strict=False):
+            aside = run.set_damaged_aside(damaged)
+            warnings.warn(f"{damage}; it is {aside.name} now, and training goes on from {path.name}", stacklevel=2)
+        _warn_of_machine(path, checkpoint)
+        return dataclasses.replace(checkpoint, system=planned.system)
+    if damages:
+        raise ValueError(f"{damages[0]}; there is no other: delete it to train {planned.name} from its beginning")
+    return None
+
+
+def _warn_of_machine(path: Path, checkpoint: Checkpoint) -> None:
+    """Says where a run that goes on will not have the bits of one that was left alone."""
+    told = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
+    if told:
+        warnings.warn(f"{path.name} was made elsewhere, so last bits will differ: {'; '.join(told)}", stacklevel=3)
 
 
 def _check_model(path: Path, planned: PlannedStage) -> None:
     """Refuses a finished model that was made with other numbers than are wanted now."""
-    made = read_archive_header(path, format=FORMAT).get("system")
+    try:
+        made = read_archive_header(path, format=FORMAT).get("system")
+    except ValueError as error:
+        raise ValueError(f"{error}; delete it to train {planned.name} again") from error
     if made is not None:
         _check_unchanged(path, system_from_dict(made, str(path), type(planned.system)), planned)
 

@@ -1,15 +1,18 @@
 """A²TG: plain Gaussians first, then textures that grow where the gradient asks for them (arXiv 2026, §3)."""
 
 import dataclasses
+import math
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Plain, TexelRates, Textured, TextureOptions
-from a2tg_jax.budget import megabytes_of
+from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
 from a2tg_jax.events import Statistic
-from a2tg_jax.mcmc import Noise
+from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.systems.stage1 import (
+    ANY_RATE,
     FLOATS_PER_TEXEL,
+    LOOKUP_RANGES,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -20,7 +23,8 @@ from a2tg_jax.systems.stage1 import (
     growing_stage,
     later_stage,
 )
-from a2tg_jax.training.options import System
+from a2tg_jax.texture import MAX_SIDE
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0}
@@ -74,12 +78,8 @@ class TextureConfig:
         """The upscaling that these numbers ask for.
 
         Raises:
-          ValueError: if the number is missing by which Gaussians are selected, or one is out of range.
+          ValueError: if the number is missing by which Gaussians are selected.
         """
-        if not 1 <= self.cap <= 16:
-            raise ValueError(f"texture.cap must lie in 1..16; got {self.cap}")
-        if not 0 <= self.fraction <= 1:
-            raise ValueError(f"texture.fraction must lie in 0..1; got {self.fraction}")
         if self.select == "budget" and self.budget_mb is None:
             raise ValueError("texture.select is 'budget', so texture.budget_mb must say how many MB (10^6 bytes)")
         if self.select == "threshold" and self.threshold is None:
@@ -115,6 +115,17 @@ class A2tg(System):
     texture: TextureConfig = dataclasses.field(default_factory=TextureConfig)
 
     name: ClassVar[str] = "a2tg"
+    ranges: ClassVar[Ranges] = {
+        "texture.fraction": (0, 1),
+        "texture.threshold": ANY_RATE,
+        "texture.budget_mb": (1e-6, math.inf),
+        "texture.k_a": (1, math.inf),
+        "texture.k_s": ANY_RATE,
+        "texture.cap": (1, MAX_SIDE),
+        "texture.rate": ANY_RATE,
+        "texture.single_rate": ANY_RATE,
+        **LOOKUP_RANGES,
+    }
 
     def stages(self) -> tuple[Stage, ...]:
         lookup, upscale = self.texture.lookup, self._texture().event()
@@ -160,11 +171,15 @@ class A2tg(System):
             ),
         }  # fmt: skip
 
-    def check(self) -> None:
-        super().check()
-        for name in ("rate", "single_rate"):
-            if (getattr(self.texture, name) or 0) < 0:
-                raise ValueError(f"texture.{name} must be at least 0; got {getattr(self.texture, name)}")
-        budget = self.texture.budget_mb
-        if self.texture.select == "budget" and budget is not None and budget <= 0:
-            raise ValueError(f"texture.budget_mb must be positive; got {budget}")
+    def check_number(self, num: int) -> None:
+        """Refuses textures' bytes that the Gaussians of the first stage take up already."""
+        if self._texture().select != "budget" or self.memory_budget is not None or not self.densify.is_enabled:
+            return
+        assert self.texture.budget_mb is not None
+        num = Mcmc(self.densify.cap).grown(num, self.stage1_iterations)
+        needed = num * bytes_per_gaussian(self.sh_degree, FLOATS_PER_TEXEL) / MEGABYTE
+        if self.texture.budget_mb < needed:
+            raise ValueError(
+                f"texture.budget_mb is {self.texture.budget_mb}, but {num:,} Gaussians of one texel each take "
+                f"{needed:.3f} MB: raise it, or lower densify.cap"
+            )

@@ -5,8 +5,8 @@ from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.mcmc import FillingMcmc, Mcmc
-from a2tg_jax.systems.stage1 import FLOATS_PER_TEXEL, QUICK, SMOKE, continued, growing_stage
-from a2tg_jax.training.options import System
+from a2tg_jax.systems.stage1 import ANY_RATE, FLOATS_PER_TEXEL, QUICK, SMOKE, continued, growing_stage
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 
@@ -42,6 +42,11 @@ class BBSplat(System):
     billboard: BillboardConfig = dataclasses.field(default_factory=BillboardConfig)
 
     name: ClassVar[str] = "bbsplat"
+    ranges: ClassVar[Ranges] = {
+        "billboard.side": (2, 16),
+        "billboard.rgb": ANY_RATE,
+        "billboard.alpha": ANY_RATE,
+    }
 
     def stages(self) -> tuple[Stage, ...]:
         if self.densify.cap < 2:

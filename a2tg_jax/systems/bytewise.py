@@ -11,9 +11,9 @@ from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.gaussians import floats_per_gaussian
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.splitting import SplitByGradient
-from a2tg_jax.systems.stage1 import QUICK, SMOKE, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
-from a2tg_jax.training.options import System
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.view_dependence import AdaptDegrees
 
@@ -71,6 +71,7 @@ class Bytewise(System):
     texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
 
     name: ClassVar[str] = "bytewise"
+    ranges: ClassVar[Ranges] = LOOKUP_RANGES
 
     @property
     def initial_sh_degree(self) -> int:

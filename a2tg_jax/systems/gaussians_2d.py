@@ -3,8 +3,17 @@
 import dataclasses
 from typing import ClassVar, Self
 
-from a2tg_jax.systems.stage1 import QUICK, QUICK_CAP, SMOKE, SMOKE_CAP, DensityConfig, continued, growing_stage
-from a2tg_jax.training.options import System
+from a2tg_jax.systems.stage1 import (
+    DENSITY_RANGES,
+    QUICK,
+    QUICK_CAP,
+    SMOKE,
+    SMOKE_CAP,
+    DensityConfig,
+    continued,
+    growing_stage,
+)
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 
@@ -18,6 +27,7 @@ class Gaussians2d(System):
     densify: DensityConfig = dataclasses.field(default_factory=DensityConfig)
 
     name: ClassVar[str] = "gaussians-2d"
+    ranges: ClassVar[Ranges] = DENSITY_RANGES
 
     def stages(self) -> tuple[Stage, ...]:
         first = growing_stage(self, self.stage1_iterations, self.densify.events(self.budget_cap()))

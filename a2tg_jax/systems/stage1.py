@@ -1,6 +1,7 @@
 """The first stage that most systems share: plain Gaussians, densified by Monte Carlo or by adaptive density control."""
 
 import dataclasses
+import math
 from typing import Any
 
 from a2tg_jax.appearance import Appearance, Plain
@@ -23,6 +24,9 @@ SMOKE: dict[str, Any] = {
 }  # fmt: skip
 SMOKE_CAP = 1_000
 FLOATS_PER_TEXEL = 4
+ANY_RATE = (0.0, math.inf)
+LOOKUP_RANGES = {"texture.lookup.max_alpha": (1e-3, 0.9999), "texture.lookup.initial_rgb": (-1.0, 1.0)}
+DENSITY_RANGES = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0.0, 0.99)}
 
 
 @dataclasses.dataclass(frozen=True)

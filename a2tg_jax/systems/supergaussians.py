@@ -6,6 +6,8 @@ from typing import Any, ClassVar, Self
 from a2tg_jax.appearance import MovableKernels
 from a2tg_jax.appearance.movable_kernels import MovableKernelParams
 from a2tg_jax.systems.stage1 import (
+    ANY_RATE,
+    DENSITY_RANGES,
     QUICK,
     QUICK_CAP,
     QUICK_RATES,
@@ -15,7 +17,7 @@ from a2tg_jax.systems.stage1 import (
     continued,
     growing_stage,
 )
-from a2tg_jax.training.options import System
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import LearningRates, Stage
 
 AUTHORS_LOG_SCALES = 3e-3
@@ -48,6 +50,12 @@ class SuperGaussians(System):
     kernels: KernelConfig = dataclasses.field(default_factory=KernelConfig)
 
     name: ClassVar[str] = "supergaussians"
+    ranges: ClassVar[Ranges] = {
+        **DENSITY_RANGES,
+        **dict.fromkeys(
+            ("kernels.colors", "kernels.logit_opacities", "kernels.centers", "kernels.sharpness"), ANY_RATE
+        ),
+    }
 
     def stages(self) -> tuple[Stage, ...]:
         kernels, rates = MovableKernels(), self.kernels.rates()

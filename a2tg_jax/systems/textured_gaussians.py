@@ -5,7 +5,9 @@ from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Textured, TextureOptions
 from a2tg_jax.systems.stage1 import (
+    ANY_RATE,
     FLOATS_PER_TEXEL,
+    LOOKUP_RANGES,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -16,7 +18,7 @@ from a2tg_jax.systems.stage1 import (
     growing_stage,
     later_stage,
 )
-from a2tg_jax.training.options import System
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 
@@ -42,11 +44,14 @@ class TexturedGaussians(System):
     texture: FixedTextureConfig = dataclasses.field(default_factory=FixedTextureConfig)
 
     name: ClassVar[str] = "textured-gaussians"
+    ranges: ClassVar[Ranges] = {
+        "texture.side": (1, 16),
+        "texture.rate": ANY_RATE,
+        **LOOKUP_RANGES,
+    }
 
     def stages(self) -> tuple[Stage, ...]:
         side = self.texture.side
-        if not 1 <= side <= 16:
-            raise ValueError(f"texture.side must lie in 1..16; got {side}")
         textured = Textured((side, side), self.texture.lookup)
         events = self.densify.events(self.budget_cap(FLOATS_PER_TEXEL * side * side))
         first = growing_stage(self, self.stage1_iterations, events)

@@ -12,8 +12,10 @@ import numpy as np
 from a2tg_jax.checks import shortened
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.io.model import LONGEST_REASON
 from a2tg_jax.io.structure import check_count, check_rows
+from a2tg_jax.machine import Machine, this_machine
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
 from a2tg_jax.training.options import System
@@ -73,6 +75,8 @@ class Checkpoint:
     """Of this stage."""
     num_restored: int = 0
     """How often the stage went back to an earlier state because it diverged: which order of the views it follows."""
+    machine: Machine | None = None
+    """On which it was saved; None where that is not known, or it was not yet."""
 
     @property
     def iteration(self) -> int:
@@ -93,6 +97,7 @@ def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
         "stage": checkpoint.stage,
         "is_ahead": [event is not None for event in state.events],
         "num_restored": checkpoint.num_restored,
+        "machine": config_to_dict(this_machine()),
     }
     shown = model.appearance.arrays(model.params, model.layout)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
@@ -146,7 +151,8 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], where:
     check_history(history)
     num_restored = header.get("num_restored", 0)
     check_count("num_restored", num_restored, MOST_RESTORED)
-    return Checkpoint(options, header["stage"], state, history, num_restored)
+    machine = config_from_dict(Machine, header["machine"], "machine") if "machine" in header else None
+    return Checkpoint(options, header["stage"], state, history, num_restored, machine)
 
 
 MOST_RESTORED = 2**31 - 1

@@ -11,6 +11,9 @@ from a2tg_jax.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.stage import LearningRates, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
+Ranges = dict[str, tuple[float, float]]
+"""Smallest and largest value of options by name, both included; None is in any range."""
+
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
@@ -68,6 +71,8 @@ class System:
 
     name: ClassVar[str] = ""
     """What the command line calls the system."""
+    ranges: ClassVar[Ranges] = {}
+    """Of options of its own."""
 
     def __post_init__(self) -> None:
         """A budget is kept as a number of MB, however it was written."""
@@ -148,6 +153,13 @@ class System:
         for stage in stages:
             stage.check()
 
+    def check_number(self, num: int) -> None:
+        """Refuses what cannot be trained from so many Gaussians.
+
+        Raises:
+          ValueError: naming the option, what was wanted and what came.
+        """
+
     def _check_numbers(self) -> None:
         """Refuses numbers out of the range of the options that every system has, and whatever is not finite."""
         numbers = flatten_config(self)
@@ -156,7 +168,7 @@ class System:
                 raise ValueError(f"{name} must be a finite number; got {value}")
             if name.startswith(("rates.", "loss.")) and value < 0:
                 raise ValueError(f"{name} must be at least 0; got {value}")
-        for name, (least, most) in RANGES.items():
+        for name, (least, most) in {**RANGES, **self.ranges}.items():
             if numbers[name] is not None and not least <= numbers[name] <= most:
                 wanted = f"be at least {least}" if most == math.inf else f"lie in {least}..{most}"
                 raise ValueError(f"{name} must {wanted}; got {numbers[name]}")

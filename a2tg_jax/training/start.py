@@ -32,6 +32,7 @@ def check_start(scene: Scene, system: System) -> None:
     first, num = system.stages()[0], min(initial_number(scene, system), len(scene.points))
     for event in first.events:
         event.num_rows(num, first.iterations)
+    system.check_number(num)
 
 
 def initial_number(scene: Scene, system: System) -> int:

@@ -1,0 +1,66 @@
+"""Arguments of a command line as a dataclass, by tyro; whatever is wrong with them becomes one line."""
+
+import contextlib
+import io
+import os
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import tyro
+
+WIDE = "1000"
+"""Columns in which no line of an error is broken."""
+
+
+def parse(kind: type, program: str, arguments: Sequence[str], **options: Any) -> Any:
+    """What the arguments say, an instance of `kind`. Help is printed, and ends in SystemExit.
+
+    Args:
+      kind: a dataclass.
+      program: what the help calls the command.
+      arguments: without the command's name.
+      options: of `tyro.cli`.
+
+    Raises:
+      ValueError: if an argument is missing, unknown or of another type.
+    """
+    errors = io.StringIO()
+    width = contextlib.nullcontext() if {"-h", "--help"} & set(arguments) else _columns(WIDE)
+    try:
+        with width, contextlib.redirect_stderr(errors):
+            return tyro.cli(kind, prog=program, args=arguments, **options)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise ValueError(f"{one_line(errors.getvalue())} ({program} --help tells what there is)") from None
+
+
+def one_line(box: str) -> str:
+    """What an error of tyro's says first, and the names that it suggests; without title, frame and colours."""
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╰╮╯ ") for line in box.splitlines()]
+    parts: list[list[str]] = [[]]
+    for line in [line for line in lines if line][1:]:
+        if line.strip("─-"):
+            parts[-1].append(line)
+        else:
+            parts.append([])
+    said, *others = [part for part in parts if part] or [[box]]
+    suggested = [part for part in others if part[0].startswith("Perhaps")]
+    flags = [re.split(r"[ ,]", line)[0] for part in suggested for line in part if line.startswith("--")]
+    told = " ".join(" ".join(said).split()).rstrip(".")
+    return f"{told}; did you mean {' or '.join(flags)}?" if flags else told
+
+
+@contextlib.contextmanager
+def _columns(width: str) -> Iterator[None]:
+    """The environment says a width of the terminal for a while."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = width
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before

@@ -1,0 +1,41 @@
+"""LPIPS that stands in a run folder already, for a measurement without its weights."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from a2tg_jax.evaluation import Evaluation
+from a2tg_jax.results.folder import RunFolder, read_json
+from a2tg_jax.results.summary import ModelResult
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
+    """The figures, with the LPIPS of metrics.json for each model whose file is the one that this was measured on."""
+    try:
+        metrics, per_view = read_json(run.metrics), read_json(run.per_view)
+        network, models = metrics["lpips_network"], metrics["models"]
+        unchanged = {name for name, found in measured.items() if models.get(name, {}).get("sha256") == found.sha256}
+        return {
+            name: _with_lpips(found, per_view[name], network) if network and name in unchanged else found
+            for name, found in measured.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return dict(measured)  # none was measured, or it cannot be read
+
+
+def _with_lpips(found: ModelResult, kept: Mapping[str, Any], network: str) -> ModelResult:
+    test = None if found.test is None else _merged(found.test, kept["test"], network)
+    return dataclasses.replace(found, train=_merged(found.train, kept["train"], network), test=test)
+
+
+def _merged(found: Evaluation, kept: Mapping[str, Any], network: str) -> Evaluation:
+    per_view = tuple(dataclasses.replace(view, lpips=float(kept[view.name]["lpips"])) for view in found.per_view)
+    return dataclasses.replace(found, per_view=per_view, lpips_network=network)

@@ -1,0 +1,88 @@
+"""A run from its checks to its report: begun, or gone on with, by one process at a time."""
+
+import contextlib
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+from a2tg_jax import signals
+from a2tg_jax.data import Scene
+from a2tg_jax.results.checks import check_new_run
+from a2tg_jax.results.claim import claimed
+from a2tg_jax.results.evaluate_run import evaluate_run
+from a2tg_jax.results.folder import RunFolder, check_free, create_run
+from a2tg_jax.results.record import RunRecord, read_record, write_record
+from a2tg_jax.results.replacement import drop_old
+from a2tg_jax.results.summary import RunResult
+from a2tg_jax.results.train_run import train_run
+
+
+def begin_run(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None = None) -> RunResult:
+    """Trains and measures a new run, once all about it has been checked.
+
+    Args:
+      record: what is trained.
+      out: the run folder; made if it is not there.
+      overwrite: the run that is in the folder is replaced, once this one has a checkpoint, and deleted once this one
+        has its report.
+      lpips_weights: a weights file for LPIPS; None leaves it out.
+
+    Raises:
+      ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
+      Stopped: if the process is asked to end; its `advice` tells how to go on.
+    """
+    scene = check_new_run(record, out, overwrite=overwrite, lpips_weights=lpips_weights)
+    run = RunFolder(out)
+    with claimed(run):
+        check_free(out, overwrite=overwrite)  # Another process may have been here meanwhile.
+        if overwrite and run.is_begun:
+            return go_on(run, scene, lpips_weights=lpips_weights, replaced_by=record)
+        write_record(create_run(out), record)
+        return go_on(run, scene, lpips_weights=lpips_weights)
+
+
+def go_on(
+    run: RunFolder, scene: Scene, *, lpips_weights: Path | None = None, replaced_by: RunRecord | None = None
+) -> RunResult:
+    """Trains what is not trained yet, and measures. Arguments as of `train_run`, errors as of `begin_run`."""
+    with _advised(run, is_replacing=replaced_by is not None):
+        with signals.noted() as is_stopped:
+            train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped)
+        result = evaluate_run(run, scene, lpips_weights=lpips_weights)
+    drop_old(run)
+    return result
+
+
+@contextlib.contextmanager
+def _advised(run: RunFolder, *, is_replacing: bool) -> Iterator[None]:
+    """Whatever ends the training, how to go on is said."""
+    before = _identity(run.record) if is_replacing else None
+
+    def advice() -> str:
+        is_untouched = is_replacing and run.record.is_file() and _identity(run.record) == before
+        return f"the run that was in {run.path} is untouched" if is_untouched else how_to_go_on(run)
+
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
+        raise signals.Stopped(number, advice()) from None
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{error}; {advice()}") from error
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """What another file in its place would not have."""
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
+
+
+def how_to_go_on(run: RunFolder) -> str:
+    """Where the newest checkpoint is, and how to resume."""
+    names = read_record(run).plan.names
+    checkpoints = [path for name in names for path in run.checkpoints(name)]
+    finished = [run.model(name) for name in names if run.model(name).is_file()]
+    last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
+    if finished and not checkpoints:
+        last = f"the last model is {finished[-1]}"
+    return f"{last}; go on with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"

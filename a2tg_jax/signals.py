@@ -1,0 +1,75 @@
+"""Ctrl-C, SIGTERM and SIGHUP: what a program does that is asked to end."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+CTRL_C = signal.SIGINT
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class Stopped(KeyboardInterrupt):
+    """The process was asked to end."""
+
+    def __init__(self, number: int, advice: str = ""):
+        """Args:
+        number: of the signal.
+        advice: how to go on with what was stopped.
+        """
+        super().__init__(signal.Signals(number).name)
+        self.number, self.advice = int(number), advice
+
+    @property
+    def exit_code(self) -> int:
+        """128 and the number of the signal, as shells say it: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
+        return 128 + self.number
+
+
+@contextlib.contextmanager
+def raised() -> Iterator[None]:
+    """Meanwhile SIGTERM and SIGHUP raise `Stopped`, as Ctrl-C raises KeyboardInterrupt."""
+
+    def stop(number: int, frame: object) -> None:
+        raise Stopped(number)
+
+    with _handled_by(stop, ENDING):
+        yield
+
+
+@contextlib.contextmanager
+def noted() -> Iterator[Callable[[], bool]]:
+    """Meanwhile the first signal is noted, and the second raises `Stopped`.
+
+    Yields a function that tells whether there was one. In the end any becomes a `Stopped`.
+    """
+    numbers: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        numbers.append(number)
+        if len(numbers) > 1:
+            raise Stopped(number)
+
+    with _handled_by(note, (CTRL_C, *ENDING)):
+        try:
+            yield lambda: bool(numbers)
+        except KeyboardInterrupt:
+            raise Stopped(numbers[-1] if numbers else CTRL_C) from None
+    if numbers:
+        raise Stopped(numbers[-1])
+
+
+@contextlib.contextmanager
+def _handled_by(handler: Callable, numbers: tuple[int, ...]) -> Iterator[None]:
+    """Signals that are ignored, as nohup ignores SIGHUP, stay so; and all do outside the main thread."""
+    before: dict[int, object] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in numbers}
+        before = {number: old for number, old in before.items() if old not in (signal.SIG_IGN, None)}
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+"""Mistakes on the command line: each is one line on stderr and exit code 2, before anything is trained or written."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from a2tg_jax import cli, save_model, synthetic_scene
+from a2tg_jax.origin import BLACK, Origin
+from a2tg_jax.results import whole_run
+from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.record import RunRecord, SceneSource, write_record
+from a2tg_jax.systems.a2tg import A2tg
+from a2tg_jax.training.start import initial_model
+
+SYNTHETIC = "train synthetic --out new"
+MISTAKES = {
+    # Commands, flags and their values
+    "trian": "there is no command 'trian'",
+    "--verbose": "there is no command '--verbose'",
+    "train": "Missing from a2tg train",
+    "train synthetic": "--out PATH",
+    "train --out new": "SCENE",
+    "train synthetic more --out new": "Unrecognized options: more",
+    f"{SYNTHETIC} --texture.fracton 0.5": "did you mean --texture.fraction",
+    f"{SYNTHETIC} --seed": "Missing value for argument '--seed'",
+    f"{SYNTHETIC} --seed 0.5": "'0.5'",
+    f"{SYNTHETIC} --batch-size two": "'two'",
+    f"{SYNTHETIC} --texture.select best": "Expected one of ('fraction', 'threshold', 'budget')",
+    f"{SYNTHETIC} --texture.upscale-at soon": "--texture.upscale-at",
+    f"{SYNTHETIC} --on-nan hope": "Expected one of ('stop', 'restore')",
+    f"{SYNTHETIC} --system b2tg": "there is no system 'b2tg'",
+    f"{SYNTHETIC} --system os:sep": "'os:sep' is no system",
+    f"{SYNTHETIC} --preset fast": "presets paper",
+    f"{SYNTHETIC} --compare b2tg": "there is no system 'b2tg'",
+    f"{SYNTHETIC} --system gaussians-2d --texture.cap 4": "Unrecognized options: --texture.cap",
+    # Numbers out of range
+    f"{SYNTHETIC} --batch-size 0": "batch_size must be at least 1",
+    f"{SYNTHETIC} --seed -1": "seed must lie in",
+    f"{SYNTHETIC} --rates.means nan": "rates.means must be a finite number",
+    f"{SYNTHETIC} --rates.quats -1": "rates.quats must be at least 0",
+    f"{SYNTHETIC} --loss.ssim-weight inf": "loss.ssim_weight must be a finite number",
+    f"{SYNTHETIC} --texture.fraction 2": "texture.fraction must lie in 0..1",
+    f"{SYNTHETIC} --texture.rate -0.1": "texture.rate must be at least 0",
+    f"{SYNTHETIC} --texture.cap 32": "texture.cap must lie in 1..16",
+    f"{SYNTHETIC} --texture.upscale-at 0.5 0.2": "texture.upscale_at must be ascending",
+    f"{SYNTHETIC} --stage1-iterations 0": "at least 1 iteration",
+    f"{SYNTHETIC} --densify.cap 1": "densify.cap must be at least 2",
+    f"{SYNTHETIC} --system gaussians-2d --densify.threshold -1": "densify.threshold must be at least 0",
+    f"{SYNTHETIC} --system bbsplat --billboard.side 1": "billboard.side must lie in 2..16",
+    f"{SYNTHETIC} --system supergaussians --kernels.colors -1": "kernels.colors must be at least 0",
+    f"{SYNTHETIC} --system textured-gaussians --texture.side 17": "texture.side must lie in 1..16",
+    f"{SYNTHETIC} --memory-budget 5XB": "memory_budget must be a number of MB",
+    f"{SYNTHETIC} --memory-budget 100B": "memory_budget must be a number of MB",
+    f"{SYNTHETIC} --memory-budget 0.0003": "there must be 2",
+    f"{SYNTHETIC} --memory-budget 1kB --initial-gaussians 800": "fewer than training starts from",
+    f"{SYNTHETIC} --texture.select budget --texture.budget-mb 0.001": "Gaussians of one texel each take",
+    f"{SYNTHETIC} --texture.select budget": "budget_mb must say",
+    f"{SYNTHETIC} --downscale 0": "downscale",
+    f"{SYNTHETIC} --test-every -1": "test_every",
+    # Places and files
+    "train nowhere --out new": "nowhere",
+    "train photos --out new": "photos",
+    "train scene --out scene/run": "lie in each other",
+    f"{SYNTHETIC[:-3]}photo.png": "photo.png is a file",
+    f"{SYNTHETIC[:-3]}photos": "not a run folder",
+    f"{SYNTHETIC[:-3]}run": "add --resume to go on with it, --overwrite",
+    "train --out nowhere --resume": "is not a run folder",
+    f"{SYNTHETIC[:-3]}run --resume --overwrite": "give one of them",
+    f"{SYNTHETIC[:-3]}run --resume --seed 5": "leave out --seed",
+    "train photos --out run --resume": "was trained on synthetic",
+    f"{SYNTHETIC} --lpips-weights photo.png": "photo.png",
+    f"{SYNTHETIC} --config nowhere.toml": "no such configuration file",
+    "train --config bad.toml --out new": "is not valid TOML",
+    "train --config wrong.toml --out new": "did you mean scene",
+    "demo --out photos": "not a run folder",
+    "eval run --lpips-weights nowhere.npz": "nowhere.npz",
+    "eval photos": "is not a run folder",
+    "eval run": "no finished stage",
+    "info": "Missing from a2tg info",
+    "info photo.png": "is not a run folder",
+    "render done --frames -3": "number of frames must be at least 1",
+    "render done --path round": "Expected one of ('test', 'smooth')",
+    "render done --model stage2": "the run has the models",
+    "render done --out photo.png": "photo.png",
+    "render run": "has no finished",
+    "compress nowhere.npz": "nowhere.npz",
+    "compress photo.png": "photo.png",
+    "compress done --max-loss nan": "max_loss",
+    "compress done --max-loss -1": "max_loss",
+    "compress done --out photos": "other than the model",
+    "sfm nowhere new": "nowhere",
+    "sfm photos new": "holds 1 photographs",
+    "sfm many many/scene": "lie in each other",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a run that never began, one that is finished, a scene, photographs and broken files."""
+    place = tmp_path_factory.mktemp("mistakes")
+    scene = synthetic_scene(num_views=8, width=40, height=30, num_points=60)
+    system = A2tg(stage1_iterations=1, stage2_iterations=1, initial_gaussians=50)
+    record = RunRecord(SceneSource("synthetic"), "a2tg", system)
+    for name in ("run", "done"):
+        run = create_run(place / name)
+        write_record(run, record)
+        run.own(run.checkpoint("a2tg-gaussians", 1)).parent.mkdir()
+        run.checkpoint("a2tg-gaussians", 1).write_bytes(b"")
+    model = dataclasses.replace(initial_model(scene, system), origin=Origin.of_scene(scene, BLACK))
+    save_model(run.own(run.model("a2tg-textures")), model)
+    for name in ("photos/a", "scene/a", "photo", "many/a", "many/b", "many/c"):
+        (place / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(place / f"{name}.png")
+    (place / "scene/transforms.json").write_text(json.dumps({"frames": []}))
+    (place / "bad.toml").write_text("scene = {")
+    (place / "wrong.toml").write_text('scenes = "synthetic"')
+    return place
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, place, mistake):
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    monkeypatch.setattr(whole_run, "train_run", lambda *_, **__: pytest.fail("training began"))
+    before = sorted(place.rglob("*"))
+    code = cli.main(mistake.split())
+    printed = capsys.readouterr()
+    assert code == 2 and printed.out == ""
+    assert printed.err.startswith("a2tg: error: ") and printed.err.count("\n") == 1
+    assert MISTAKES[mistake] in printed.err and len(printed.err) < 600
+    assert sorted(place.rglob("*")) == before

@@ -1,0 +1,469 @@
+"""Run folders through everything that ends a process or damages a file; training itself only where it takes part."""
+
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from a2tg_jax import Change, StepEvent, cli, event, signals
+from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.model import load_model
+from a2tg_jax.machine import this_machine
+from a2tg_jax.results import checks, evaluate_run, whole_run
+from a2tg_jax.results import train_run as train_run_module
+from a2tg_jax.results.checks import check_apart
+from a2tg_jax.results.claim import claimed, opened
+from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.kept_lpips import sha256_of
+from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
+from a2tg_jax.results.replacement import OLD, old_run, set_aside, undo_unfinished
+from a2tg_jax.results.train_run import MOST_RESTORED, train_run
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import DivergedError, find_system, load_checkpoint, save_checkpoint
+from a2tg_jax.training.batches import BatchOrder
+from a2tg_jax.training.loop import StageRun
+
+SIZES = {"initial_gaussians": 60, "densify": McmcConfig(cap=60)}
+SOURCE = SceneSource("synthetic", downscale=6)
+RECORD = RunRecord(SOURCE, "gaussians-2d-mcmc", Gaussians2dMcmc(stage1_iterations=20, **SIZES))
+NAME = "gaussians-2d-mcmc-gaussians"
+TRAIN = [
+    *("train", "synthetic", "--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "20"),
+    *("--initial-gaussians", "60", "--densify.cap", "60"),
+]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return SOURCE.load()
+
+
+@pytest.fixture(autouse=True)
+def untouched_jax(monkeypatch):
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+
+
+def filled(path) -> RunFolder:
+    """A folder with a few files of a run, and one of somebody else."""
+    run = create_run(path)
+    write_record(run, RECORD)
+    for file in (run.model(NAME), run.checkpoint(NAME, 20), run.report):
+        file.parent.mkdir(exist_ok=True)
+        run.own(file).write_text(f"old {file.name}")
+    (run.path / "models" / "mine.txt").write_text("mine")
+    return run
+
+
+def files_of(run: RunFolder) -> dict[str, bytes]:
+    """The files of a folder and what is in them, the marker left out."""
+    paths = [path for path in run.path.rglob("*") if path.is_file() and path != run.marker]
+    return {path.relative_to(run.path).as_posix(): path.read_bytes() for path in paths}
+
+
+# Files
+
+
+def test_files_are_on_the_disk_before_they_are_renamed(tmp_path, monkeypatch):
+    done = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: (done.append("flush"), fsync(number)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("rename"), replace(*paths)))
+    with replacing(tmp_path / "file") as temporary:
+        temporary.write_text("whole")
+    assert done == ["flush", "rename", "flush"] and (tmp_path / "file").read_text() == "whole"
+
+
+def test_left_over_partial_files_go_and_others_stay(tmp_path):
+    run = filled(tmp_path / "run")
+    left = run.checkpoint(NAME, 20).with_name(f".{run.checkpoint(NAME, 20).name}.123.partial")
+    others = [run.path / ".notes.txt.123.partial", run.path / "models" / ".mine.npz.1.partial"]
+    for path in (left, *others):
+        path.write_text("half")
+    with opened(run.path):
+        assert not left.exists() and all(path.is_file() for path in others)
+
+
+def test_names_of_checkpoints_sort_by_iteration(tmp_path):
+    run = RunFolder(tmp_path)
+    names = [run.checkpoint(NAME, iteration).name for iteration in (9, 10, 999_999, 1_000_000, 2**31 - 1)]
+    assert names == sorted(names)
+
+
+# Two processes
+
+
+def hold(path, is_held, may_end):
+    with claimed(RunFolder(path)):
+        is_held.set()
+        may_end.wait(60)
+
+
+def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path, capsys):
+    run = filled(tmp_path / "run")
+    context = multiprocessing.get_context("spawn")
+    is_held, may_end = context.Event(), context.Event()
+    process = context.Process(target=hold, args=(run.path, is_held, may_end))
+    process.start()
+    assert is_held.wait(60)
+    for command in (["eval", str(run.path)], ["train", "--out", str(run.path), "--resume"]):
+        assert cli.main(command) == 2
+        assert "another process is training or measuring" in capsys.readouterr().err
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with opened(run.path):
+        assert run.report.is_file()
+
+
+# Replacement
+
+
+def test_the_old_run_waits_until_the_new_one_has_its_report(tmp_path, capsys):
+    out = tmp_path / "run"
+    old = files_of(filled(out))
+    assert cli.main([*TRAIN, "--out", str(out), "--overwrite"]) == 0
+    run = RunFolder(out)
+    assert old_run(run) is None and run.report.read_text() != "old report.html"
+    assert (out / "models" / "mine.txt").read_text() == "mine"
+    assert load_model(run.model(NAME)).num == 60 and not run.checkpoints(NAME)
+    assert set(old) - set(files_of(run)) == {f"checkpoints/{NAME}-0000000020.npz"}
+
+
+@pytest.mark.parametrize("error", [ValueError("no room"), KeyboardInterrupt()])
+def test_a_run_without_a_checkpoint_replaces_nothing(tmp_path, monkeypatch, capsys, error):
+    run = filled(tmp_path / "run")
+    before = files_of(run)
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(train_run_module, "fit_stage", fail)
+    assert cli.main([*TRAIN, "--out", str(run.path), "--overwrite"]) in (2, 130)
+    assert files_of(run) == before
+    assert f"the run that was in {run.path} is untouched" in capsys.readouterr().err
+
+
+def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, monkeypatch, capsys):
+    run = filled(tmp_path / "run")
+    save = train_run_module.save_checkpoint
+
+    def save_and_stop(path, checkpoint):
+        save(path, checkpoint)
+        if checkpoint.iteration == 4:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train_run_module, "save_checkpoint", save_and_stop)
+        assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
+    assert f"{NAME}-0000000004.npz; go on with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
+    kept = old_run(run)
+    assert kept is not None and kept.report.read_text() == "old report.html" and read_record(kept) == RECORD
+    assert cli.main(["info", str(run.path)]) == 0
+    assert f"kept in {kept.path}" in capsys.readouterr().out
+    assert cli.main(["train", "--out", str(run.path), "--resume"]) == 0
+    assert old_run(run) is None and read_record(run).system.seed == 5
+
+
+@pytest.mark.parametrize("after", range(7))
+def test_a_process_killed_while_it_sets_a_run_aside_loses_nothing(tmp_path, monkeypatch, after):
+    """Killed after any of its renamings; the next process puts all of it back."""
+    run = filled(tmp_path / "run")
+    before, left, replace = files_of(run), iter(range(after)), os.replace
+
+    def rename(*paths):
+        if next(left, None) is None:
+            raise SystemExit
+        replace(*paths)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", rename)
+        with contextlib.suppress(SystemExit):
+            set_aside(run)
+    undo_unfinished(run)
+    assert files_of(run) == before
+
+
+def test_an_unfinished_replacement_never_costs_the_finished_run(tmp_path):
+    run = filled(tmp_path / "run")
+    set_aside(run)
+    write_record(run, dataclasses.replace(RECORD, preset="quick"))
+    set_aside(run)
+    assert RunFolder(run.path / OLD).report.read_text() == "old report.html" and not run.record.exists()
+
+
+# Before training
+
+
+def test_the_run_folder_and_the_scene_lie_apart(tmp_path):
+    for out, scene in ((tmp_path / "scene/run", tmp_path / "scene"), (tmp_path, tmp_path / "scene")):
+        with pytest.raises(ValueError, match="lie in each other"):
+            check_apart(out, scene)
+    check_apart(tmp_path / "scene-run", tmp_path / "scene")
+
+
+def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
+    usage = shutil.disk_usage(tmp_path)._replace(free=50_000)
+    monkeypatch.setattr(checks.shutil, "disk_usage", lambda path: usage)
+    assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
+    assert "GB at least for models and checkpoints" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+# Checkpoints
+
+
+@pytest.fixture(scope="module")
+def stopped(scene, tmp_path_factory):
+    """A run with two checkpoints, stopped at iteration 8, and what it would have become."""
+    folder = tmp_path_factory.mktemp("stopped")
+    save = train_run_module.save_checkpoint
+
+    def save_and_stop(path, checkpoint):
+        save(path, checkpoint)
+        if checkpoint.iteration == 8:
+            raise KeyboardInterrupt
+
+    for name, function in (("whole", save), ("run", save_and_stop)):
+        run = create_run(folder / name)
+        write_record(run, RECORD)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(train_run_module, "save_checkpoint", function)
+            with contextlib.suppress(KeyboardInterrupt):
+                train_run(run, scene, progress=False)
+    return RunFolder(folder / "run"), load_model(RunFolder(folder / "whole").model(NAME))
+
+
+def assert_same(run, whole):
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        found, wanted = (getattr(model.gaussians, name) for model in (load_model(run.model(NAME)), whole))
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_damaged_newest_checkpoint_is_said_and_the_one_before_used(scene, stopped, tmp_path):
+    run, whole = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run")), stopped[1]
+    *_, older, newest = run.checkpoints(NAME)
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.warns(UserWarning, match=rf"is damaged.* goes on from {older.name}"):
+        train_run(run, scene, progress=False)
+    assert_same(run, whole)
+    assert not list((run.path / "checkpoints").glob("*"))
+
+
+def test_without_a_checkpoint_that_can_be_read_nothing_begins_anew(scene, stopped, tmp_path):
+    run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
+    for path in run.checkpoints(NAME):
+        path.write_bytes(b"")
+    with pytest.raises(ValueError, match=rf"there is no other: delete it to train {NAME} from its beginning"):
+        train_run(run, scene, progress=False)
+    assert run.checkpoints(NAME)
+
+
+def test_other_threads_are_said(scene, stopped, tmp_path, monkeypatch):
+    run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
+    threads = this_machine().threads
+    monkeypatch.setenv("A2TG_NUM_THREADS", str(threads + 1))
+    with pytest.warns(UserWarning, match=rf"there are {threads + 1} threads and were {threads} \(A2TG_NUM_THREADS="):
+        train_run(run, scene, progress=False)
+
+
+# LPIPS
+
+
+def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, monkeypatch):
+    run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
+    train_run(run, scene, progress=False)
+    evaluate_run.evaluate_run(run, scene)
+    metrics, per_view = (json.loads(path.read_text()) for path in (run.metrics, run.per_view))
+    assert metrics["models"][NAME]["sha256"] == sha256_of(run.model(NAME))
+    metrics["lpips_network"] = "alex"
+    for split in per_view[NAME].values():
+        for view in split.values():
+            view["lpips"] = 0.25
+    run.metrics.write_text(json.dumps(metrics))
+    run.per_view.write_text(json.dumps(per_view))
+    result = evaluate_run.evaluate_run(run, scene)
+    assert result.models[NAME].test.lpips == 0.25 and result.is_lpips_kept and result.lpips_network == "alex"
+    assert json.loads(run.metrics.read_text())["models"][NAME]["test"]["lpips"] == 0.25
+    with open(run.model(NAME), "ab") as file:
+        file.write(b"\0")
+    assert evaluate_run.evaluate_run(run, scene).lpips_network is None
+
+
+# Divergence
+
+
+@event
+class Trap(StepEvent):
+    """After iteration 12, everything is NaN, if the view of the first order was seen."""
+
+    x: float = 0.0
+    """How its camera is turned."""
+
+    @property
+    def observes(self):
+        return True
+
+    def init(self, model):
+        return jnp.zeros(())
+
+    def observe(self, state, model, seen):
+        return seen.cameras.viewmat[0, 0, 0]
+
+    def apply(self, now, model, moments, state):
+        is_bad = (now.iteration == 12) & (jnp.abs(state - self.x) < 1e-4)
+        means = jnp.where(is_bad, jnp.nan, model.gaussians.means)
+        gaussians = dataclasses.replace(model.gaussians, means=means)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trapped(Gaussians2dMcmc):
+    """With that event, or with one that always fires."""
+
+    x: float = 0.0
+    always: bool = False
+
+    def stages(self):
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(*stage.events, Always() if self.always else Trap(self.x))),)
+
+
+@event
+class Always(StepEvent):
+    """After iteration 12, everything is NaN."""
+
+    def apply(self, now, model, moments, state):
+        means = jnp.where(now.iteration == 12, jnp.nan, model.gaussians.means)
+        gaussians = dataclasses.replace(model.gaussians, means=means)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+def trapped_run(scene, folder, on_nan, always=False) -> RunFolder:
+    view = scene.train[BatchOrder(scene.train, 1, RECORD.system.seed * 2 + 1).indices(12)[0]]
+    x = float(np.asarray(view.camera.viewmat)[0, 0])
+    system = Trapped(stage1_iterations=20, x=x, always=always, **SIZES)
+    run = create_run(folder)
+    write_record(run, dataclasses.replace(RECORD, name=f"{__name__}:Trapped", system=system, on_nan=on_nan))
+    return run
+
+
+TRAPPED = "Trapped-gaussians"
+
+
+def test_the_state_before_a_divergence_is_a_file(scene, tmp_path):
+    run = trapped_run(scene, tmp_path / "run", "stop")
+    with pytest.raises(ValueError, match=r"not finite at iteration 12 .*means is not finite in 60 of 60.*--on-nan"):
+        train_run(run, scene, progress=False)
+    kept = load_checkpoint(run.diverged(TRAPPED, 11), Trapped)
+    assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.means).all()
+    assert run.checkpoints(TRAPPED)[-1] == run.checkpoint(TRAPPED, 10)
+
+
+def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, monkeypatch):
+    run = trapped_run(scene, tmp_path / "run", "restore")
+    with pytest.warns(UserWarning, match=r"goes back to iteration 10 and takes the views in another order \(1 of 5"):
+        train_run(run, scene, progress=False)
+    other, save, numbers = trapped_run(scene, tmp_path / "other", "restore"), save_checkpoint, []
+
+    def save_and_stop(path, checkpoint):
+        save(path, checkpoint)
+        numbers.append((checkpoint.iteration, checkpoint.num_restored))
+        if checkpoint.iteration in (8, 14):
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setattr(train_run_module, "save_checkpoint", save_and_stop)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                train_run(other, scene, progress=False)
+    train_run(other, scene, progress=False)
+    assert numbers[-1] == (14, 1) and numbers[3] == (8, 0)
+    for name in ("means", "sh"):
+        first, second = (getattr(load_model(r.model(TRAPPED)).gaussians, name) for r in (run, other))
+        np.testing.assert_array_equal(first, second)
+
+
+def test_restoring_has_an_end(scene, tmp_path):
+    run = trapped_run(scene, tmp_path / "run", "restore", always=True)
+    with (
+        pytest.warns(UserWarning),
+        pytest.raises(ValueError, match=f"went back {MOST_RESTORED} times already") as raised,
+    ):
+        train_run(run, scene, progress=False)
+    assert isinstance(raised.value.__cause__, DivergedError)
+    assert find_system(f"{__name__}:Trapped") == Trapped()
+
+
+# Signals
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_outside_training_ends_with_one_line(monkeypatch, capsys, number, code):
+    monkeypatch.setattr(cli.Info, "run", lambda self: os.kill(os.getpid(), number))
+    before = signal.getsignal(number)
+    assert cli.main(["info", "run"]) == code
+    assert capsys.readouterr().err == "a2tg: interrupted\n" and signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_training_keeps_the_state_of_that_moment(stopped, tmp_path, monkeypatch, capsys, number, code):
+    launch, out = StageRun._launch, tmp_path / "run"
+
+    def launch_and_signal(self, iteration):
+        if iteration == 7 and not list(out.glob("models/*")):
+            os.kill(os.getpid(), number)
+        return launch(self, iteration)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StageRun, "_launch", launch_and_signal)
+        assert cli.main([*TRAIN, "--out", str(out)]) == code
+    run = RunFolder(out)
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == (
+        f"a2tg: interrupted; the last checkpoint is {run.checkpoint(NAME, 7)}; "
+        f"go on with: a2tg train --out {out} --resume"
+    )
+    assert cli.main(["train", "--out", str(out), "--resume"]) == 0
+    assert_same(run, stopped[1])
+
+
+def test_a_second_signal_is_obeyed_at_once():
+    with pytest.raises(signals.Stopped) as raised, signals.noted() as is_asked:
+        assert not is_asked()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert is_asked()
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("it went on")
+    assert raised.value.exit_code == 143
+
+
+def test_a_closed_pipe_is_quiet(tmp_path):
+    run = filled(tmp_path / "run")
+    run.model(NAME).unlink()
+    command = f"{sys.executable} -m a2tg_jax.cli info {run.path}; echo $? >&2"
+    done = subprocess.run(
+        ["bash", "-c", f"({command}) | true"], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert done.stderr.strip() == "141"
+
+
+def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def full(path, checkpoint):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(train_run_module, "save_checkpoint", full)
+    assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "No space left on device; there is no checkpoint yet; go on with: a2tg train" in error
+    assert whole_run.how_to_go_on(RunFolder(tmp_path / "run")) in error
