@@ -48,8 +48,9 @@ def described(value: Any) -> str:
 
 
 def shortened(value: Any, most: int = 80) -> str:
-    """A value as an error tells it, on one line of bounded length; texts without quotes."""
+    """A value as an error tells it, on one line of bounded length; texts without quotes, nor what steers a terminal."""
     text = " ".join((value if isinstance(value, str) else repr(value)).split())
+    text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 

@@ -84,7 +84,7 @@ def case(index: int, seeds: Path) -> tuple[int, Reader, str, bytes]:
     reader = READERS[number]
     name = reader.files[int(rng.integers(len(reader.files)))]
     change = reader.changes[int(rng.integers(len(reader.changes)))]
-    return number, reader, name, change((seeds / reader.name / name).read_bytes(), rng)
+    return number, reader, name, change((seeds / reader.folder / name).read_bytes(), rng)
 
 
 def run(worker: Worker, cases: range, keep: Path | None = None, on_case=lambda index, answer: None) -> dict:
@@ -111,7 +111,7 @@ def run(worker: Worker, cases: range, keep: Path | None = None, on_case=lambda i
 def _run_case(index: int, worker: Worker, keep: Path | None) -> dict:
     seeds = worker.work / "seeds"
     number, reader, name, changed = case(index, seeds)
-    file = seeds / reader.name / name
+    file = seeds / reader.folder / name
     sound = file.read_bytes()
     worker.start()  # It reads the sound files first.
     try:

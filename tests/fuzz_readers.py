@@ -21,11 +21,15 @@ class Reader:
     """What is changed, and how."""
 
     name: str
-    """Also of its folder."""
     files: tuple[str, ...]
     changes: tuple[Callable, ...]
     target: str
     """Which function of the worker reads the folder or the file."""
+
+    @property
+    def folder(self) -> str:
+        """Below that of all sound files; masks are those of a scene that is tried itself."""
+        return "nerfstudio" if self.name == "masks" else self.name
 
 
 READERS = (
@@ -33,6 +37,7 @@ READERS = (
     Reader("colmap", tuple(f"sparse/0/{kind}.bin" for kind in COLMAP[3:]), BINARY, "scene"),
     Reader("colmap-text", tuple(f"sparse/0/{kind}.txt" for kind in COLMAP), TEXT, "scene"),
     Reader("nerfstudio", ("transforms.json",), JSON, "scene"),
+    Reader("masks", ("masks/00.png", "masks/01.png", "images/00.png"), (mutate.of_bytes, mutate.of_png), "scene"),
     Reader("blender", ("transforms_train.json", "transforms_test.json"), JSON, "scene"),
     Reader("points", ("ascii.ply",), TEXT, "points"),
     Reader("points", ("little.ply", "big.ply"), BINARY, "points"),

@@ -58,12 +58,23 @@ def _write_scenes(folder: Path) -> None:
         write_colmap(folder / name, models=models, num_views=NUM_VIEWS, num_points=6, text=text)
     frames = write_frames(folder / "nerfstudio", NUM_VIEWS)
     write_ply(folder / "nerfstudio" / "points.ply")
+    _write_masks(folder / "nerfstudio" / "masks")
+    frames[1]["mask_path"] = "masks/01.png"
     write_json(folder / "nerfstudio", frames, ply_file_path="points.ply", k1=0.01, **FOCAL, **SIZE)
     (folder / "blender").mkdir()
     write_blender(folder / "blender")
     (folder / "points").mkdir()
     for name, encoding in (("ascii", "ascii"), ("little", "binary_little_endian"), ("big", "binary_big_endian")):
         write_ply(folder / "points" / f"{name}.ply", encoding)
+
+
+def _write_masks(folder: Path) -> None:
+    """Of all views, the upper half."""
+    folder.mkdir()
+    mask = np.zeros((SIZE["h"], SIZE["w"]), np.uint8)
+    mask[: SIZE["h"] // 2] = 255
+    for index in range(NUM_VIEWS):
+        Image.fromarray(mask).save(folder / f"{index:02d}.png")
 
 
 def _write_pictures(folder: Path) -> None:

@@ -98,7 +98,7 @@ def main() -> None:
         os.rename(work / "new", seeds)
     for reader in READERS:
         for name in reader.files:
-            read(reader, seeds / reader.name, seeds / reader.name / name, is_rendering)
+            read(reader, seeds / reader.folder, seeds / reader.folder / name, is_rendering)
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
     watch = Watch(work)
@@ -106,7 +106,7 @@ def main() -> None:
     for line in sys.stdin:
         number, name = json.loads(line)
         reader = READERS[number]
-        folder = seeds / reader.name
+        folder = seeds / reader.folder
         before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
         watch.is_on = True
         kind, where = outcome(read, reader, folder, folder / name, is_rendering)

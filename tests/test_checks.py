@@ -10,7 +10,7 @@ import pytest
 from small_values import some_gaussians, some_world
 
 import a2tg_jax as a2tg
-from a2tg_jax.checks import check_floats, check_shape, described
+from a2tg_jax.checks import check_floats, check_shape, described, shortened
 from a2tg_jax.losses import depth_normals, mean_opacity, mean_scale
 from a2tg_jax.numerics import safe_norm
 
@@ -160,3 +160,9 @@ def test_pytrees_may_hold_anything():
     colors = jax.vmap(lambda g: a2tg.render_image(g, CAMERA, settings=settings).color)(batched)
     np.testing.assert_array_equal(colors[0], colors[1])
     assert "object" in repr(jax.tree.map(lambda x: object(), some_gaussians()))
+
+
+def test_what_a_file_says_is_told_on_one_short_line():
+    assert shortened("a\nb\tc") == "a b c" and shortened([1, None]) == "[1, None]"
+    assert shortened("\x1b[31mred\x07") == "\ufffd[31mred\ufffd"
+    assert len(shortened("x" * 10**6)) == 80 and shortened("x" * 81).endswith("…") and shortened("x" * 80) == "x" * 80

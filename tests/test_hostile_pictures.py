@@ -135,6 +135,12 @@ def test_names_do_not_lead_out_of_the_scene(tmp_path, name):
         locate_image(tmp_path / "images", name, 1)
 
 
+def test_names_that_are_too_long_are_shortened(tmp_path):
+    with pytest.raises(ValueError, match="too long a name, of 5000 letters") as caught:
+        locate_image(tmp_path, "x" * 5000, 1)
+    assert len(str(caught.value)) < 500
+
+
 def test_names_within_the_scene_and_links_are_followed(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "x.png").write_bytes(png(4, 3))

@@ -143,7 +143,7 @@ def test_principal_points_that_no_camera_has(tmp_path, key, value):
 
 
 @pytest.mark.parametrize("key", ["k1", "k2", "p1", "k3"])
-@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e9, -1e9, -40.0, {}])
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e9, -1e9, {}])
 def test_distortions_that_no_camera_has(tmp_path, key, value):
     write_transforms(tmp_path, **{key: value})
     refused(tmp_path, f"distortion|{key} must be a number|parameters must be finite")

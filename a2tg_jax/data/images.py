@@ -9,8 +9,12 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.checks import shortened
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 """Tried in this order on image paths written without a suffix."""
+LONGEST_NAME = 1000
+"""Letters of the path of an image below its folder."""
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
 
@@ -47,12 +51,16 @@ def check_inside(folder: Path, name: str) -> None:
     """Refuses a name, found in a file of the scene, that leads out of the scene's folder. Links may lead anywhere.
 
     Raises:
-      ValueError: naming both, if it is absolute, or climbs by "..".
+      ValueError: naming both, if it is absolute, climbs by "..", or is no name.
     """
     if os.path.isabs(name) or os.pardir in Path(name).parts or "\0" in name:
         raise ValueError(
-            f"{folder}: {name!r} leads out of the scene's folder, and nothing outside is read; "
+            f"{folder}: {shortened(name)} leads out of the scene's folder, and nothing outside is read; "
             "move it there, or put a link there to where it is, and name that"
+        )
+    if len(name) > LONGEST_NAME:
+        raise ValueError(
+            f"{folder}: {shortened(name)} is too long a name, of {len(name)} letters; give it a shorter one"
         )
 
 
