@@ -1,0 +1,255 @@
+"""Scenes for browsers, *.a2tgw: rounded to bytes, the rows that show most first, readable while they arrive.
+
+docs/formats.md describes the file. N rows, in chunks of C; T texels. All numbers but positions are kept as one byte
+each, positions as two; the whole body is one stream of zlib, which browsers unpack themselves.
+"""
+
+import dataclasses
+import json
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Textured, TextureOptions
+from a2tg_jax.appearance.textured import shown_textures
+from a2tg_jax.data.world import Similarity
+from a2tg_jax.gaussians import check_gaussians
+from a2tg_jax.io.config_json import config_from_dict
+from a2tg_jax.io.rows import Rows, model_of, ordered, rows_of
+from a2tg_jax.io.web_codes import codes_of, rows_of_body
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.sh_bands import MAX_DEGREE
+
+MAGIC = b"a2tgw\r\n\x1a"
+VERSION = 1
+HEAD = struct.Struct("<8sHIII")
+"""Magic, version, bytes of the header, bytes of the body as coded, checksum of the header."""
+LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
+MOST_ROWS = 1 << 24
+"""Rows and texels that a file may announce."""
+LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
+"""What a file may unpack to: so many times its own bytes, and the room."""
+NEAREST = 1e-3
+"""Distance from a camera, in units of the median, below which a row does not count for more."""
+MOST_CAMERAS = 16
+"""So many cameras say which rows show most."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WebScene:
+    """What a file holds."""
+
+    model: Model
+    """Float32, in the order of the file; its cameras stand in the world of the scene."""
+    header: Mapping[str, Any]
+    """As the file has it."""
+
+
+def check_viewable(appearance: Appearance) -> None:
+    """Raises ValueError, naming what the splats show, unless a browser can show it."""
+    inner = appearance.inner if isinstance(appearance, Banded) else appearance
+    if type(inner) not in (Plain, Textured) or type(appearance) not in (Plain, Textured, Banded):
+        system = {Billboards: " of bbsplat", MovableKernels: " of supergaussians"}.get(type(inner), "")
+        raise ValueError(
+            f"the viewer cannot show {type(inner).__name__}{system}: it shows Gaussians with or without textures"
+        )
+
+
+def encode_web_scene(model: Model, *, title: str = "", note: str = "", near_plane: float = 0.2) -> bytes:
+    """The bytes of a file.
+
+    Args:
+      model: one that shows Plain, Textured, or Banded of these.
+      title: what the page is called.
+      note: what the viewer says about the scene.
+      near_plane: hits nearer than this do not show.
+
+    Raises:
+      ValueError: if the model shows anything else, has more rows than a file may hold, or a number that is not finite.
+    """
+    check_gaussians(model.gaussians, "model.gaussians")
+    check_viewable(model.appearance)
+    model = _as_shown(model.live)
+    rows = rows_of(model)
+    if max(len(rows.means), 0 if rows.texels is None else len(rows.texels)) > MOST_ROWS:
+        raise ValueError(f"model has more Gaussians or texels than the {MOST_ROWS:,} that a web scene may hold")
+    rows = ordered(rows, np.argsort(-importance(rows, model.origin), kind="stable"))
+    chunk = int(np.clip(-(-len(rows.means) // 16), LEAST_CHUNK, LARGEST_CHUNK))
+    codes = codes_of(rows)
+    body = b"".join(piece for start in range(0, len(rows.means), chunk) for piece in codes.chunk(start, start + chunk))
+    header = {
+        "title": title,
+        "note": note,
+        "num": len(rows.means),
+        "chunk": chunk,
+        "base_degree": model.gaussians.sh_degree,
+        "num_bands": len(rows.bands),
+        "num_texels": None if rows.texels is None else len(rows.texels),
+        "bytes": len(body),
+        "near_plane": near_plane,
+        **_appearance_to_dict(model.appearance),
+        **codes.ends,
+        **_origin_to_dict(model.origin),
+    }
+    return _framed(header, body)
+
+
+def decode_web_scene(data: bytes, where: str = "the web scene") -> WebScene:
+    """What the bytes of a file hold; errors call it `where`.
+
+    Raises:
+      ValueError: if it is not a scene for browsers, is damaged, or is of another version.
+    """
+    try:
+        header, body = _unframed(data)
+        rows = rows_of_body(header, body)
+        model = model_of(rows, header["base_degree"], _appearance_of(header), _origin_of(header))
+        return WebScene(model, header)
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{where}: the web scene is damaged or of another version ({error!r})") from error
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
+    """[N] opacity times the area that cameras see, on average; without cameras times the area itself."""
+    shown = 1 / (1 + np.exp(-np.clip(rows.logit_opacities.astype(np.float64), -80, 80)))
+    areas = shown * np.exp(rows.log_scales.astype(np.float64).sum(axis=1))
+    if origin is None or not len(origin.viewmats):
+        return areas
+    viewmats = origin.viewmats[:: -(-len(origin.viewmats) // MOST_CAMERAS)]
+    centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    squares = np.stack([np.sum((rows.means - center) ** 2, axis=1) for center in centers])
+    least = NEAREST * np.median(squares) if squares.size else 1.0
+    return areas * np.mean(1 / np.maximum(squares, max(least, 1e-30)), axis=0)
+
+
+def _as_shown(model: Model) -> Model:
+    """The model with texels as they are seen, which need no rule any more but where they are looked up."""
+    textured = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
+    if not isinstance(textured, Textured) or model.textures is None or not model.num:
+        return model
+    textures, layout = model.textures
+    model = model.with_textures(shown_textures(textures, layout, textured.options), layout)
+    options = dataclasses.replace(textured.options, rgb="signed", alpha="projected")
+    seen: Appearance = dataclasses.replace(textured, options=options)
+    is_banded = isinstance(model.appearance, Banded)
+    return dataclasses.replace(model, appearance=Banded(seen) if is_banded else seen)
+
+
+# The frame
+
+
+def _framed(header: Mapping[str, Any], body: bytes) -> bytes:
+    text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
+    coded = zlib.compress(body, 9)
+    if len(body) > _room(len(coded)):
+        coded = zlib.compress(body, 0)  # So alike are its numbers that the file would be taken for a bomb.
+    return HEAD.pack(MAGIC, VERSION, len(text), len(coded), zlib.crc32(text)) + text + coded
+
+
+def _room(num_coded: int) -> int:
+    return FREE_ROOM + LARGEST_RATIO * num_coded
+
+
+def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The header, of which the counts are checked, and the body."""
+    if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
+        raise ValueError("is not a web scene of a2tg-jax")
+    _, version, num_text, num_coded, checksum = HEAD.unpack_from(data)
+    if version != VERSION:
+        raise ValueError(f"is a web scene of version {version}; this program reads version {VERSION}")
+    if len(data) != HEAD.size + num_text + num_coded:
+        raise ValueError(f"has {len(data)} bytes where {HEAD.size + num_text + num_coded} are announced")
+    text = data[HEAD.size : HEAD.size + num_text]
+    if zlib.crc32(text) != checksum:
+        raise ValueError("is damaged: the checksum of its header differs")
+    header = json.loads(text)
+    _check_counts(header, num_coded)
+    reader = zlib.decompressobj()
+    try:
+        body = reader.decompress(data[HEAD.size + num_text :], header["bytes"] + 1)
+    except zlib.error as error:
+        raise ValueError(f"is damaged: {error}") from error
+    if len(body) != header["bytes"] or not reader.eof:
+        raise ValueError(f"does not unpack to the {header['bytes']} bytes that it announces")
+    return header, body
+
+
+def _check_counts(header: Any, num_coded: int) -> None:
+    """Raises ValueError unless no more is announced than such a file can hold."""
+    if not isinstance(header, dict):
+        raise ValueError("has no header")
+    texels = 0 if header["num_texels"] is None else header["num_texels"]
+    limits = {"num": (0, MOST_ROWS), "chunk": (1, MOST_ROWS), "bytes": (0, _room(num_coded))}
+    limits |= {"base_degree": (0, MAX_DEGREE), "num_bands": (1, MAX_DEGREE + 1)}
+    for name, (least, most) in limits.items():
+        if type(header[name]) is not int or not least <= header[name] <= most:
+            raise ValueError(f"announces {name} {header[name]!r}; {least} to {most} are possible")
+    if type(texels) is not int or not 0 <= texels <= MOST_ROWS:
+        raise ValueError(f"announces num_texels {texels!r}; 0 to {MOST_ROWS} are possible")
+    if header["bytes"] < 16 * header["num"] + 4 * texels:
+        raise ValueError(f"announces {header['num']} rows and {texels} texels in {header['bytes']} bytes")
+
+
+# What stands in the header as text
+
+
+def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
+    inner = appearance.inner if isinstance(appearance, Banded) else appearance
+    options = inner.options if isinstance(inner, Textured) else TextureOptions()
+    max_alpha = inner.max_alpha if isinstance(inner, Plain) else options.max_alpha
+    banded = isinstance(appearance, Banded)
+    return {"banded": banded, "uv": options.uv, "outside": options.outside, "max_alpha": max_alpha}
+
+
+def _appearance_of(header: Mapping[str, Any]) -> Appearance:
+    """What a file's splats show."""
+    max_alpha = header["max_alpha"]
+    if not isinstance(max_alpha, float) or not 0 < max_alpha < 1:
+        raise ValueError(f"max_alpha must lie in (0, 1); got {max_alpha!r}")
+    inner: Appearance = Plain(max_alpha)
+    if header["num_texels"] is not None:
+        named = {"uv": header["uv"], "outside": header["outside"], "max_alpha": max_alpha}
+        inner = Textured(options=config_from_dict(TextureOptions, named, "options"))
+    return Banded(inner) if header["banded"] is True else inner
+
+
+def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
+    if origin is None:
+        return {"background": [0.0, 0.0, 0.0], "cameras": None}
+    as_floats = lambda x: [float(str(number)) for number in np.asarray(x, np.float32).ravel()]  # noqa: E731
+    cameras = [
+        {
+            "name": name,
+            "is_test": bool(is_test),
+            "size": size.tolist(),
+            "viewmat": as_floats(viewmat),
+            "K": as_floats(K),
+        }
+        for name, is_test, size, viewmat, K in zip(
+            origin.names, origin.is_test, origin.sizes, origin.viewmats, origin.Ks, strict=True
+        )
+    ]
+    return {"background": as_floats(origin.background), "cameras": cameras}
+
+
+def _origin_of(header: Mapping[str, Any]) -> Origin | None:
+    """The cameras, in the world of the scene; None where the file has none."""
+    cameras = header["cameras"]
+    if cameras is None:
+        return None
+    red, green, blue = (float(number) for number in header["background"])
+    return Origin(
+        viewmats=np.array([camera["viewmat"] for camera in cameras], np.float64).reshape(-1, 4, 4),
+        Ks=np.array([camera["K"] for camera in cameras], np.float64).reshape(-1, 3, 3),
+        sizes=np.array([camera["size"] for camera in cameras], np.int64).reshape(-1, 2),
+        names=tuple(str(camera["name"]) for camera in cameras),
+        is_test=np.array([camera["is_test"] for camera in cameras], bool),
+        transform=Similarity(1.0, np.eye(3), np.zeros(3)),
+        background=(red, green, blue),
+    )
