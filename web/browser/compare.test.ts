@@ -1,0 +1,89 @@
+/**
+ * Pictures of the page beside those of the JAX renderer: A2TG_CASES is a folder with a folder for each scene, which
+ * holds scene.a2tgw, views.json, and of each view i the colours as float32, i.f32 (tests/viewer_cases.py writes it).
+ */
+
+import { existsSync, readFileSync, readdirSync } from "node:fs";
+import { join } from "node:path";
+
+import type { Browser } from "playwright-core";
+import { afterAll, beforeAll, describe, expect, test } from "vitest";
+
+import { CHROMIUM, launch, serve } from "./chromium";
+
+interface CaseView {
+  readonly viewmat: number[];
+  readonly K: number[];
+  readonly size: [number, number];
+  readonly mode: string;
+  /** Whose picture it is: the model's, which the file was made of, or that of what the file holds. */
+  readonly of: "the model" | "the file";
+}
+
+interface Case {
+  readonly background: [number, number, number];
+  readonly views: CaseView[];
+}
+
+const FOLDER = process.env.A2TG_CASES ?? "";
+const NAMES = FOLDER !== "" && existsSync(FOLDER) ? readdirSync(FOLDER) : [];
+/** Mean absolute differences in 1/255: of the model's picture, and of what the file holds, where nothing was rounded. */
+const LIMITS = { "the model": 1, "the file": 0.15 } as const;
+const PAGE = new URL("../dist/index.html", import.meta.url);
+
+/** Colours over the background, as a screen shows them: [h, w, 3]. */
+function composited(found: Float32Array, background: readonly number[]): Float32Array {
+  const num = found.length / 4;
+  const colors = new Float32Array(3 * num);
+  for (let i = 0; i < num; i++) {
+    for (let k = 0; k < 3; k++) colors[3 * i + k] = found[4 * i + k] + (1 - found[4 * i + 3]) * background[k];
+  }
+  return colors;
+}
+
+const clipped = (x: number): number => Math.min(Math.max(x, 0), 1);
+
+describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows what the JAX renderer shows", () => {
+  let browser: Browser;
+  beforeAll(async () => { browser = await launch(); });
+  afterAll(async () => { await browser.close(); });
+
+  test.each(NAMES)("%s", async (name) => {
+    const folder = join(FOLDER, name);
+    const { background, views } = JSON.parse(readFileSync(join(folder, "views.json"), "utf8")) as Case;
+    const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgw": readFileSync(join(folder, "scene.a2tgw")) });
+    const page = await browser.newPage();
+    const errors: string[] = [];
+    page.on("pageerror", (error) => errors.push(error.message));
+    page.on("console", (message) => { if (message.type() === "error") errors.push(message.text()); });
+    await page.goto(served.address);
+    await page.evaluate(() => window.a2tg?.loaded);
+    for (const [index, view] of views.entries()) {
+      const text = await page.evaluate(async ({ viewmat, K, size, mode }) => {
+        const found = await window.a2tg?.render(viewmat, K, size, mode);
+        const bytes = new Uint8Array(found?.buffer ?? new ArrayBuffer(0));
+        let binary = "";
+        for (let i = 0; i < bytes.length; i += 8192) binary += String.fromCharCode(...bytes.subarray(i, i + 8192));
+        return btoa(binary);
+      }, view);
+      const bytes = Uint8Array.from(Buffer.from(text, "base64"));
+      const found = composited(new Float32Array(bytes.buffer), background);
+      const wanted = new Float32Array(Uint8Array.from(readFileSync(join(folder, `${index}.f32`))).buffer);
+      expect(found.length).toBe(wanted.length);
+      let [sum, largest, far] = [0, 0, 0];
+      found.forEach((x, i) => {
+        const difference = Math.abs(clipped(x) - clipped(wanted[i]));
+        sum += difference;
+        largest = Math.max(largest, difference);
+        if (difference > 8 / 255) far++;
+      });
+      const mean = (255 * sum) / found.length;
+      console.log(`${name}, ${view.of}, ${index} ${view.mode}: mean ${mean.toFixed(4)}/255, largest ${(255 * largest).toFixed(1)}/255, ` +
+        `${((100 * far) / found.length).toFixed(3)}% beyond 8/255`);
+      expect(mean).toBeLessThan(LIMITS[view.of]);
+    }
+    expect(errors.filter((error) => !error.includes("404"))).toEqual([]);
+    await page.close();
+    served.close();
+  });
+});

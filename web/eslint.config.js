@@ -1,0 +1,20 @@
+import tseslint from "typescript-eslint";
+
+export default tseslint.config(
+  { ignores: ["dist", "node_modules", "eslint.config.js"] },
+  ...tseslint.configs.strictTypeChecked,
+  {
+    languageOptions: { parserOptions: { projectService: true } },
+    rules: {
+      // Words of text are numbers and strings alike here.
+      "@typescript-eslint/restrict-template-expressions": ["error", { allowNumber: true }],
+      // What a scene file says is text and never becomes markup.
+      "no-restricted-properties": [
+        "error",
+        { property: "innerHTML", message: "use textContent" },
+        { property: "outerHTML", message: "use textContent" },
+        { property: "insertAdjacentHTML", message: "use textContent" },
+      ],
+    },
+  },
+);

@@ -1,0 +1,116 @@
+/** Where the viewer looks from, and what leads from the world to pixels. */
+
+import { add, cross, dot, lookingAlong, normalize, orthonormal, scale, subtract, turned } from "./math";
+import type { Mat3, Row4, Vec3 } from "./math";
+
+/** Pinhole intrinsics in pixels of an image of width × height; pixel centres lie at +0.5. */
+export interface Lens {
+  readonly fx: number;
+  readonly fy: number;
+  readonly cx: number;
+  readonly cy: number;
+  readonly skew: number;
+  readonly width: number;
+  readonly height: number;
+}
+
+export interface Pose {
+  readonly position: Vec3;
+  /** Rows: right, down, forward, in the world. */
+  readonly rotation: Mat3;
+  /** Distance to the point that one turns around. */
+  readonly focus: number;
+}
+
+/** Rows of K·[R | t]: from a position in the world to homogeneous pixels; the last one gives the depth. */
+export type Projection = readonly [Row4, Row4, Row4];
+
+export const target = (pose: Pose): Vec3 => add(pose.position, scale(pose.rotation[2], pose.focus));
+
+/** The lens for a canvas: the lens' whole image is seen, as large as it fits, in the middle. */
+export function fitted(lens: Lens, width: number, height: number): Lens {
+  const s = Math.min(width / lens.width, height / lens.height);
+  return {
+    fx: lens.fx * s,
+    fy: lens.fy * s,
+    cx: lens.cx * s + (width - lens.width * s) / 2,
+    cy: lens.cy * s + (height - lens.height * s) / 2,
+    skew: lens.skew * s,
+    width,
+    height,
+  };
+}
+
+export function projection(pose: Pose, lens: Lens): Projection {
+  const view = pose.rotation.map((axis): Row4 => [...axis, -dot(axis, pose.position)]) as [Row4, Row4, Row4];
+  const combined = (a: number, b: number, c: number): Row4 =>
+    [0, 1, 2, 3].map((k) => a * view[0][k] + b * view[1][k] + c * view[2][k]) as unknown as Row4;
+  return [combined(lens.fx, lens.skew, lens.cx), combined(0, lens.fy, lens.cy), view[2]];
+}
+
+/** The pose of a world-to-camera matrix, 16 numbers row by row. */
+export function poseOf(viewmat: readonly number[], focus: number): Pose {
+  const row = (i: number): Vec3 => [viewmat[4 * i], viewmat[4 * i + 1], viewmat[4 * i + 2]];
+  const rotation: Mat3 = [row(0), row(1), row(2)];
+  const t: Vec3 = [viewmat[3], viewmat[7], viewmat[11]];
+  const position: Vec3 = [0, 1, 2].map((k) => -(rotation[0][k] * t[0] + rotation[1][k] * t[1] + rotation[2][k] * t[2])) as unknown as Vec3;
+  return { position, rotation, focus };
+}
+
+/** The world-to-camera matrix of a pose, 16 numbers row by row. */
+export function viewmatOf(pose: Pose): number[] {
+  const rows = pose.rotation.flatMap((axis) => [...axis, -dot(axis, pose.position)]);
+  return [...rows, 0, 0, 0, 1];
+}
+
+/** Turned around the target: by `yaw` about `up`, then by `pitch` about the camera's right; never over the top. */
+export function orbited(pose: Pose, up: Vec3, yaw: number, pitch: number): Pose {
+  const centre = target(pose);
+  const rotation = looked(pose.rotation, up, yaw, pitch);
+  return { ...pose, rotation, position: subtract(centre, scale(rotation[2], pose.focus)) };
+}
+
+/** Turned on the spot. */
+export function panned(pose: Pose, up: Vec3, yaw: number, pitch: number): Pose {
+  return { ...pose, rotation: looked(pose.rotation, up, yaw, pitch) };
+}
+
+function looked(rotation: Mat3, up: Vec3, yaw: number, pitch: number): Mat3 {
+  const around = (rows: Mat3, axis: Vec3, angle: number): Mat3 => [
+    turned(rows[0], axis, angle),
+    turned(rows[1], axis, angle),
+    turned(rows[2], axis, angle),
+  ];
+  const level = around(rotation, up, yaw);
+  const pitched = around(level, level[0], pitch);
+  const steep = Math.abs(dot(pitched[2], up));
+  const isOver = steep > 0.995 && steep > Math.abs(dot(level[2], up));
+  return orthonormal(isOver ? level : pitched);
+}
+
+/** Moved along the camera's own axes, right, down and forward, in units of the world. */
+export function moved(pose: Pose, by: Vec3): Pose {
+  const [x, y, z] = pose.rotation;
+  return { ...pose, position: add(pose.position, add(add(scale(x, by[0]), scale(y, by[1])), scale(z, by[2]))) };
+}
+
+/** Nearer to the target by a factor. */
+export function dollied(pose: Pose, factor: number, least: number): Pose {
+  const focus = Math.max(pose.focus * factor, least);
+  return { ...pose, focus, position: subtract(target(pose), scale(pose.rotation[2], focus)) };
+}
+
+/** The same direction, levelled, around another target. */
+export function aimed(pose: Pose, at: Vec3): Pose {
+  const offset = subtract(at, pose.position);
+  const focus = Math.max(dot(offset, pose.rotation[2]), 1e-6);
+  return { ...pose, focus, position: subtract(at, scale(pose.rotation[2], focus)) };
+}
+
+/** A first view of points around a centre. */
+export function overview(centre: Vec3, radius: number, up: Vec3): Pose {
+  const side = Math.abs(up[0]) < 0.9 ? cross(up, [1, 0, 0]) : cross(up, [0, 1, 0]);
+  const forward = normalize(subtract(scale(normalize(side), 1), scale(up, 0.35)));
+  const focus = 2.5 * radius;
+  return { position: subtract(centre, scale(forward, focus)), rotation: lookingAlong(forward, up), focus };
+}

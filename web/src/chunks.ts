@@ -1,0 +1,143 @@
+/** The body of a scene, chunk after chunk, as bytes arrive. */
+
+import { SceneError, fixedColumns } from "./format";
+import type { Header } from "./format";
+
+/** The columns of some rows, as they lie in the file. */
+export interface Chunk {
+  /** Index of the first row. */
+  readonly start: number;
+  readonly num: number;
+  /** [6, n] low bytes of x, y, z, then high bytes. */
+  readonly means: Uint8Array;
+  /** [9, n] log-scales u, v; quaternion x, y, z; opacity; degree 0: red − green, green, blue − green. */
+  readonly numbers: Uint8Array;
+  /** [n] of the spherical harmonics. */
+  readonly degrees: Uint8Array;
+  /** [2, n] Tv, Tu; zeros without textures. */
+  readonly sizes: Uint8Array;
+  /** Band l > 0 at l − 1: [3, 2l + 1, m], red − green, green, blue − green of the rows of that degree or more. */
+  readonly bands: readonly Uint8Array[];
+  /** [4, t]: red − green, green, blue − green, alpha. */
+  readonly texels: Uint8Array;
+}
+
+/** Takes bytes as they come and gives whole chunks. */
+export class ChunkReader {
+  private readonly header: Header;
+  private row = 0;
+  private numRead = 0;
+  private fixed: Uint8Array | null = null;
+  private buffer: Uint8Array;
+  private filled = 0;
+
+  constructor(header: Header) {
+    this.header = header;
+    this.buffer = new Uint8Array(this.fixedBytes);
+  }
+
+  /** The chunks that are whole with these bytes. */
+  push(bytes: Uint8Array): Chunk[] {
+    const found: Chunk[] = [];
+    let place = 0;
+    while (place < bytes.length) {
+      if (this.row >= this.header.num) throw new SceneError("The scene is damaged: it holds more than its rows.");
+      const taken = Math.min(bytes.length - place, this.buffer.length - this.filled);
+      this.buffer.set(bytes.subarray(place, place + taken), this.filled);
+      place += taken;
+      this.filled += taken;
+      // Twice where nothing but fixed columns follows.
+      for (let i = 0; i < 2 && this.filled === this.buffer.length && this.row < this.header.num; i++) {
+        const chunk = this.advance();
+        if (chunk !== null) found.push(chunk);
+      }
+    }
+    return found;
+  }
+
+  /** Throws unless all rows have come. */
+  end(): void {
+    if (this.row < this.header.num || this.numRead !== this.header.bytes) {
+      throw new SceneError("The scene is cut off: not all of its rows are there.");
+    }
+  }
+
+  private get numRows(): number {
+    return Math.min(this.header.chunk, this.header.num - this.row);
+  }
+
+  private get fixedBytes(): number {
+    return fixedColumns(this.header) * this.numRows;
+  }
+
+  /** The buffer is full: fixed columns make room for the rest, the rest makes a chunk. */
+  private advance(): Chunk | null {
+    this.numRead += this.filled;
+    const full = this.buffer;
+    if (this.fixed === null) {
+      this.fixed = full;
+      const rest = this.restBytes(full);
+      if (this.numRead + rest > this.header.bytes) throw new SceneError("The scene is damaged: its rows do not fit.");
+      this.room(rest);
+      return null;
+    }
+    const chunk = this.chunkOf(this.fixed, full);
+    this.row += chunk.num;
+    this.fixed = null;
+    this.room(this.fixedBytes);
+    return chunk;
+  }
+
+  private room(bytes: number): void {
+    this.buffer = new Uint8Array(bytes);
+    this.filled = 0;
+  }
+
+  private parts(fixed: Uint8Array): Pick<Chunk, "means" | "numbers" | "degrees" | "sizes"> {
+    const n = this.numRows;
+    return {
+      means: fixed.subarray(0, 6 * n),
+      numbers: fixed.subarray(6 * n, 15 * n),
+      degrees: fixed.subarray(15 * n, 16 * n),
+      sizes: this.header.numTexels === null ? new Uint8Array(2 * n) : fixed.subarray(16 * n, 18 * n),
+    };
+  }
+
+  private restBytes(fixed: Uint8Array): number {
+    const { degrees, sizes } = this.parts(fixed);
+    const { baseDegree, numBands } = this.header;
+    if (degrees.some((degree) => degree < baseDegree || degree >= numBands)) {
+      throw new SceneError("The scene is damaged: a degree is impossible.");
+    }
+    return this.bandLengths(degrees).reduce((a, b) => a + b, 0) + 4 * numTexelsOf(sizes, this.numRows);
+  }
+
+  private bandLengths(degrees: Uint8Array): number[] {
+    const counts = [0, 0, 0, 0];
+    for (const degree of degrees) for (let l = 1; l <= degree; l++) counts[l]++;
+    return Array.from({ length: this.header.numBands - 1 }, (_, i) => 3 * (2 * i + 3) * counts[i + 1]);
+  }
+
+  private chunkOf(fixed: Uint8Array, rest: Uint8Array): Chunk {
+    const parts = this.parts(fixed);
+    const bands: Uint8Array[] = [];
+    let place = 0;
+    for (const length of this.bandLengths(parts.degrees)) {
+      bands.push(rest.subarray(place, place + length));
+      place += length;
+    }
+    return { start: this.row, num: this.numRows, ...parts, bands, texels: rest.subarray(place) };
+  }
+}
+
+function numTexelsOf(sizes: Uint8Array, num: number): number {
+  let total = 0;
+  for (let i = 0; i < num; i++) {
+    const [height, width] = [sizes[i], sizes[num + i]];
+    if (height > 16 || width > 16 || (height === 0) !== (width === 0)) {
+      throw new SceneError("The scene is damaged: a texture's size is impossible.");
+    }
+    total += height * width;
+  }
+  return total;
+}

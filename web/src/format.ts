@@ -1,0 +1,219 @@
+/** The frame and the header of *.a2tgw (docs/formats.md): nothing is believed that was not checked. */
+
+export const MAGIC = [0x61, 0x32, 0x74, 0x67, 0x77, 0x0d, 0x0a, 0x1a];
+export const VERSION = 1;
+export const HEAD_BYTES = 22;
+const MOST_ROWS = 1 << 24;
+const LARGEST_HEADER = 1 << 24;
+const LARGEST_RATIO = 64;
+const FREE_ROOM = 1 << 20;
+
+/** What is wrong with a file, in words for its reader. */
+export class SceneError extends Error {
+  override name = "SceneError";
+}
+
+export interface Head {
+  readonly headerBytes: number;
+  readonly bodyBytes: number;
+  readonly checksum: number;
+}
+
+export interface SceneCamera {
+  readonly name: string;
+  readonly isTest: boolean;
+  readonly size: readonly number[];
+  readonly viewmat: readonly number[];
+  readonly K: readonly number[];
+}
+
+export interface Ends {
+  readonly low: number;
+  readonly step: number;
+}
+
+/** Centre, spread, and the first and last step of an axis of the means. */
+export type Axis = readonly [number, number, number, number];
+
+export interface Header {
+  readonly title: string;
+  readonly note: string;
+  readonly num: number;
+  readonly chunk: number;
+  readonly baseDegree: number;
+  readonly numBands: number;
+  /** null: splats have no textures. */
+  readonly numTexels: number | null;
+  readonly bytes: number;
+  readonly nearPlane: number;
+  readonly maxAlpha: number;
+  readonly uv: "texel-centre" | "align-corners";
+  readonly outside: "clamp" | "identity";
+  readonly means: readonly Axis[];
+  readonly ends: Readonly<Record<string, Ends>>;
+  readonly background: readonly number[];
+  readonly cameras: readonly SceneCamera[];
+}
+
+const BITS: Readonly<Record<string, number>> = {
+  log_scales: 8, quats: 8, opacities: 8, sh_0: 8, sh_1: 7, sh_2: 6, sh_3: 6, colors: 8, alphas: 8,
+};
+
+/** What the first 22 bytes say. */
+export function parseHead(bytes: Uint8Array): Head {
+  if (bytes.length < HEAD_BYTES || MAGIC.some((byte, i) => bytes[i] !== byte)) {
+    throw new SceneError("This is not a scene of a2tg view (*.a2tgw).");
+  }
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const version = view.getUint16(8, true);
+  if (version !== VERSION) {
+    throw new SceneError(`The scene is of version ${version}; this viewer reads version ${VERSION}.`);
+  }
+  const head = {
+    headerBytes: view.getUint32(10, true),
+    bodyBytes: view.getUint32(14, true),
+    checksum: view.getUint32(18, true),
+  };
+  if (head.headerBytes > LARGEST_HEADER) throw damaged(`a header of ${head.headerBytes} bytes`);
+  return head;
+}
+
+/** The header's text, of which every number is looked at. */
+export function parseHeader(text: Uint8Array, head: Head): Header {
+  if (crc32(text) !== head.checksum) throw damaged("the checksum of the header differs");
+  const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "header");
+  const header: Header = {
+    title: raw.text("title"),
+    note: raw.text("note"),
+    num: raw.count("num", 0, MOST_ROWS),
+    chunk: raw.count("chunk", 1, MOST_ROWS),
+    baseDegree: raw.count("base_degree", 0, 3),
+    numBands: raw.count("num_bands", 1, 4),
+    numTexels: raw.isNull("num_texels") ? null : raw.count("num_texels", 0, MOST_ROWS),
+    bytes: raw.count("bytes", 0, FREE_ROOM + LARGEST_RATIO * head.bodyBytes),
+    nearPlane: raw.between("near_plane", 0, 1e9),
+    maxAlpha: raw.between("max_alpha", 0, 1),
+    uv: raw.oneOf("uv", ["texel-centre", "align-corners"]),
+    outside: raw.oneOf("outside", ["clamp", "identity"]),
+    means: raw.list("means", 3).map((axis, i) => floats(axis, 4, `means[${i}]`) as unknown as Axis),
+    ends: endsOf(raw.fields("ends")),
+    background: floats(raw.list("background", 3), 3, "background"),
+    cameras: raw.isNull("cameras") ? [] : raw.list("cameras").map(cameraOf),
+  };
+  if (header.bytes < 16 * header.num + 4 * (header.numTexels ?? 0)) throw damaged("it announces more rows than bytes");
+  if (header.baseDegree >= header.numBands) throw damaged("its degrees contradict each other");
+  return header;
+}
+
+/** Columns of bytes per row that come first in each chunk: 6 of means, 9 of numbers, degree, and sizes. */
+export const fixedColumns = (header: Header): number => (header.numTexels === null ? 16 : 18);
+
+function endsOf(raw: Fields): Record<string, Ends> {
+  const found: Record<string, Ends> = {};
+  for (const [name, bits] of Object.entries(BITS)) {
+    const [low, high] = raw.has(name) ? floats(raw.list(name, 2), 2, name) : [0, 0];
+    found[name] = { low, step: (high - low) / (2 ** bits - 1) };
+  }
+  return found;
+}
+
+function cameraOf(value: unknown, index: number): SceneCamera {
+  const raw = new Fields(value, `cameras[${index}]`);
+  const camera = {
+    name: raw.text("name"),
+    isTest: raw.flag("is_test"),
+    size: floats(raw.list("size", 2), 2, "size"),
+    viewmat: floats(raw.list("viewmat", 16), 16, "viewmat"),
+    K: floats(raw.list("K", 9), 9, "K"),
+  };
+  if (!(camera.size[0] >= 1 && camera.size[1] >= 1 && camera.K[0] > 0 && camera.K[4] > 0)) {
+    throw damaged(`camera ${index} has no size`);
+  }
+  return camera;
+}
+
+function floats(values: unknown, length: number, name: string): number[] {
+  if (!Array.isArray(values) || values.length !== length) throw damaged(`${name} must be ${length} numbers`);
+  if (!values.every((value): value is number => typeof value === "number" && Number.isFinite(value))) {
+    throw damaged(`${name} holds what is no number`);
+  }
+  return values;
+}
+
+const damaged = (what: string): SceneError => new SceneError(`The scene is damaged: ${what}.`);
+
+/** JSON of which nothing is known. */
+class Fields {
+  private readonly values: Readonly<Record<string, unknown>>;
+  private readonly where: string;
+
+  constructor(value: unknown, where: string) {
+    if (typeof value !== "object" || value === null || Array.isArray(value)) throw damaged(`${where} is no object`);
+    this.values = value as Readonly<Record<string, unknown>>;
+    this.where = where;
+  }
+
+  has(name: string): boolean {
+    return Object.hasOwn(this.values, name);
+  }
+
+  isNull(name: string): boolean {
+    return this.get(name) === null;
+  }
+
+  text(name: string): string {
+    const value = this.get(name);
+    return typeof value === "string" ? value : this.wrong(name);
+  }
+
+  flag(name: string): boolean {
+    const value = this.get(name);
+    return typeof value === "boolean" ? value : this.wrong(name);
+  }
+
+  between(name: string, above: number, below: number): number {
+    const value = this.get(name);
+    return typeof value === "number" && value > above && value < below ? value : this.wrong(name);
+  }
+
+  count(name: string, least: number, most: number): number {
+    const value = this.get(name);
+    const isCount = typeof value === "number" && Number.isInteger(value) && value >= least && value <= most;
+    return isCount ? value : this.wrong(name);
+  }
+
+  oneOf<T extends string>(name: string, choices: readonly T[]): T {
+    return choices.find((choice) => choice === this.get(name)) ?? this.wrong(name);
+  }
+
+  list(name: string, length?: number): unknown[] {
+    const value: unknown = this.get(name);
+    if (!Array.isArray(value)) return this.wrong(name);
+    return length === undefined || value.length === length ? (value as unknown[]) : this.wrong(name);
+  }
+
+  fields(name: string): Fields {
+    return new Fields(this.get(name), name);
+  }
+
+  private get(name: string): unknown {
+    return this.has(name) ? this.values[name] : this.wrong(name);
+  }
+
+  private wrong(name: string): never {
+    throw damaged(`${name} in its ${this.where} is missing or impossible`);
+  }
+}
+
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
+  let c = n;
+  for (let k = 0; k < 8; k++) c = c & 1 ? 0xedb88320 ^ (c >>> 1) : c >>> 1;
+  return c;
+});
+
+/** CRC-32 as zlib's. */
+export function crc32(bytes: Uint8Array): number {
+  let c = 0xffffffff;
+  for (const byte of bytes) c = CRC_TABLE[(c ^ byte) & 255] ^ (c >>> 8);
+  return (c ^ 0xffffffff) >>> 0;
+}

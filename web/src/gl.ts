@@ -1,0 +1,138 @@
+/** Small pieces of WebGL 2. */
+
+import { SceneError } from "./format";
+
+/** A program and where its uniforms lie. */
+export class Program {
+  readonly handle: WebGLProgram;
+  private readonly gl: WebGL2RenderingContext;
+  private readonly places = new Map<string, WebGLUniformLocation | null>();
+
+  constructor(gl: WebGL2RenderingContext, vertex: string, fragment: string) {
+    this.gl = gl;
+    this.handle = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]] as const) {
+      const shader = gl.createShader(kind);
+      if (shader === null) throw new Error("WebGL made no shader");
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      if (gl.getShaderParameter(shader, gl.COMPILE_STATUS) !== true && !gl.isContextLost()) {
+        throw new Error(`The graphics driver refuses a shader: ${gl.getShaderInfoLog(shader) ?? ""}`);
+      }
+      gl.attachShader(this.handle, shader);
+    }
+    gl.linkProgram(this.handle);
+    if (gl.getProgramParameter(this.handle, gl.LINK_STATUS) !== true && !gl.isContextLost()) {
+      throw new Error(`The graphics driver refuses a program: ${gl.getProgramInfoLog(this.handle) ?? ""}`);
+    }
+  }
+
+  at(name: string): WebGLUniformLocation | null {
+    let place = this.places.get(name);
+    if (place === undefined) {
+      place = this.gl.getUniformLocation(this.handle, name);
+      this.places.set(name, place);
+    }
+    return place;
+  }
+}
+
+/** One long array in a texture, filled from its beginning; four numbers a texel. */
+export class LongTexture {
+  readonly handle: WebGLTexture;
+  private readonly gl: WebGL2RenderingContext;
+  private readonly width: number;
+  private readonly isWords: boolean;
+  private place = 0;
+
+  /** Room for `num` texels in rows of 2^widthBits. */
+  constructor(gl: WebGL2RenderingContext, num: number, widthBits: number, isWords: boolean, what: string) {
+    this.gl = gl;
+    this.width = 1 << widthBits;
+    this.isWords = isWords;
+    const height = Math.max(Math.ceil(num / this.width), 1);
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
+    if (height > most) throw new SceneError(`The scene has more ${what} than this graphics processor takes.`);
+    this.handle = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, this.handle);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, isWords ? gl.RGBA32UI : gl.RGBA8, this.width, height);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+    }
+  }
+
+  /** Adds [n, 4] numbers. */
+  append(data: Uint32Array | Uint8Array): void {
+    const { gl, width } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.handle);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    let done = 0;
+    const num = data.length / 4;
+    while (done < num) {
+      const x = this.place % width;
+      const y = Math.floor(this.place / width);
+      const columns = x > 0 || num - done < width ? Math.min(width - x, num - done) : width;
+      const lines = columns === width ? Math.floor((num - done) / width) : 1;
+      const piece = data.subarray(4 * done, 4 * (done + columns * lines));
+      const [format, type] = this.isWords ? [gl.RGBA_INTEGER, gl.UNSIGNED_INT] : [gl.RGBA, gl.UNSIGNED_BYTE];
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, x, y, columns, lines, format, type, piece);
+      done += columns * lines;
+      this.place += columns * lines;
+    }
+  }
+
+  delete(): void {
+    this.gl.deleteTexture(this.handle);
+  }
+}
+
+/** A picture to draw into, in the finest format that blends. */
+export class Target {
+  width = 0;
+  height = 0;
+  readonly framebuffer: WebGLFramebuffer;
+  texture: WebGLTexture | null = null;
+  private readonly gl: WebGL2RenderingContext;
+  /** Whether colours beyond 0 and 1 are kept while splats are added. */
+  readonly isFloat: boolean;
+
+  constructor(gl: WebGL2RenderingContext) {
+    this.gl = gl;
+    this.framebuffer = gl.createFramebuffer();
+    const isFloat = gl.getExtension("EXT_color_buffer_float") !== null;
+    this.isFloat = isFloat || gl.getExtension("EXT_color_buffer_half_float") !== null;
+    gl.getExtension("OES_texture_half_float_linear");
+  }
+
+  resize(width: number, height: number): void {
+    if (width === this.width && height === this.height) return;
+    const { gl } = this;
+    gl.deleteTexture(this.texture);
+    this.texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.isFloat ? gl.RGBA16F : gl.RGBA8, width, height);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
+    }
+    for (const wrap of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
+      gl.texParameteri(gl.TEXTURE_2D, wrap, gl.CLAMP_TO_EDGE);
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.texture, 0);
+    [this.width, this.height] = [width, height];
+  }
+
+  /** Red, green, blue (or what the mode draws), alpha of a rectangle, [h, w, 4], rows from the top. */
+  read(x: number, y: number, width: number, height: number): Float32Array {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    const found = new Float32Array(4 * width * height);
+    if (this.isFloat) {
+      gl.readPixels(x, y, width, height, gl.RGBA, gl.FLOAT, found);
+      return found;
+    }
+    const bytes = new Uint8Array(found.length);
+    gl.readPixels(x, y, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    return found.map((_, i) => bytes[i] / 255);
+  }
+}

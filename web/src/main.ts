@@ -1,0 +1,108 @@
+/** The page: a scene is read, shown as it comes, and steered. */
+
+import "./style.css";
+
+import type { Lens } from "./camera";
+import { poseOf } from "./camera";
+import { SceneError } from "./format";
+import { bytesText, countText, element, setFigures, showMessage } from "./page";
+import { Panel } from "./panel";
+import { MODES } from "./shaders";
+import { openScene, readScene } from "./source";
+import type { Source } from "./source";
+import type { Splats } from "./splats";
+import { Viewer } from "./viewer";
+
+/** What other scripts of a page may ask for, tests among them. */
+export interface PageApi {
+  /** Resolves when all of the scene is there. */
+  readonly loaded: Promise<void>;
+  readonly viewer: Viewer;
+  /** A picture as numbers, [h, w, 4]: colours times alpha, and alpha; rows from the top. */
+  render(viewmat: readonly number[], K: readonly number[], size: readonly number[], mode: string): Promise<Float32Array>;
+}
+
+declare global {
+  interface Window { a2tg?: PageApi }
+}
+
+async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void> {
+  const progress = element("progress", HTMLProgressElement);
+  progress.hidden = false;
+  let splats: Splats | null = null;
+  let numBytes = 1;
+  await readScene(source, {
+    onHeader: (header, length) => {
+      numBytes = length;
+      splats = viewer.begin(header);
+      panel.begin(header);
+    },
+    onChunk: (chunk, numRead) => {
+      if (splats === null) return;
+      const isFirst = splats.num === 0;
+      splats.add(chunk);
+      if (isFirst) {
+        viewer.settle(splats);
+        viewer.splats ??= splats;
+        panel.ready();
+      }
+      viewer.sort(splats);
+      progress.value = numRead / numBytes;
+      tell(splats, numBytes);
+    },
+  });
+  progress.hidden = true;
+  const last = splats as Splats | null;
+  if (last === null || last.num === 0) throw new SceneError("The scene is empty.");
+  await last.settled();
+}
+
+function tell(splats: Splats, numBytes: number): void {
+  const { header } = splats;
+  const figures: [string, string][] = [
+    ["Gaussians", splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num)],
+    ["Texels", countText(header.numTexels ?? 0)],
+    ["File", bytesText(numBytes)],
+    ["On the GPU", bytesText(splats.numBytes)],
+  ];
+  setFigures(figures);
+}
+
+async function findPhotographs(panel: Panel): Promise<void> {
+  if (document.getElementById("scene-data") !== null) return;
+  const response = await fetch("photographs.json").catch(() => null);
+  if (response?.ok !== true) return;
+  const found: unknown = await response.json().catch(() => null);
+  if (Array.isArray(found)) panel.setPhotographs(found.filter((x): x is number => Number.isInteger(x)));
+}
+
+function lensOf(K: readonly number[], size: readonly number[]): Lens {
+  return { fx: K[0], skew: K[1], cx: K[2], fy: K[4], cy: K[5], width: size[0], height: size[1] };
+}
+
+function begin(): void {
+  const viewer = new Viewer(element("view", HTMLCanvasElement));
+  const panel = new Panel(viewer);
+  const loaded = openScene().then((source) => load(viewer, panel, source));
+  loaded.catch(fail);
+  void findPhotographs(panel);
+  window.a2tg = {
+    loaded,
+    viewer,
+    render: (viewmat, K, size, mode) =>
+      viewer.read(poseOf(viewmat, 1), lensOf(K, size), MODES.find((name) => name === mode) ?? "full"),
+  };
+  viewer.canvas.addEventListener("webglcontextlost", () => {
+    showMessage("The graphics processor was lost, perhaps because its memory is full. Reload the page to try again.");
+  });
+}
+
+function fail(error: unknown): void {
+  showMessage(error instanceof SceneError ? error.message : `Something went wrong: ${String(error)}`);
+}
+
+try {
+  begin();
+} catch (error) {
+  fail(error);
+}

@@ -1,0 +1,246 @@
+/** The panel beside the picture: what is shown, the cameras with their photographs, the link, the path. */
+
+import { viewmatOf } from "./camera";
+import type { Header } from "./format";
+import { linkOf, viewOf } from "./link";
+import { element, setText } from "./page";
+import { MODES } from "./shaders";
+import type { Mode } from "./shaders";
+import type { Viewer } from "./viewer";
+
+const LEGENDS: Partial<Record<Mode, string>> = {
+  texture: "What textures add to the colour; grey is nothing.",
+  resolution: "Square textures are blue, others red; the more texels, the deeper. Dark: one texel.",
+  depth: "Bright is near.",
+  normals: "Red, green and blue are x, y and z of the normal.",
+  ellipses: "Each Gaussian out to 1.4 standard deviations.",
+};
+
+/** A view of a path, as a2tg render --path reads it. */
+interface KeptView {
+  readonly viewmat: readonly number[];
+  readonly K: readonly number[];
+  readonly size: readonly number[];
+}
+
+export class Panel {
+  private readonly viewer: Viewer;
+  private readonly mode = element("mode", HTMLSelectElement);
+  private readonly camera = element("camera", HTMLSelectElement);
+  private readonly divide = element("divide", HTMLInputElement);
+  private readonly divider = element("divider", HTMLInputElement);
+  private readonly wipe = element("wipe", HTMLInputElement);
+  private readonly photograph = element("photograph", HTMLImageElement);
+  private photographs: ReadonlySet<number> = new Set();
+  private header: Header | null = null;
+  private current: number | null = null;
+  private kept: KeptView[] = [];
+  private linkTimer = 0;
+
+  constructor(viewer: Viewer) {
+    this.viewer = viewer;
+    this.mode.addEventListener("change", () => { this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full"); });
+    this.divide.addEventListener("change", () => { this.setDivided(); });
+    this.divider.addEventListener("input", () => { this.setDivided(); });
+    this.camera.addEventListener("change", () => { this.goTo(Number(this.camera.value)); });
+    this.wipe.addEventListener("input", () => { this.placePhotograph(); });
+    this.onClick("before", () => { this.step(-1); });
+    this.onClick("after", () => { this.step(1); });
+    this.onClick("start", () => { this.restart(); });
+    this.onClick("link", () => { void this.copyLink(); });
+    this.onClick("fullscreen", () => { void toggleFullScreen(); });
+    this.onClick("keep", () => { this.keep(); });
+    this.onClick("save", () => { this.save(); });
+    viewer.onLeave = () => { this.leave(); };
+    addEventListener("keydown", (event) => { this.pressKey(event); });
+    addEventListener("resize", () => { this.placePhotograph(); });
+    addEventListener("hashchange", () => { this.followLink(); });
+    if (matchMedia("(max-width: 600px)").matches) element("panel", HTMLDetailsElement).open = false;
+  }
+
+  /** A scene has begun. */
+  begin(header: Header): void {
+    this.header = header;
+    const title = header.title === "" ? "a2tg view" : header.title;
+    element("title", HTMLElement).textContent = title;
+    document.title = `${title} · a2tg view`;
+    setText("note", header.note);
+    element("cameras", HTMLElement).hidden = header.cameras.length === 0;
+    const choices = header.cameras.map((camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)));
+    this.camera.replaceChildren(new Option("free", "-1"), ...choices);
+    const hasTextures = (header.numTexels ?? 0) > 0;
+    element("compare", HTMLElement).hidden = !hasTextures;
+    for (const option of this.mode.options) {
+      option.disabled = !hasTextures && ["plain", "texture", "resolution"].includes(option.value);
+    }
+  }
+
+  /** The scene stands: goes where the address says, or to its first camera. */
+  ready(): void {
+    if (!this.followLink()) this.restart();
+  }
+
+  /** The cameras of which there is a photograph beside the page. */
+  setPhotographs(indices: readonly number[]): void {
+    this.photographs = new Set(indices);
+    this.showPhotograph();
+  }
+
+  private onClick(id: string, act: () => void): void {
+    element(id, HTMLButtonElement).addEventListener("click", act);
+  }
+
+  private restart(): void {
+    const { splats } = this.viewer;
+    if (splats === null) return;
+    this.viewer.settle(splats);
+    this.setCurrent(splats.header.cameras.length > 0 ? 0 : null);
+    this.viewer.draw();
+  }
+
+  private setMode(mode: Mode): void {
+    this.viewer.mode = mode;
+    this.mode.value = mode;
+    setText("legend", LEGENDS[mode] ?? "");
+    this.viewer.draw();
+    this.noteLink();
+  }
+
+  private setDivided(): void {
+    this.divider.hidden = !this.divide.checked;
+    this.viewer.divided = this.divide.checked ? Number(this.divider.value) : null;
+    this.viewer.draw();
+  }
+
+  private goTo(index: number): void {
+    const camera = this.header?.cameras.at(index);
+    if (index < 0 || camera === undefined) return;
+    this.viewer.goTo(camera);
+    this.setCurrent(index);
+    this.noteLink();
+  }
+
+  private step(by: number): void {
+    const num = this.header?.cameras.length ?? 0;
+    if (num === 0) return;
+    const from = this.current ?? (by > 0 ? -1 : 0);
+    this.goTo((from + by + num) % num);
+  }
+
+  private leave(): void {
+    if (this.current !== null) this.setCurrent(null);
+    this.noteLink();
+  }
+
+  private setCurrent(index: number | null): void {
+    this.current = index;
+    this.camera.value = String(index ?? -1);
+    this.showPhotograph();
+  }
+
+  private showPhotograph(): void {
+    const index = this.current;
+    const isThere = index !== null && this.photographs.has(index);
+    element("photo", HTMLElement).hidden = !isThere;
+    this.photograph.hidden = !isThere;
+    if (isThere) {
+      this.photograph.src = `photographs/${index}.jpg`;
+      this.photograph.alt = `Photograph ${this.header?.cameras[index].name ?? ""}`;
+      this.placePhotograph();
+    }
+  }
+
+  /** Where the camera's image lies on the canvas, wiped to the slider's share. */
+  private placePhotograph(): void {
+    const { image, lens } = this.viewer;
+    const s = lens.fx / image.fx;
+    const share = Number(this.wipe.value);
+    const { style } = this.photograph;
+    style.left = `${(lens.width - image.width * s) / 2}px`;
+    style.top = `${(lens.height - image.height * s) / 2}px`;
+    style.width = `${image.width * s}px`;
+    style.height = `${image.height * s}px`;
+    style.clipPath = `inset(0 ${100 * (1 - share)}% 0 0)`;
+    style.visibility = share > 0 ? "visible" : "hidden";
+  }
+
+  private noteLink(): void {
+    clearTimeout(this.linkTimer);
+    this.linkTimer = window.setTimeout(() => {
+      // The address of a page that opens from the disk may not be changed everywhere.
+      try { history.replaceState(null, "", this.link); } catch { /* then it stays */ }
+    }, 400);
+  }
+
+  private get link(): string {
+    const { pose, image, mode } = this.viewer;
+    return linkOf({ pose, lens: image, mode });
+  }
+
+  private async copyLink(): Promise<void> {
+    const address = new URL(this.link, location.href).href;
+    const button = element("link", HTMLButtonElement);
+    try {
+      await navigator.clipboard.writeText(address);
+      button.textContent = "Copied";
+    } catch {
+      location.hash = this.link;
+      button.textContent = "In the address";
+    }
+    window.setTimeout(() => { button.textContent = "Copy link"; }, 1500);
+  }
+
+  private followLink(): boolean {
+    const view = viewOf(location.hash);
+    if (view === null) return false;
+    const { viewer } = this;
+    if (viewer.splats !== null) viewer.settle(viewer.splats);
+    viewer.pose = view.pose;
+    viewer.image = view.lens;
+    this.setMode(view.mode);
+    this.setCurrent(null);
+    viewer.draw();
+    return true;
+  }
+
+  private keep(): void {
+    const { pose, image } = this.viewer;
+    const K = [image.fx, image.skew, image.cx, 0, image.fy, image.cy, 0, 0, 1];
+    this.kept.push({ viewmat: viewmatOf(pose), K, size: [image.width, image.height] });
+    this.tellKept();
+  }
+
+  private save(): void {
+    const text = JSON.stringify({ format: "a2tg-jax path", version: 1, views: this.kept }, null, 1);
+    const anchor = document.createElement("a");
+    anchor.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
+    anchor.download = "path.json";
+    anchor.click();
+    URL.revokeObjectURL(anchor.href);
+    this.kept = [];
+    this.tellKept();
+  }
+
+  private tellKept(): void {
+    element("kept", HTMLElement).textContent = String(this.kept.length);
+    element("save", HTMLButtonElement).disabled = this.kept.length === 0;
+  }
+
+  private pressKey(event: KeyboardEvent): void {
+    if (event.altKey || event.metaKey || event.ctrlKey) return;
+    if (event.target instanceof HTMLSelectElement || event.target instanceof HTMLInputElement) return;
+    const mode = MODES.at(Number(event.key) - 1);
+    if (/^[1-7]$/.test(event.key) && mode !== undefined) this.setMode(mode);
+    else if (event.key === ",") this.step(-1);
+    else if (event.key === ".") this.step(1);
+    else if (event.key.toLowerCase() === "h") {
+      const panel = element("panel", HTMLDetailsElement);
+      panel.open = !panel.open;
+    }
+  }
+}
+
+async function toggleFullScreen(): Promise<void> {
+  if (document.fullscreenElement !== null) await document.exitFullscreen();
+  else await document.documentElement.requestFullscreen();
+}

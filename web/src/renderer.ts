@@ -1,0 +1,118 @@
+/** Draws splats: sorted back to front into a picture of half floats, then that onto the canvas. */
+
+import type { Lens, Pose } from "./camera";
+import { projection } from "./camera";
+import type { Ends } from "./format";
+import { Program, Target } from "./gl";
+import { MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from "./shaders";
+import type { Mode } from "./shaders";
+import type { Splats } from "./splats";
+
+/** What is drawn of the picture's columns. */
+interface Part {
+  readonly mode: Mode;
+  readonly from: number;
+  readonly to: number;
+}
+
+export class Renderer {
+  readonly gl: WebGL2RenderingContext;
+  readonly target: Target;
+  private readonly splat: Program;
+  private readonly screen: Program;
+  private readonly vertices: WebGLVertexArrayObject;
+  private readonly nothing: WebGLVertexArrayObject;
+
+  /** Throws where shaders are refused. */
+  constructor(gl: WebGL2RenderingContext) {
+    this.gl = gl;
+    this.target = new Target(gl);
+    this.splat = new Program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
+    this.screen = new Program(gl, SCREEN_VERTEX, SCREEN_FRAGMENT);
+    this.vertices = gl.createVertexArray();
+    this.nothing = gl.createVertexArray();
+  }
+
+  /** The picture of a pose, of the lens' size; `divided`: left of that share of the width with textures, right without. */
+  draw(splats: Splats, pose: Pose, lens: Lens, mode: Mode, divided: number | null = null): void {
+    const { gl, target } = this;
+    target.resize(lens.width, lens.height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
+    gl.viewport(0, 0, lens.width, lens.height);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (splats.numDrawn === 0) return;
+    this.prepare(splats, pose, lens);
+    const middle = divided === null ? lens.width : Math.round(divided * lens.width);
+    const parts: Part[] = [{ mode, from: 0, to: middle }];
+    if (middle < lens.width) parts.push({ mode: "plain", from: middle, to: lens.width });
+    for (const part of parts) this.drawPart(splats, lens, part);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.disable(gl.BLEND);
+  }
+
+  /** The picture on the canvas. */
+  present(splats: Splats, mode: Mode, depths: readonly [number, number], divided: number | null = null): void {
+    const { gl, screen } = this;
+    const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(screen.handle);
+    gl.bindVertexArray(this.nothing);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
+    gl.uniform1i(screen.at("picture"), 0);
+    gl.uniform2f(screen.at("screen"), width, height);
+    gl.uniform3fv(screen.at("background"), splats.header.background);
+    gl.uniform2fv(screen.at("depths"), depths);
+    gl.uniform1i(screen.at("mode"), MODES.indexOf(mode));
+    gl.uniform1f(screen.at("divider"), divided === null ? -1 : Math.round(divided * width));
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  private prepare(splats: Splats, pose: Pose, lens: Lens): void {
+    const { gl, splat } = this;
+    const { header } = splats;
+    gl.useProgram(splat.handle);
+    gl.bindVertexArray(this.vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, splats.order);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    const textures = { rows: splats.rows, harmonics: splats.harmonics, texels: splats.texels };
+    Object.entries(textures).forEach(([name, texture], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture.handle);
+      gl.uniform1i(splat.at(name), unit);
+    });
+    const ends = (name: string, { low, step }: Ends): void => { gl.uniform2f(splat.at(name), low, step); };
+    ends("scaleEnds", header.ends.log_scales);
+    ends("quatEnds", header.ends.quats);
+    ends("opacityEnds", header.ends.opacities);
+    ends("colorEnds", header.ends.colors);
+    ends("alphaEnds", header.ends.alphas);
+    for (let l = 0; l < 4; l++) ends(`harmonicEnds[${l}]`, header.ends[`sh_${l}`]);
+    const { alphas } = header.ends;
+    gl.uniform1f(splat.at("peak"), header.numTexels === null ? 1 : Math.max(1, alphas.low + 255 * alphas.step));
+    gl.uniform1f(splat.at("nearPlane"), header.nearPlane);
+    gl.uniform1f(splat.at("maxAlpha"), header.maxAlpha);
+    gl.uniform1i(splat.at("isClamped"), Number(header.outside === "clamp"));
+    gl.uniform1i(splat.at("isCentred"), Number(header.uv === "texel-centre"));
+    gl.uniform1i(splat.at("widthBits"), splats.widthBits);
+    gl.uniform4fv(splat.at("projection"), projection(pose, lens).flat());
+    gl.uniform3fv(splat.at("center"), pose.position);
+    gl.uniform2f(splat.at("size"), lens.width, lens.height);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  private drawPart(splats: Splats, lens: Lens, { mode, from, to }: Part): void {
+    const { gl } = this;
+    if (to <= from) return;
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(from, 0, to - from, lens.height);
+    gl.uniform1i(this.splat.at("mode"), MODES.indexOf(mode));
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, splats.numDrawn);
+  }
+}

@@ -1,0 +1,311 @@
+/**
+ * What a splat shows at a pixel, as a2tg_jax/pixel.py and a2tg_jax/geometry.py say it. Pictures are drawn upside down:
+ * gl_FragCoord then counts pixels as cameras do, y downwards, centres at +0.5.
+ */
+
+export const MODES = ["full", "plain", "texture", "resolution", "depth", "normals", "ellipses"] as const;
+export type Mode = (typeof MODES)[number];
+
+const HEADER = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp usampler2D;
+precision highp sampler2D;
+const int FULL = 0, PLAIN = 1, TEXTURE = 2, RESOLUTION = 3, DEPTH = 4, NORMALS = 5, ELLIPSES = 6;
+`;
+
+const TEXELS = `
+uniform sampler2D texels;
+uniform int widthBits;
+uniform vec2 colorEnds, alphaEnds;
+
+vec4 texelAt(uint index) {
+  ivec2 place = ivec2(int(index) & ((1 << widthBits) - 1), int(index >> widthBits));
+  vec4 code = texelFetch(texels, place, 0) * 255.0;
+  vec3 root = colorEnds.x + code.rgb * colorEnds.y;
+  return vec4(root * abs(root), alphaEnds.x + code.a * alphaEnds.y);
+}
+`;
+
+export const SPLAT_VERTEX = `${HEADER}${TEXELS}
+layout(location = 0) in uint row;
+
+uniform usampler2D rows, harmonics;
+uniform vec4 projection[3];
+uniform vec3 center;
+uniform vec2 size;
+uniform float nearPlane, peak;
+uniform vec2 scaleEnds, quatEnds, opacityEnds, harmonicEnds[4];
+uniform int mode;
+uniform bool isClamped;
+
+flat out vec4 axes;
+flat out vec3 plane;
+flat out vec3 mean;
+flat out vec4 shown;
+flat out uvec3 region;
+flat out vec3 own;
+
+const float SLACK = 1e-2;
+
+uvec4 wordsAt(usampler2D words, uint index) {
+  return texelFetch(words, ivec2(int(index) & ((1 << widthBits) - 1), int(index >> widthBits)), 0);
+}
+
+vec4 bytesOf(uint word) {
+  return vec4(uvec4(word, word >> 8, word >> 16, word >> 24) & 255u);
+}
+
+vec4 values(uint word, vec2 ends) { return ends.x + bytesOf(word) * ends.y; }
+
+// Coefficient k of 1 to 15, of those that begin at "first".
+vec3 coefficient(uvec4 words[4], int k, vec2 ends) { return values(words[(k - 1) >> 2][(k - 1) & 3], ends).rgb; }
+
+vec3 colorOf(vec3 base, uint first, int degree, vec3 d) {
+  vec3 sum = 0.28209479177387814 * base;
+  if (degree > 0) {
+    uvec4 words[4];
+    words[0] = wordsAt(harmonics, first);
+    words[1] = degree > 1 ? wordsAt(harmonics, first + 1u) : uvec4(0);
+    words[2] = degree > 2 ? wordsAt(harmonics, first + 2u) : uvec4(0);
+    words[3] = degree > 2 ? wordsAt(harmonics, first + 3u) : uvec4(0);
+    float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+    vec2 e = harmonicEnds[1];
+    sum += 0.4886025119029199
+      * (z * coefficient(words, 2, e) - y * coefficient(words, 1, e) - x * coefficient(words, 3, e));
+    if (degree > 1) {
+      e = harmonicEnds[2];
+      sum += 1.0925484305920792
+        * (x * y * coefficient(words, 4, e) - y * z * coefficient(words, 5, e) - x * z * coefficient(words, 7, e));
+      sum += 0.31539156525252005 * (2.0 * zz - xx - yy) * coefficient(words, 6, e);
+      sum += 0.5462742152960396 * (xx - yy) * coefficient(words, 8, e);
+    }
+    if (degree > 2) {
+      e = harmonicEnds[3];
+      sum -= 0.5900435899266435 * y * (3.0 * xx - yy) * coefficient(words, 9, e);
+      sum += 2.890611442640554 * x * y * z * coefficient(words, 10, e);
+      sum -= 0.4570457994644658 * y * (4.0 * zz - xx - yy) * coefficient(words, 11, e);
+      sum += 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(words, 12, e);
+      sum -= 0.4570457994644658 * x * (4.0 * zz - xx - yy) * coefficient(words, 13, e);
+      sum += 1.445305721320277 * z * (xx - yy) * coefficient(words, 14, e);
+      sum -= 0.5900435899266435 * x * (xx - 3.0 * yy) * coefficient(words, 15, e);
+    }
+  }
+  return max(sum + 0.5, 0.0);
+}
+
+// The columns of the rotation of a unit quaternion, w not negative.
+mat3 rotationOf(vec3 q) {
+  float squares = min(dot(q, q), 1.0);
+  vec4 p = normalize(vec4(q, sqrt(1.0 - squares)));
+  float x = p.x, y = p.y, z = p.z, w = p.w;
+  return mat3(
+    1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+    2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+    2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+// The corner of the box around a disc of which a part lies behind the near plane.
+vec2 clippedCorner(vec3 M[3], float reach, vec2 middle, float radius, vec2 side) {
+  vec2 low = middle - radius, high = middle + radius;
+  const int SIDES = 8;
+  float r = reach / cos(3.14159265358979 / float(SIDES));
+  vec3 before = vec3(0);
+  for (int i = 0; i <= SIDES; i++) {
+    float angle = float(i) * (2.0 * 3.14159265358979 / float(SIDES));
+    vec3 uv = vec3(r * cos(angle), r * sin(angle), 1.0);
+    vec3 point = vec3(dot(M[0], uv), dot(M[1], uv), dot(M[2], uv));
+    bool isBefore = point.z >= nearPlane;
+    if (isBefore) {
+      low = min(low, point.xy / point.z);
+      high = max(high, point.xy / point.z);
+    }
+    if (i > 0 && isBefore != (before.z >= nearPlane)) {
+      vec3 cut = mix(before, point, (nearPlane - before.z) / (point.z - before.z));
+      low = min(low, cut.xy / nearPlane);
+      high = max(high, cut.xy / nearPlane);
+    }
+    before = point;
+  }
+  vec2 margin = 1e-3 * (high - low) + SLACK;
+  return mix(max(low - margin, -1.0), min(high + margin, size + 1.0), side);
+}
+
+// The corner of the smallest turned box around an ellipse and the low-pass filter's circle.
+vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side) {
+  float depth = M[2].z;
+  vec2 last = M[2].xy, xs = M[0].xy - middle.x * last, ys = M[1].xy - middle.y * last;
+  float spread = r2 * dot(last, last);
+  if (depth - sqrt(spread) < nearPlane) return clippedCorner(M, sqrt(r2), middle, radius, side);
+  float factor = r2 / (depth * depth - spread);
+  vec2 shift = -factor * vec2(dot(xs, last), dot(ys, last));
+  float xx = (shift.x * shift.x + factor * dot(xs, xs)) * 1.0001 + SLACK;
+  float xy = (shift.x * shift.y + factor * dot(xs, ys)) * 1.0001;
+  float yy = (shift.y * shift.y + factor * dot(ys, ys)) * 1.0001 + SLACK;
+  float mid = 0.5 * (xx + yy), half_ = 0.5 * (xx - yy), root = length(vec2(half_, xy));
+  float angle = root > 1e-6 * mid ? 0.5 * atan(xy, half_) : 0.0;
+  vec2 major = vec2(cos(angle), sin(angle)), minor = vec2(-major.y, major.x);
+  vec2 reach = sqrt(vec2(mid + root, max(mid - root, 0.0))) * 1.0005 + 1e-2;
+  vec2 offset = vec2(dot(-shift, major), dot(-shift, minor));
+  vec2 low = min(-reach, offset - radius), high = max(reach, offset + radius);
+  vec2 place = mix(low, high, side);
+  return middle + shift + place.x * major + place.y * minor;
+}
+
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  axes = vec4(0); plane = vec3(0); mean = vec3(0); shown = vec4(0); region = uvec3(0); own = vec3(0);
+  uvec4 first = wordsAt(rows, 2u * row);
+  vec3 position = uintBitsToFloat(first.xyz);
+  float depth = dot(projection[2].xyz, position) + projection[2].w;
+  if (!(depth >= nearPlane)) return;
+  uvec4 second = wordsAt(rows, 2u * row + 1u);
+  float opacity = values(second.x, opacityEnds).a;
+  float cutoff = 2.0 * log(255.0 * opacity * peak);
+  if (mode == ELLIPSES) cutoff = opacity < 0.02 ? 0.0 : 2.0;
+  if (!(cutoff > 0.0)) return;
+
+  vec2 scales = exp(values(second.y, scaleEnds).xy);
+  mat3 R = rotationOf(values(second.x, quatEnds).xyz);
+  vec3 M[3];
+  for (int i = 0; i < 3; i++) {
+    vec4 p = projection[i];
+    M[i] = vec3(scales.x * dot(p.xyz, R[0]), scales.y * dot(p.xyz, R[1]), dot(p.xyz, position) + p.w);
+  }
+  vec2 middle = vec2(M[0].z, M[1].z) / depth;
+  vec2 side = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+  float radius = sqrt(cutoff / 2.0 + SLACK);
+  vec2 at = corner(M, cutoff, middle, radius, side);
+  gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);
+
+  // Seen from the projected mean, p0 = depth (b.y, -a.y, 0), p1 = depth (-b.x, a.x, 0), p2 = depth plane.
+  vec2 last = M[2].xy, a = M[0].xy - middle.x * last, b = M[1].xy - middle.y * last;
+  axes = vec4(b.y, -a.y, -b.x, a.x);
+  plane = vec3(b.x * last.y - b.y * last.x, last.x * a.y - last.y * a.x, a.x * b.y - a.y * b.x) / depth;
+  mean = vec3(middle, depth);
+
+  vec4 base = values(first.w, harmonicEnds[0]);
+  vec3 color = colorOf(base.rgb, second.w, int(first.w >> 24), normalize(position - center));
+  uvec2 sides = uvec2(second.y >> 16, second.y >> 24) & 255u;
+  region = uvec3(second.z, sides);
+  if (sides.x == 0u) region.yz = uvec2(0);
+  if (mode == PLAIN) region.yz = uvec2(0);
+  own = vec3(0.0);
+  if (isClamped && region.y == 1u && region.z == 1u) {
+    vec4 texel = texelAt(region.x);
+    own = texel.rgb;
+    opacity *= texel.a;
+    region.yz = uvec2(0);
+  }
+  if (mode == TEXTURE) color = vec3(0.5);
+  if (mode == RESOLUTION) {
+    float level = log2(float(max(sides.x * sides.y, 1u))) / 8.0;
+    float light = 0.35 + 0.65 * level;
+    bool isSquare = sides.x == sides.y;
+    color = sides.x * sides.y <= 1u ? vec3(0.16)
+      : isSquare ? mix(vec3(0.75, 0.82, 1.0), vec3(0.05, 0.15, 0.95), level)
+      : mix(vec3(1.0, 0.8, 0.75), vec3(0.95, 0.08, 0.05), level);
+    own = vec3(0.0);
+  }
+  if (mode == NORMALS) {
+    vec3 normal = R[2];
+    own = 0.5 + 0.5 * (dot(normal, center - position) < 0.0 ? -normal : normal);
+  }
+  if (mode == FULL || mode == TEXTURE || mode == ELLIPSES) color += own;
+  shown = vec4(color, opacity);
+}
+`;
+
+export const SPLAT_FRAGMENT = `${HEADER}${TEXELS}
+flat in vec4 axes;
+flat in vec3 plane;
+flat in vec3 mean;
+flat in vec4 shown;
+flat in uvec3 region;
+flat in vec3 own;
+
+uniform float nearPlane, maxAlpha;
+uniform int mode;
+uniform bool isClamped, isCentred;
+
+out vec4 fragment;
+
+vec4 textureAt(vec2 uv) {
+  vec2 sides = vec2(region.yz), unit = (uv * (1.0 / 3.0) + 1.0) * 0.5;
+  vec2 place = isCentred ? unit * sides - 0.5 : unit * (sides - 1.0);
+  place = clamp(place, vec2(0.0), sides - 1.0);
+  uvec2 low = min(uvec2(place), region.yz - 1u), high = min(low + 1u, region.yz - 1u);
+  vec2 f = place - vec2(low);
+  uint above = region.x + low.y * region.y, below = region.x + high.y * region.y;
+  return mix(
+    mix(texelAt(above + low.x), texelAt(above + high.x), f.x),
+    mix(texelAt(below + low.x), texelAt(below + high.x), f.x), f.y);
+}
+
+void main() {
+  vec2 offset = gl_FragCoord.xy - mean.xy;
+  float q = dot(plane.xy, offset) + plane.z;
+  float hitDepth = mean.z * plane.z / q;
+  bool isHit = q != 0.0 && hitDepth >= nearPlane;
+  vec2 uv = isHit ? vec2(dot(axes.xy, offset), dot(axes.zw, offset)) / q : vec2(0.0);
+  float rhoRay = dot(uv, uv), rhoScreen = 2.0 * dot(offset, offset);
+  bool isRay = isHit && rhoRay <= rhoScreen;
+  float rho = isRay ? rhoRay : rhoScreen;
+
+  if (mode == ELLIPSES) {
+    if (rho > 2.0) discard;
+    float edge = smoothstep(1.25, 1.6, rho);
+    fragment = vec4(mix(shown.rgb, vec3(0.02), 0.75 * edge), 1.0);
+    return;
+  }
+  float alpha = shown.a * exp(-0.5 * rho);
+  vec3 color = shown.rgb;
+  if (region.y > 0u) {
+    vec4 texel = textureAt(uv);
+    if (!isClamped && any(greaterThan(abs(uv), vec2(3.0)))) texel = vec4(0.0, 0.0, 0.0, 1.0);
+    if (mode == FULL || mode == TEXTURE) color += texel.rgb;
+    alpha *= texel.a;
+  }
+  if (alpha < 1.0 / 255.0) discard;
+  alpha = min(alpha, maxAlpha);
+  if (mode == DEPTH) color = vec3(isRay ? hitDepth : mean.z);
+  if (mode == NORMALS) color = own;
+  fragment = vec4(color * alpha, alpha);
+}
+`;
+
+export const SCREEN_VERTEX = `${HEADER}
+void main() {
+  vec2 side = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+  gl_Position = vec4(4.0 * side - 1.0, 0.0, 1.0);
+}
+`;
+
+export const SCREEN_FRAGMENT = `${HEADER}
+uniform sampler2D picture;
+uniform vec2 screen;
+uniform vec3 background;
+uniform vec2 depths;
+uniform int mode;
+uniform float divider;
+out vec4 fragment;
+
+// Near is bright, far is dark.
+vec3 ramp(float t) {
+  vec3 a = vec3(0.99, 0.90, 0.60), b = vec3(0.86, 0.35, 0.35), c = vec3(0.22, 0.10, 0.42), d = vec3(0.02, 0.02, 0.08);
+  return t < 0.33 ? mix(a, b, t / 0.33) : t < 0.66 ? mix(b, c, (t - 0.33) / 0.33) : mix(c, d, (t - 0.66) / 0.34);
+}
+
+void main() {
+  vec2 place = gl_FragCoord.xy / screen;
+  vec4 found = texture(picture, vec2(place.x, 1.0 - place.y));
+  vec3 color = found.rgb + (1.0 - found.a) * background;
+  if (mode == DEPTH) {
+    float depth = found.a > 0.02 ? found.r / found.a : depths.y;
+    color = ramp(clamp(log(depth / depths.x) / log(depths.y / depths.x), 0.0, 1.0));
+  }
+  if (mode == TEXTURE) color = found.rgb + (1.0 - found.a) * vec3(0.5);
+  if (divider >= 0.0 && abs(gl_FragCoord.x - divider) < 1.0) color = vec3(1.0);
+  fragment = vec4(color, 1.0);
+}
+`;

@@ -1,0 +1,101 @@
+/** A scene on the graphics processor, and the worker that sorts it. */
+
+import { LongTexture } from "./gl";
+import type { Header } from "./format";
+import type { Chunk } from "./chunks";
+import { Packer, mostHarmonics } from "./packing";
+import SortWorker from "./sort.worker?worker&inline";
+import type { AddMessage, OrderMessage, SortMessage } from "./sort.worker";
+
+export class Splats {
+  readonly header: Header;
+  readonly rows: LongTexture;
+  readonly harmonics: LongTexture;
+  readonly texels: LongTexture;
+  readonly order: WebGLBuffer;
+  readonly widthBits: number;
+  /** Rows that have come. */
+  num = 0;
+  /** Rows in the order that is drawn. */
+  numDrawn = 0;
+  numTexels = 0;
+  numBytes = 0;
+  /** Positions of the first rows, which show most: to find a place to stand. */
+  readonly sample: number[] = [];
+  /** Called when there is another order to draw. */
+  onOrder: () => void = () => undefined;
+
+  private readonly gl: WebGL2RenderingContext;
+  private readonly packer: Packer;
+  private readonly worker: Worker;
+  private isSorting = false;
+  private wanted: readonly number[] | null = null;
+  private sorted: { row: readonly number[]; num: number } | null = null;
+  private waiting: (() => void)[] = [];
+
+  constructor(gl: WebGL2RenderingContext, header: Header) {
+    this.gl = gl;
+    this.header = header;
+    this.widthBits = Math.min(12, Math.floor(Math.log2(gl.getParameter(gl.MAX_TEXTURE_SIZE) as number)));
+    this.rows = new LongTexture(gl, 2 * header.num, this.widthBits, true, "Gaussians");
+    this.harmonics = new LongTexture(gl, mostHarmonics(header), this.widthBits, true, "colours");
+    this.texels = new LongTexture(gl, header.numTexels ?? 0, this.widthBits, false, "texels");
+    this.order = gl.createBuffer();
+    this.packer = new Packer(header);
+    this.worker = new SortWorker();
+    this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => { this.receive(event.data); });
+  }
+
+  add(chunk: Chunk): void {
+    const packed = this.packer.pack(chunk);
+    this.rows.append(packed.rows);
+    this.harmonics.append(packed.harmonics);
+    this.texels.append(packed.texels);
+    this.numBytes += packed.rows.byteLength + packed.harmonics.byteLength + packed.texels.byteLength;
+    this.num += packed.num;
+    this.numTexels += packed.texels.length / 4;
+    if (this.sample.length < 3 * 4096) this.sample.push(...packed.means.subarray(0, 3 * 4096));
+    const message: AddMessage = { kind: "add", means: packed.means, total: this.header.num };
+    this.worker.postMessage(message, [packed.means.buffer]);
+  }
+
+  /** Asks for the order of these depths, row · (x, y, z, 1); the last one asked for wins. */
+  sort(row: readonly number[]): void {
+    if (this.sorted !== null && this.sorted.num === this.num && row.every((x, i) => x === this.sorted?.row[i])) return;
+    this.wanted = row;
+    this.next();
+  }
+
+  /** Resolves when the order asked for last is there. */
+  async settled(): Promise<void> {
+    if (!this.isSorting && this.wanted === null) return;
+    await new Promise<void>((resolve) => this.waiting.push(resolve));
+  }
+
+  delete(): void {
+    this.worker.terminate();
+    for (const texture of [this.rows, this.harmonics, this.texels]) texture.delete();
+    this.gl.deleteBuffer(this.order);
+  }
+
+  private next(): void {
+    if (this.isSorting || this.wanted === null) return;
+    const message: SortMessage = { kind: "sort", row: this.wanted };
+    [this.isSorting, this.wanted] = [true, null];
+    this.worker.postMessage(message);
+  }
+
+  private receive({ order, row }: OrderMessage): void {
+    const { gl } = this;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+    this.numDrawn = order.length;
+    this.sorted = { row, num: order.length };
+    this.isSorting = false;
+    if (this.wanted === null) {
+      for (const resolve of this.waiting.splice(0)) resolve();
+    }
+    this.next();
+    this.onOrder();
+  }
+}

@@ -1,0 +1,194 @@
+/** A scene on a canvas: what is looked at, from where, and when it is drawn anew. */
+
+import { aimed, fitted, overview, poseOf, projection } from "./camera";
+import type { Lens, Pose } from "./camera";
+import { Controls } from "./controls";
+import type { Steered } from "./controls";
+import { SceneError } from "./format";
+import type { Header, SceneCamera } from "./format";
+import { add, dot, norm, scale, subtract } from "./math";
+import type { Vec3 } from "./math";
+import { Renderer } from "./renderer";
+import type { Mode } from "./shaders";
+import { Splats } from "./splats";
+
+const SLOW = 45;
+const QUICK = 18;
+const COARSEST = 0.25;
+/** Milliseconds without a motion, after which the picture is drawn in full. */
+const REST = 160;
+
+export class Viewer implements Steered {
+  readonly canvas: HTMLCanvasElement;
+  splats: Splats | null = null;
+  pose: Pose = overview([0, 0, 0], 1, [0, 0, 1]);
+  /** Of the picture that one looks at; the canvas shows all of it, and more beside it. */
+  image: Lens = { fx: 600, fy: 600, cx: 400, cy: 300, skew: 0, width: 800, height: 600 };
+  up: Vec3 = [0, 0, 1];
+  extent = 1;
+  mode: Mode = "full";
+  /** Textures are shown left of this share of the width; null: everywhere. */
+  divided: number | null = null;
+  /** Called after each picture. */
+  onFrame: (milliseconds: number) => void = () => undefined;
+  /** Called when one has moved away from where one was put. */
+  onLeave: () => void = () => undefined;
+
+  private readonly gl: WebGL2RenderingContext;
+  private readonly renderer: Renderer;
+  private isWaiting = false;
+  private movedAt = -Infinity;
+  private coarseness = 1;
+  private drawnAt = 0;
+  private isSettled = true;
+
+  /** Throws a SceneError where there is no WebGL 2. */
+  constructor(canvas: HTMLCanvasElement) {
+    this.canvas = canvas;
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
+    if (gl === null) {
+      throw new SceneError(
+        "This browser offers no WebGL 2, which the viewer draws with. Another browser, or hardware acceleration " +
+          "switched on in this one's settings, may help.",
+      );
+    }
+    this.gl = gl;
+    this.renderer = new Renderer(gl);
+    new Controls(canvas, this);
+    new ResizeObserver(() => { this.draw(); }).observe(canvas);
+  }
+
+  /** Begins a scene; it takes the place of the one before once its first rows are sorted. */
+  begin(header: Header): Splats {
+    const splats = new Splats(this.gl, header);
+    splats.onOrder = () => {
+      if (this.splats !== splats) {
+        this.splats?.delete();
+        this.splats = splats;
+      }
+      this.draw();
+    };
+    return splats;
+  }
+
+  /** Sorts a scene for the present view. */
+  sort(splats: Splats): void {
+    splats.sort(this.depthRow);
+  }
+
+  /** Finds out how large the scene is and which way is up, and goes to its first camera. */
+  settle(splats: Splats): void {
+    const { cameras } = splats.header;
+    const { centre, radius } = middleOf(splats.sample);
+    this.up = cameras.length > 0 ? [0, 0, 1] : [0, -1, 0];
+    this.extent = cameras.length > 0 ? 1 : radius;
+    if (cameras.length > 0) this.goTo(cameras[0]);
+    else this.pose = overview(centre, radius, this.up);
+  }
+
+  goTo(camera: SceneCamera): void {
+    const [fx, skew, cx, , fy, cy] = camera.K;
+    this.image = { fx, fy, cx, cy, skew, width: camera.size[0], height: camera.size[1] };
+    const pose = poseOf(camera.viewmat, 1);
+    // What one turns around lies near the middle of the scene.
+    this.pose = { ...pose, focus: Math.max(-dot(pose.position, pose.rotation[2]), 0.2 * this.extent) };
+    this.draw();
+  }
+
+  /** The lens for the canvas, in pixels as the page counts them. */
+  get lens(): Lens {
+    return fitted(this.image, Math.max(this.canvas.clientWidth, 1), Math.max(this.canvas.clientHeight, 1));
+  }
+
+  onMove(): void {
+    this.movedAt = performance.now();
+    this.onLeave();
+    this.draw();
+  }
+
+  /** Turns around what is seen at a point of the canvas. */
+  onAim(x: number, y: number): void {
+    const { lens, splats } = this;
+    if (splats === null) return;
+    this.renderer.draw(splats, this.pose, lens, "depth");
+    const column = Math.min(Math.max(Math.floor(x), 0), lens.width - 1);
+    const row = Math.min(Math.max(Math.floor(y), 0), lens.height - 1);
+    const [depth, , , alpha] = this.renderer.target.read(column, row, 1, 1);
+    if (alpha > 0.1) {
+      const z = depth / alpha;
+      const [right, down, forward] = this.pose.rotation;
+      const across = scale(right, ((x - lens.cx) / lens.fx) * z);
+      const below = scale(down, ((y - lens.cy) / lens.fy) * z);
+      this.pose = aimed(this.pose, add(this.pose.position, add(add(across, below), scale(forward, z))));
+    }
+    this.onMove();
+  }
+
+  /** Draws at the next occasion. */
+  draw(): void {
+    if (this.isWaiting) return;
+    this.isWaiting = true;
+    requestAnimationFrame((time) => { this.frame(time); });
+  }
+
+  /** The picture of a pose and a lens as numbers, [h, w, 4], rows from the top: colours times alpha, and alpha. */
+  async read(pose: Pose, lens: Lens, mode: Mode): Promise<Float32Array> {
+    const { splats } = this;
+    if (splats === null) throw new SceneError("There is no scene yet.");
+    splats.sort(projection(pose, lens)[2]);
+    await splats.settled();
+    this.renderer.draw(splats, pose, lens, mode);
+    const found = this.renderer.target.read(0, 0, lens.width, lens.height);
+    this.draw();
+    return found;
+  }
+
+  private get depthRow(): readonly number[] {
+    return projection(this.pose, this.lens)[2];
+  }
+
+  private frame(time: number): void {
+    this.isWaiting = false;
+    const { splats, canvas } = this;
+    if (splats === null || this.gl.isContextLost()) return;
+    splats.sort(this.depthRow);
+    const isMoving = performance.now() - this.movedAt < REST;
+    if (isMoving && !this.isSettled) this.adapt(time - this.drawnAt);
+    const share = (isMoving ? this.coarseness : 1) * Math.min(window.devicePixelRatio, 2);
+    const width = Math.max(Math.round(canvas.clientWidth * share), 1);
+    const height = Math.max(Math.round(canvas.clientHeight * share), 1);
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    const began = performance.now();
+    this.renderer.draw(splats, this.pose, fitted(this.image, width, height), this.mode, this.divided);
+    this.renderer.present(splats, this.mode, this.depths, this.divided);
+    this.onFrame(performance.now() - began);
+    this.drawnAt = time;
+    this.isSettled = !isMoving;
+    if (isMoving) this.draw();
+  }
+
+  /** Fewer pixels while one moves, where pictures are slow to come. */
+  private adapt(milliseconds: number): void {
+    if (milliseconds > SLOW) this.coarseness = Math.max(this.coarseness * 0.8, COARSEST);
+    else if (milliseconds < QUICK) this.coarseness = Math.min(this.coarseness * 1.05, 1);
+  }
+
+  /** From where to where depths are told apart. */
+  private get depths(): readonly [number, number] {
+    return [0.3 * this.pose.focus, 5 * this.pose.focus];
+  }
+}
+
+/** Where most of the positions [x, y, z, …] lie. */
+function middleOf(positions: readonly number[]): { centre: Vec3; radius: number } {
+  if (positions.length === 0) return { centre: [0, 0, 0], radius: 1 };
+  const axis = (k: number): number[] => positions.filter((_, i) => i % 3 === k);
+  const centre = [0, 1, 2].map((k) => quantile(axis(k), 0.5)) as unknown as Vec3;
+  const [xs, ys, zs] = [axis(0), axis(1), axis(2)];
+  const distances = xs.map((x, i) => norm(subtract([x, ys[i], zs[i]], centre)));
+  return { centre, radius: Math.max(quantile(distances, 0.75), 1e-6) };
+}
+
+function quantile(values: number[], share: number): number {
+  return values.sort((a, b) => a - b)[Math.floor(share * (values.length - 1))];
+}

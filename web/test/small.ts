@@ -1,0 +1,11 @@
+/** A small scene, and the numbers that another reader found in it (tests/viewer_cases.py). */
+
+import { readFileSync } from "node:fs";
+
+const at = (name: string): URL => new URL(name, import.meta.url);
+
+export const SMALL: Uint8Array<ArrayBuffer> = Uint8Array.from(readFileSync(at("small.a2tgw")));
+export const NUMBERS = JSON.parse(readFileSync(at("small.json"), "utf8")) as Record<
+  "means" | "log_scales" | "quats" | "opacities" | "degrees" | "sizes" | "sh" | "texels",
+  number[]
+>;

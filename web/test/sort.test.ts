@@ -1,0 +1,28 @@
+import { expect, test } from "vitest";
+
+import { DepthSorter } from "../src/sort";
+
+function drawn(num: number, seed: number): Float32Array {
+  let state = seed;
+  return Float32Array.from({ length: 3 * num }, () => {
+    state = (Math.imul(state, 1664525) + 1013904223) >>> 0;
+    return Math.round((state / 2 ** 32 - 0.5) * 400) / 10;
+  });
+}
+
+test.each([0, 1, 2, 257, 5000])("%i positions, from the farthest to the nearest, ties from the last", (num) => {
+  const means = drawn(num, num + 1);
+  const row = [0.25, -0.5, 1, 2];
+  const depths = Float32Array.from({ length: num }, (_, i) =>
+    row[0] * means[3 * i] + row[1] * means[3 * i + 1] + row[2] * means[3 * i + 2] + row[3]);
+  const wanted = [...depths.keys()].sort((a, b) => depths[b] - depths[a] || b - a);
+  expect([...new DepthSorter().sort(means, num, row)]).toEqual(wanted);
+});
+
+test("fewer and more positions than before", () => {
+  const sorter = new DepthSorter();
+  const means = drawn(300, 3);
+  const first = sorter.sort(means, 300, [0, 0, 1, 0]);
+  expect(sorter.sort(means, 10, [0, 0, 1, 0]).length).toBe(10);
+  expect([...sorter.sort(means, 300, [0, 0, 1, 0])]).toEqual([...first]);
+});

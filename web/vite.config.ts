@@ -1,0 +1,17 @@
+import { defineConfig } from "vite";
+
+import { onefile } from "./scripts/onefile.ts";
+
+export default defineConfig({
+  base: "./",
+  build: {
+    target: "es2022",
+    modulePreload: false,
+    cssCodeSplit: false,
+    assetsInlineLimit: 1_000_000,
+    outDir: "dist",
+    reportCompressedSize: false,
+  },
+  worker: { format: "es" },
+  plugins: [onefile()],
+});
