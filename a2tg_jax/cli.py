@@ -1,4 +1,4 @@
-"""The command line `a2tg`: demo, train, eval, render, compress, info, sfm."""
+"""The command line `a2tg`: demo, train, eval, render, view, export, compress, info, sfm."""
 
 import dataclasses
 import inspect
@@ -17,6 +17,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax import signals
 from a2tg_jax.arguments import parse
+from a2tg_jax.cli_view import Export, View
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.results.checks import check_apart, check_weights
@@ -64,6 +65,8 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg train scene/ --out runs/scene   train a scene, evaluate, write a report
   a2tg eval runs/scene                 measure a run again
   a2tg render runs/scene               frames and a video of a flight, or the test views
+  a2tg view runs/scene                 look at it in a browser; also *.npz, *.a2tgz and *.ply
+  a2tg export runs/scene --web out/    the same for a web server, or as one HTML file
   a2tg compress runs/scene             a small file of the model that it left
   a2tg info runs/scene                 what a run folder holds
 
@@ -282,9 +285,10 @@ class Sfm:
         print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
 
 
-Command = Demo | Train | Eval | Render | Compress | Info | Sfm
+Command = Demo | Train | Eval | Render | View | Export | Compress | Info | Sfm
 COMMANDS: dict[str, type] = {
-    "demo": Demo, "train": Train, "eval": Eval, "render": Render, "compress": Compress, "info": Info, "sfm": Sfm,
+    "demo": Demo, "train": Train, "eval": Eval, "render": Render, "view": View, "export": Export,
+    "compress": Compress, "info": Info, "sfm": Sfm,
 }  # fmt: skip
 
 

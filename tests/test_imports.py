@@ -33,9 +33,10 @@ LAYERS = (
     {"splitting"},
     {"least_squares"},
     {"training"},
-    {"systems", "evaluation", "compaction"},
+    {"systems", "evaluation", "compaction", "web"},
     {"shrinking"},
     {"results"},
+    {"cli_view"},
     {"cli"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""

@@ -1,0 +1,163 @@
+"""What the viewer is given: a run's model or any other, as a scene for browsers, and its photographs."""
+
+import dataclasses
+import functools
+import io
+import json
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from a2tg_jax.data import Scene, View, view_image
+from a2tg_jax.io.compact import load_compact
+from a2tg_jax.io.model import load_model
+from a2tg_jax.io.ply import load_ply
+from a2tg_jax.io.web_scene import encode_web_scene
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings
+from a2tg_jax.results.evaluate_run import settings_of
+from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.pictures import to_uint8
+from a2tg_jax.results.record import read_record
+from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, photograph_name
+from a2tg_jax.web.server import Route
+
+QUALITY = 90
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A model, and what is known of it."""
+
+    model: Model
+    title: str
+    note: str = ""
+    """What the viewer says about it."""
+    settings: RenderSettings = RenderSettings()  # noqa: RUF009 - frozen
+    """How it is rendered."""
+    load_scene: Callable[[], Scene | None] = lambda: None
+    """The photographs; None where there are none."""
+
+    @functools.cached_property
+    def near_plane(self) -> float:
+        """Hits nearer than this do not show; small in the world of a file of which no size is known."""
+        if self.model.origin is not None or not self.model.num:
+            return self.settings.near_plane
+        return min(self.settings.near_plane, 0.02 * middle_of(self.model)[1])
+
+    @functools.cached_property
+    def encoded(self) -> bytes:
+        """The scene for browsers. Raises ValueError where they cannot show it."""
+        return encode_web_scene(self.model, title=self.title, note=self.note, near_plane=self.near_plane)
+
+
+def open_source(path: Path, name: str | None = None) -> Source:
+    """What a path leads to.
+
+    Args:
+      path: a run folder; or a model, *.npz or *.a2tgz; or Gaussians, *.ply.
+      name: which model of a run, by the name that `a2tg info` tells; None is the last of its main system.
+
+    Raises:
+      FileNotFoundError: if there is no such file, or the run's stage is not finished.
+      ValueError: if it cannot be read.
+    """
+    if path.is_dir():
+        return _source_of_run(open_run(path), name)
+    if name is not None:
+        raise ValueError(f"--model is one of a run folder's models; {path} is no folder")
+    if path.suffix == ".ply":
+        return _source_of_ply(path)
+    load = load_compact if path.suffix == ".a2tgz" else load_model
+    return Source(load(path), path.stem)
+
+
+def _source_of_run(run: RunFolder, name: str | None) -> Source:
+    record = read_record(run)
+    planned = record.plan[record.plan.main[-1] if name is None else name]
+    path = run.model(planned.name)
+    if not path.is_file():
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+
+    def load_scene() -> Scene | None:
+        try:
+            return record.scene.load()
+        except (FileNotFoundError, ValueError):
+            return None  # The photographs are gone; the model shows itself.
+
+    title = f"{Path(record.scene.path).name} · {planned.name}"
+    return Source(load_model(path), title, settings=settings_of(planned.system), load_scene=load_scene)
+
+
+def _source_of_ply(path: Path) -> Source:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        gaussians = load_ply(path)
+    notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
+    for note in notes:
+        warnings.warn(f"{path}: {note}", stacklevel=3)
+    return Source(Model(gaussians), path.stem, ". ".join(notes))
+
+
+# Photographs
+
+
+class Photographs:
+    """Those of the cameras that a model knows, as JPEG, read when they are asked for."""
+
+    def __init__(self, source: Source):
+        self._source = source
+        self._lock = threading.Lock()
+        self._views: dict[int, View] | None = None
+
+    @property
+    def views(self) -> dict[int, View]:
+        """By the index of the camera."""
+        with self._lock:
+            if self._views is None:
+                self._views = self._found()
+            return self._views
+
+    def jpeg(self, index: int) -> bytes | None:
+        """A photograph over the model's background, of its camera's size."""
+        view = self.views.get(index)
+        if view is None:
+            return None
+        buffer = io.BytesIO()
+        pixels = to_uint8(view_image(view, self._source.model.background))
+        Image.fromarray(pixels).save(buffer, format="JPEG", quality=QUALITY)
+        return buffer.getvalue()
+
+    def _found(self) -> dict[int, View]:
+        origin = self._source.model.origin
+        scene = None if origin is None else self._source.load_scene()
+        if origin is None or scene is None:
+            return {}
+        by_name = {view.name: view for view in (*scene.train, *scene.test)}
+        return {index: by_name[name] for index, name in enumerate(origin.names) if name in by_name}
+
+
+def routes_of(source: Source) -> dict[str, Route]:
+    """What the viewer's server answers."""
+    photographs = Photographs(source)
+    num_cameras = 0 if source.model.origin is None else len(source.model.origin.names)
+    routes = {
+        "/": Route("text/html; charset=utf-8", page().encode()),
+        f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
+        f"/{PHOTOGRAPHS_NAME}": Route("application/json", lambda: json.dumps(sorted(photographs.views)).encode()),
+    }
+    for index in range(num_cameras):
+        jpeg = functools.partial(photographs.jpeg, index)
+        routes[f"/{photograph_name(index)}"] = Route("image/jpeg", jpeg)
+    return routes
+
+
+def middle_of(model: Model) -> tuple[np.ndarray, float]:
+    """Where most means lie: [3], and the radius that holds three quarters."""
+    means = np.asarray(model.live.gaussians.means, np.float64)
+    centre = np.median(means, axis=0)
+    return centre, float(max(np.quantile(np.linalg.norm(means - centre, axis=1), 0.75), 1e-6))

@@ -1,0 +1,112 @@
+"""The viewer's page for any web server, or as one file, with a scene; and what its file of the scene loses."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
+from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.web_scene import decode_web_scene
+from a2tg_jax.model import Model
+from a2tg_jax.results.viewing import Photographs, Source, middle_of
+from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, page_with, photograph_name
+
+MOST_VIEWS = 8
+"""So many views are measured, evenly chosen."""
+RING_SIZE = (320, 240)
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    path: Path
+    """The page."""
+    num_bytes: int
+    """Of the scene's file, alone."""
+    model: Model
+    losses: Mapping[str, float]
+    """dB of PSNR that the file loses, by what they are measured on."""
+
+
+def export_web(source: Source, out: Path, *, single_file: bool = False, photographs: bool = False) -> Exported:
+    """Writes a page that shows a model: a folder for any web server, or one file that opens from the disk.
+
+    Args:
+      source: the model.
+      out: the folder, which is made; or the file, by custom *.html.
+      single_file: the scene stands in the page.
+      photographs: into the folder go the cameras' photographs too.
+
+    Raises:
+      ValueError: if browsers cannot show the model, or photographs are asked for where there are none, or in one file.
+    """
+    if single_file and photographs:
+        raise ValueError("--photographs lie in a folder beside the page: leave out --single-file")
+    if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
+        raise ValueError(f"{out} holds a page that is not the viewer's; choose another folder with --web")
+    data = source.encoded
+    files = {out: page_with(data).encode()} if single_file else _files_of(source, out, photographs)
+    for path, content in files.items():
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+    return Exported(out if single_file else out / "index.html", len(data), source.model, _losses_of(source))
+
+
+def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
+    files = {out / SCENE_NAME: source.encoded}
+    if photographs:
+        found = Photographs(source)
+        if not found.views:
+            raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
+        files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
+        files[out / PHOTOGRAPHS_NAME] = json.dumps(sorted(found.views)).encode()
+    return files | {out / "index.html": page().encode()}
+
+
+def exported_text(result: Exported) -> str:
+    """What was written, how large it is, and what it loses."""
+    model, size = result.model, result.num_bytes
+    lines = [f"{model.num:,} Gaussians, {model.num_bytes:,} bytes of numbers, {size:,} in the scene's file: "
+             f"1/{model.num_bytes / max(size, 1):.1f}"]  # fmt: skip
+    lines += [f"{loss:+.3f} dB of PSNR lost, {measure}" for measure, loss in result.losses.items()]
+    return "\n".join(lines)
+
+
+def _losses_of(source: Source) -> dict[str, float]:
+    """What the file loses: on photographs where there are some, else beside renders."""
+    if not source.model.num:
+        return {}
+    settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
+    again = decode_web_scene(source.encoded).model
+    scene = source.load_scene()
+    if scene is not None:
+        views = {"training views": scene.train, "test views": scene.test}
+        chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
+        model = source.model
+        return {name: loss_on_views(model, found, settings=settings)(again) for name, found in chosen.items()}
+    cameras = _ring(source.model) if source.model.origin is None else source.model.origin.cameras
+    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    loss = loss_beside_renders(source.model, cameras, settings=settings)(again)
+    return {f"were it a model of {ASSUMED_PSNR:g} dB": loss}
+
+
+def _ring(model: Model) -> list[Camera]:
+    """Cameras around a model that knows none, which look at its middle."""
+    centre, radius = middle_of(model)
+    width, height = RING_SIZE
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
+    cameras = []
+    for angle in np.arange(MOST_VIEWS) * (2 * np.pi / MOST_VIEWS):
+        forward = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        right = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.stack([right, [0.0, 1.0, 0.0], forward])
+        viewmat[:3, 3] = viewmat[:3, :3] @ (2.5 * radius * forward - centre)
+        cameras.append(Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), width, height))
+    return cameras

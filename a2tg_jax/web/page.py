@@ -1,0 +1,28 @@
+"""The viewer's page, one HTML file with script and style inside, and what lies beside it or in it."""
+
+import base64
+from importlib import resources
+
+SCENE_NAME = "scene.a2tgw"
+"""What the page looks for beside itself."""
+PHOTOGRAPHS_NAME = "photographs.json"
+"""A list of the cameras whose photographs lie beside the page, as `photograph_name` names them."""
+
+
+def page() -> str:
+    """The page, which shows the scene that lies beside it."""
+    return resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+
+
+def page_with(scene: bytes) -> str:
+    """The page with a scene in it: it needs no other file."""
+    before, end, after = page().rpartition("</body>")
+    data = base64.b64encode(scene).decode("ascii")
+    # Text that no browser runs, so that the page's policy needs to allow nothing more; it stands before the script.
+    head, script, rest = before.partition('<script type="module">')
+    return f'{head}<script type="text/plain" id="scene-data">{data}</script>\n  {script}{rest}{end}{after}'
+
+
+def photograph_name(index: int) -> str:
+    """Where the photograph of a camera lies."""
+    return f"photographs/{index}.jpg"

@@ -1,0 +1,100 @@
+"""A page and its files, from memory, for browsers of this machine alone; the server itself is waitress'."""
+
+import dataclasses
+import importlib
+import socket
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+LOOPBACK = "127.0.0.1"
+HEADERS = (
+    ("Cache-Control", "no-store"),
+    ("Content-Security-Policy", "frame-ancestors 'none'"),
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+    ("Referrer-Policy", "no-referrer"),
+    ("X-Content-Type-Options", "nosniff"),
+)
+
+StartResponse = Callable[[str, list[tuple[str, str]]], Any]
+Application = Callable[[Mapping[str, Any], StartResponse], Iterable[bytes]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Route:
+    """What is answered at a path."""
+
+    content_type: str
+    content: bytes | Callable[[], bytes | None]
+    """The bytes; or what finds them each time that they are asked for, None where there are none."""
+
+    def read(self) -> bytes | None:
+        return self.content() if callable(self.content) else self.content
+
+
+def application(routes: Mapping[str, Route], port: int) -> Application:
+    """Answers GET and HEAD at the paths of `routes`, such as "/", and nothing else.
+
+    A request must name this machine as the host it asks: a page from elsewhere, whose name is made to lead here, cannot
+    read the scene.
+    """
+    hosts = {f"{name}:{port}" for name in (LOOPBACK, "localhost")}
+
+    def answer(environ: Mapping[str, Any], start_response: StartResponse) -> Iterable[bytes]:
+        def refuse(status: str) -> list[bytes]:
+            start_response(status, [("Content-Type", "text/plain"), *HEADERS])
+            return [status.encode()]
+
+        if environ.get("HTTP_HOST") not in hosts:
+            return refuse("403 Forbidden")
+        if environ["REQUEST_METHOD"] not in ("GET", "HEAD"):
+            return refuse("405 Method Not Allowed")
+        route = routes.get(environ["PATH_INFO"] or "/")
+        body = None if route is None else route.read()
+        if route is None or body is None:
+            return refuse("404 Not Found")
+        start_response("200 OK", [("Content-Type", route.content_type), ("Content-Length", str(len(body))), *HEADERS])
+        return [body] if environ["REQUEST_METHOD"] == "GET" else []
+
+    return answer
+
+
+def serve(routes: Mapping[str, Route], *, port: int = 0, on_start: Callable[[str], None] = print) -> None:
+    """Serves until the process is interrupted.
+
+    Args:
+      routes: what is answered, by path.
+      port: on this machine; 0 is a free one.
+      on_start: called with the address once it answers.
+
+    Raises:
+      ValueError: if waitress is not installed, or the port is taken.
+    """
+    server = open_server(routes, port=port)
+    on_start(f"http://{LOOPBACK}:{server.effective_port}/")
+    server.run()
+
+
+def open_server(routes: Mapping[str, Route], *, port: int = 0) -> Any:
+    """A server of waitress that listens, and answers once it is run. Raises as `serve` does."""
+    try:
+        waitress: Any = importlib.import_module("waitress")
+    except ImportError as error:
+        raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
+    listening = _listening(port)
+    app = application(routes, listening.getsockname()[1])
+    return waitress.create_server(app, sockets=[listening], threads=4, ident=None)
+
+
+def _listening(port: int) -> socket.socket:
+    """A socket bound to a port of the loopback."""
+    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        if sys.platform != "win32":  # There it would let two programs share the port.
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        found.bind((LOOPBACK, port))
+    except (OSError, OverflowError) as error:
+        found.close()
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"port {port} cannot be used: {reason}; leave --port out for a free one") from error
+    return found

@@ -1,0 +1,223 @@
+"""`a2tg view` and `a2tg export`: what is served, to whom, and what a page holds."""
+
+import base64
+import hashlib
+import http.client
+import importlib
+import io
+import json
+import re
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_values import some_gaussians
+from test_compact import textured
+
+from a2tg_jax.cli import main
+from a2tg_jax.data import synthetic_scene
+from a2tg_jax.io.compact import save_compact
+from a2tg_jax.io.model import save_model
+from a2tg_jax.io.ply import save_ply
+from a2tg_jax.io.web_scene import decode_web_scene
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.results.viewing import Photographs, Source, open_source, routes_of
+from a2tg_jax.results.web_export import export_web, exported_text
+from a2tg_jax.web.page import page, page_with
+from a2tg_jax.web.server import Route, application, open_server
+
+
+def ask(app, path="/", method="GET", host="127.0.0.1:80"):
+    """Status, headers and body of an answer."""
+    told = []
+    environ = {"REQUEST_METHOD": method, "PATH_INFO": path, "HTTP_HOST": host}
+    body = b"".join(app(environ, lambda status, headers: told.append((status, dict(headers)))))
+    ((status, headers),) = told
+    return int(status[:3]), headers, body
+
+
+# The server
+
+
+APP = application(
+    {"/": Route("text/html", b"page"), "/lazy": Route("x/y", lambda: b"late"), "/none": Route("x/y", lambda: None)}, 80
+)
+
+
+def test_known_paths_are_answered():
+    status, headers, body = ask(APP)
+    assert (status, body, headers["Content-Type"], headers["Content-Length"]) == (200, b"page", "text/html", "4")
+    assert (
+        headers["X-Content-Type-Options"] == "nosniff"
+        and "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    )
+    assert ask(APP, "/lazy")[2] == b"late"
+    status, headers, body = ask(APP, method="HEAD")
+    assert (status, body, headers["Content-Length"]) == (200, b"", "4")
+
+
+@pytest.mark.parametrize("path", ["/none", "/../etc/passwd", "//", "/lazy/", "/%2e%2e/", "lazy", "/scene.a2tgw?x"])
+def test_other_paths_are_not(path):
+    assert ask(APP, path)[0] == 404
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:81", "localhost:8080", "", None])
+def test_other_hosts_are_refused(host):
+    assert ask(APP, host=host)[0] == 403
+
+
+def test_other_methods_are_refused():
+    assert [ask(APP, method=method)[0] for method in ("POST", "PUT", "DELETE", "OPTIONS")] == [405] * 4
+    assert ask(APP, host="localhost:80")[0] == 200
+
+
+def test_a_server_listens_on_the_loopback_alone():
+    server = open_server({"/": Route("text/plain", b"here")})
+    assert server.effective_host == "127.0.0.1" and int(server.effective_port) > 0
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    try:
+        connection = http.client.HTTPConnection("127.0.0.1", int(server.effective_port), timeout=20)
+        connection.request("GET", "/")
+        answer = connection.getresponse()
+        assert (answer.status, answer.read()) == (200, b"here")
+        connection.request("GET", "/elsewhere")
+        assert connection.getresponse().read() == b"404 Not Found"
+        connection.close()
+        with pytest.raises(ValueError, match=f"port {server.effective_port} cannot be used"):
+            open_server({}, port=int(server.effective_port))
+    finally:
+        server.close()
+        server.task_dispatcher.shutdown()
+        thread.join(timeout=20)
+
+
+def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys):
+    save_ply(tmp_path / "a.ply", some_gaussians())
+    true_import = importlib.import_module
+
+    def missing(name, *rest):
+        if name == "waitress":
+            raise ImportError(name)
+        return true_import(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    assert main(["view", str(tmp_path / "a.ply"), "--no-open"]) == 2
+    assert (
+        capsys.readouterr().err == "a2tg: error: the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'\n"
+    )
+
+
+# The page
+
+
+def test_the_policy_allows_the_page_its_own_script_and_style_and_nothing_else():
+    text = page()
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)
+    assert policy is not None and "default-src 'none'" in policy[1] and "unsafe" not in policy[1]
+
+    def hashed(pattern):
+        found = re.findall(pattern, text, re.DOTALL)
+        assert len(found) == 1
+        return "'sha256-" + base64.b64encode(hashlib.sha256(found[0].encode()).digest()).decode() + "'"
+
+    assert f"script-src {hashed(r'<script[^>]*>(.*?)</script>')};" in policy[1]
+    assert f"style-src {hashed(r'<style>(.*?)</style>')};" in policy[1]
+    assert len(text) < 300_000 and not re.search(r"""(src|href)=["']?(https?:)?//""", text)
+
+
+def test_a_page_holds_a_scene():
+    text = page_with(b"\x00<script>\xff")
+    assert text.count("<script") == page().count("<script") + 1
+    data = re.search(r'<script type="text/plain" id="scene-data">([A-Za-z0-9+/=]*)</script>', text)
+    assert data is not None and base64.b64decode(data[1]) == b"\x00<script>\xff"
+
+
+# What is shown
+
+
+def test_models_compact_scenes_and_point_clouds_are_opened(tmp_path):
+    model = textured()
+    save_model(tmp_path / "a.npz", model)
+    save_compact(tmp_path / "b.a2tgz", model)
+    save_ply(tmp_path / "c.ply", some_gaussians())
+    for name, num in (("a.npz", model.num), ("b.a2tgz", model.num), ("c.ply", some_gaussians().num)):
+        source = open_source(tmp_path / name)
+        assert source.model.num == num and source.title == name[0] and not source.note
+        assert decode_web_scene(source.encoded).header["title"] == name[0]
+
+
+def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
+    path = tmp_path / "thick.ply"
+    save_ply(path, some_gaussians(), third_scale=True)
+    data = path.read_bytes()
+    head, end, body = data.partition(b"end_header\n")
+    names = re.findall(rb"property float (\w+)", head)
+    rows = np.frombuffer(body, "<f4").reshape(-1, len(names)).copy()
+    rows[:, names.index(b"scale_2")] = rows[:, names.index(b"scale_0")]
+    path.write_bytes(head + end + rows.tobytes())
+    with pytest.warns(UserWarning, match="thinnest axis is dropped"):
+        source = open_source(path)
+    assert "3D Gaussians" in source.note and str(path) not in source.note
+    assert decode_web_scene(source.encoded).header["note"] == source.note
+
+
+@pytest.mark.parametrize("name", ["nowhere.npz", "nowhere.a2tgz", "nowhere.ply", "nowhere"])
+def test_missing_files(tmp_path, capsys, name):
+    assert main(["view", str(tmp_path / name), "--no-open"]) == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_a_model_is_chosen_in_run_folders_only(tmp_path, capsys):
+    save_ply(tmp_path / "c.ply", some_gaussians())
+    assert main(["view", str(tmp_path / "c.ply"), "--no-open", "--model", "a2tg-textures"]) == 2
+    assert "is no folder" in capsys.readouterr().err
+
+
+def test_a_model_that_knows_no_scene_has_no_photographs():
+    routes = routes_of(Source(textured(), "a"))
+    assert json.loads(routes["/photographs.json"].read()) == []
+    assert routes["/photographs/0.jpg"].read() is None
+
+
+# Export
+
+
+def test_a_folder_and_a_single_file(tmp_path):
+    source = Source(textured(), "a")
+    result = export_web(source, tmp_path / "site")
+    assert result.path == tmp_path / "site" / "index.html" and result.path.read_text(encoding="utf-8") == page()
+    scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
+    assert len(scene) == result.num_bytes and decode_web_scene(scene).model.num == source.model.num
+    assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in exported_text(result)
+    one = export_web(source, tmp_path / "one.html", single_file=True)
+    assert one.path.read_text(encoding="utf-8") == page_with(scene)
+    with pytest.raises(ValueError, match="no photographs"):
+        export_web(source, tmp_path / "with", photographs=True)
+    with pytest.raises(ValueError, match="leave out --single-file"):
+        export_web(source, tmp_path / "with.html", photographs=True, single_file=True)
+
+
+def test_a_page_of_someone_else_is_not_replaced(tmp_path):
+    (tmp_path / "index.html").write_text("mine")
+    with pytest.raises(ValueError, match="choose another folder"):
+        export_web(Source(textured(), "a"), tmp_path)
+    assert (tmp_path / "index.html").read_text() == "mine"
+
+
+def test_point_clouds_are_measured_from_cameras_around_them(tmp_path):
+    gaussians = some_gaussians(40)
+    result = export_web(Source(Model(gaussians), "a"), tmp_path / "one.html", single_file=True)
+    assert 0 <= result.losses["were it a model of 30 dB"] < 1
+
+
+def test_photographs_are_those_of_the_cameras():
+    scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
+    origin = Origin.of_scene(scene)
+    photographs = Photographs(Source(Model(some_gaussians(), origin=origin), "a", load_scene=lambda: scene))
+    assert sorted(photographs.views) == [0, 1, 2, 3] and photographs.jpeg(9) is None
+    found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
+    by_name = {view.name: view for view in (*scene.train, *scene.test)}
+    assert np.abs(found - by_name[origin.names[0]].image).mean() < 12

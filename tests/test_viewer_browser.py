@@ -1,0 +1,108 @@
+"""The viewer's page in Chromium beside the JAX renderer: the same pictures to less than 1/255, on average.
+
+Needs Node, Chromium, and `npm ci && npm run build` in web/; skipped where one is missing.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_cases import small_numbers, write_case
+
+import a2tg_jax as a2tg
+from a2tg_jax.io.ply import ATTRIBUTES, SCALES
+from a2tg_jax.results.viewing import Source, open_source
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.web.page import page
+
+WEB = Path(__file__).resolve().parents[1] / "web"
+CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome")
+SYSTEM = a2tg.A2tg(
+    stage1_iterations=60,
+    stage2_iterations=60,
+    densify=McmcConfig(cap=700),
+    texture=a2tg.TextureConfig(fraction=0.5, upscale_at=(0.1, 0.3), rate=1e-2),
+)
+
+
+def run_node(*arguments: str, **environment: str) -> None:
+    done = subprocess.run(
+        ["npm", "run", *arguments], cwd=WEB, env=os.environ | environment, capture_output=True, text=True, check=False
+    )
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def trained(scene: a2tg.Scene) -> Source:
+    return Source(a2tg.fit(scene, SYSTEM, progress=False).model, scene.name)
+
+
+def ellipsoids(path: Path) -> Path:
+    """A 3DGS file: ellipsoids in a ball, with view dependence."""
+    rng = np.random.default_rng(3)
+    names = [*ATTRIBUTES, "scale_2"]
+    rows = {name: rng.normal(size=400) * 0.2 for name in names}
+    rows |= {name: rng.normal(size=400) for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")}
+    rows |= {name: rng.normal(size=400) for name in ("rot_0", "rot_1", "rot_2", "rot_3")}
+    rows |= {name: rng.normal(size=400) * 0.6 - 2.2 for name in (*SCALES, "scale_2")}
+    header = "".join(f"property float {name}\n" for name in names)
+    data = np.stack([rows[name] for name in names], axis=1).astype("<f4").tobytes()
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 400\n{header}end_header\n"
+    path.write_bytes(head.encode() + data)
+    return path
+
+
+def cameras_around(distance: float) -> list[a2tg.Camera]:
+    """Two views of the origin, 96 × 72."""
+    K = np.array([[100, 0, 48], [0, 100, 36], [0, 0, 1]], np.float32)
+    cameras = []
+    for angle in (0.3, 2.2):
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        viewmat[2, 3] = distance
+        cameras.append(a2tg.Camera(viewmat, K, 96, 72))
+    return cameras
+
+
+def test_both_readers_find_the_same_numbers():
+    """What the page's own tests compare with."""
+    data = (WEB / "test" / "small.a2tgw").read_bytes()
+    wanted = json.loads((WEB / "test" / "small.json").read_text(encoding="utf-8"))
+    found = small_numbers(data)
+    assert set(found) == set(wanted)
+    for name, numbers in wanted.items():
+        np.testing.assert_allclose(found[name], numbers, rtol=1e-4, atol=2e-5)
+
+
+@pytest.fixture
+def node():
+    has_all = shutil.which("npm") and (WEB / "node_modules").is_dir() and any(Path(path).exists() for path in CHROMIUM)
+    if not has_all:
+        pytest.skip("needs Node, Chromium and `npm ci` in web/")
+
+
+def test_the_page_is_what_the_sources_build(node):
+    run_node("build")
+    assert (WEB / "dist" / "index.html").read_text(encoding="utf-8") == page(), "copy web/dist/index.html: .ci/web"
+
+
+def test_the_page_shows_what_the_renderer_shows(node, tmp_path):
+    scene = a2tg.synthetic_scene(num_views=6, width=96, height=72, num_points=400)
+    source = trained(scene)
+    cameras = [view.camera for view in (*scene.test, *scene.train)][:3]
+    write_case(tmp_path / "built-in", source, cameras, ("full", "plain"))
+    with pytest.warns(UserWarning, match="thinnest axis"):
+        cloud = open_source(ellipsoids(tmp_path.parent / "cloud.ply"))
+    write_case(tmp_path / "3dgs", cloud, cameras_around(5.0))
+    run_node("test:browser", A2TG_CASES=str(tmp_path))
+
+
+def test_the_page_shows_a_real_scene(node, shared, tmp_path):
+    scene = a2tg.load_scene(shared / "scenes" / "fox", downscale=8)
+    source = trained(scene)
+    write_case(tmp_path / "fox", source, [view.camera for view in scene.test[:2]])
+    run_node("test:browser", A2TG_CASES=str(tmp_path))

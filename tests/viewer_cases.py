@@ -1,0 +1,112 @@
+"""What the viewer's own tests read: a small scene with its numbers, and scenes with pictures of the JAX renderer.
+
+    python tests/viewer_cases.py small web/test        # web/test/small.a2tgw and small.json, which are committed
+
+`write_case` writes a folder that web/browser/compare.test.ts compares the page with.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from a2tg_jax.appearance import Banded, Plain, Textured
+from a2tg_jax.appearance.banded import BandedLayout, BandedParams
+from a2tg_jax.cameras import Camera
+from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.io.web_scene import decode_web_scene
+from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
+from a2tg_jax.renderer import Renderer
+from a2tg_jax.results.viewing import Source
+from a2tg_jax.sh_bands import split_sh
+from a2tg_jax.texture import textures_from_arrays
+
+NUM = 300
+"""More than a chunk."""
+
+
+def small_model() -> Model:
+    """Random Gaussians of all degrees and many texture sizes, none among them."""
+    rng = np.random.default_rng(7)
+    draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
+    sizes = [(0, 0), (1, 1), (2, 3), (4, 1), (5, 5)]
+    textures, atlas = textures_from_arrays([draw(*sizes[i % 5], 4, scale=0.3) for i in range(NUM)])
+    bands, owners = split_sh(draw(NUM, 16, 3, scale=0.4), rng.integers(0, 4, NUM), 0)
+    gaussians = Gaussians(
+        draw(NUM, 3), draw(NUM, 4), draw(NUM, 2, scale=0.5) - np.float32(2), draw(NUM), draw(NUM, 1, 3)
+    )  # type: ignore[arg-type]
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 4.0
+    camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
+    origin = Origin.of_cameras([camera], ["<b>a</b>.png"], background=(0.25, 0.5, 0.75))
+    params, layout = BandedParams(bands, textures), BandedLayout(owners, atlas)
+    return Model(gaussians, params, layout, appearance=Banded(Textured()), origin=origin)
+
+
+def write_small(folder: Path) -> None:
+    """A scene's file, and what is in it."""
+    data = Source(small_model(), "small", "a note").encoded
+    (folder / "small.a2tgw").write_bytes(data)
+    (folder / "small.json").write_text(json.dumps(small_numbers(data)) + "\n")
+
+
+def small_numbers(data: bytes) -> dict[str, list]:
+    """What a reader must find in the file, rounded, by row."""
+    model = decode_web_scene(data).model
+    arrays = model.appearance.arrays(model.params, model.layout)
+    sh = model.appearance.sh(model.gaussians, model.params, model.layout)
+    found = {
+        "means": model.gaussians.means,
+        "log_scales": model.gaussians.log_scales,
+        "quats": model.gaussians.quats,
+        "opacities": model.gaussians.opacities,
+        "degrees": arrays["degrees"],
+        "sizes": arrays["inner.sizes"],
+        "sh": sh[:40],
+        "texels": arrays["inner.texels"][:400],
+    }
+    return {name: np.round(np.asarray(array, np.float64), 5).ravel().tolist() for name, array in found.items()}
+
+
+def write_case(folder: Path, source: Source, cameras: Sequence[Camera], modes: Sequence[str] = ("full",)) -> None:
+    """A scene, its views, and of each the colours that the JAX renderer gives the model itself, from which the file is
+    made, and those of what the file holds."""
+    folder.mkdir(parents=True)
+    (folder / "scene.a2tgw").write_bytes(source.encoded)
+    settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
+    models = {"the model": source.model, "the file": decode_web_scene(source.encoded).model}
+    views = []
+    for name, model in models.items():
+        for mode in modes:
+            shown = without_textures(model) if mode == "plain" else model
+            renderer = Renderer(shown, cameras=cameras, settings=settings, has_geometry=False)
+            for camera in cameras:
+                np.asarray(renderer(camera).color, "<f4").tofile(folder / f"{len(views)}.f32")
+                views.append(_view(camera, mode, name))
+    described = {"background": list(source.model.background), "views": views}
+    (folder / "views.json").write_text(json.dumps(described))
+
+
+def without_textures(model: Model) -> Model:
+    """The Gaussians alone."""
+    textured = model.appearance
+    assert isinstance(textured, Textured)
+    return dataclasses.replace(model, params=(), layout=(), appearance=Plain(textured.options.max_alpha))
+
+
+def _view(camera: Camera, mode: str, of: str) -> dict:
+    return {
+        "viewmat": np.asarray(camera.viewmat, np.float64).ravel().tolist(),
+        "K": np.asarray(camera.K, np.float64).ravel().tolist(),
+        "size": [camera.width, camera.height],
+        "mode": mode,
+        "of": of,
+    }
+
+
+if __name__ == "__main__":
+    write_small(Path(sys.argv[2]))
