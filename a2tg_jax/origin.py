@@ -5,7 +5,7 @@ With it a model is rendered, flown past and moved without the photographs.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +37,9 @@ class Origin:
     """Leads from the original world to the one of the cameras."""
     background: Color = BLACK
     """RGB behind everything when the model is looked at."""
+    corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """[V, ...] what was learned of each photograph besides (`corrections`), by the correction's name, in the world of
+    the training; `viewmats` are corrected by it already."""
 
     @staticmethod
     def of_scene(scene: Scene, background: Color = BLACK) -> "Origin":
@@ -80,12 +83,13 @@ class Origin:
         ]
 
     def moved(self, similarity: Similarity) -> "Origin":
-        """The same cameras in the world that `similarity` leads to."""
+        """The same cameras in the world that `similarity` leads to; corrections, which are in them, are forgotten."""
         viewmats = [similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]
         return dataclasses.replace(
             self,
             viewmats=np.array(viewmats).reshape(-1, 4, 4),
             transform=self.transform.then(similarity),
+            corrections={},
         )
 
     # Arrays have no hash of their own, and jit asks for one of everything that is static.
@@ -94,7 +98,8 @@ class Origin:
     def _content(self) -> tuple:
         arrays = (self.viewmats, self.Ks, self.sizes, self.is_test, self.transform.rotation, self.transform.translation)
         texts = tuple(np.ascontiguousarray(array).tobytes() for array in arrays)
-        return texts, self.names, float(self.transform.scale), self.background
+        learned = tuple((name, rows.shape, rows.tobytes()) for name, rows in sorted(self.corrections.items()))
+        return texts, self.names, float(self.transform.scale), self.background, learned
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Origin) and self._content == other._content)

@@ -30,7 +30,7 @@ FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 LONGEST_REASON = 500
 """Characters of what is wrong with a file: it may say anything of itself."""
-APPEARANCE, ORIGIN = "appearance/", "origin/"
+APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
 """What the names of their arrays begin with."""
 
 
@@ -56,6 +56,7 @@ def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] 
     if model.origin is not None:
         described["origin"] = origin_to_dict(model.origin)
         arrays |= {ORIGIN + name: array for name, array in origin_arrays(model.origin).items()}
+        arrays |= {ORIGIN + CORRECTIONS + name: rows for name, rows in model.origin.corrections.items()}
     write_archive(path, described, arrays, format=FORMAT)
 
 
@@ -185,6 +186,7 @@ def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Orig
     viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[name] for name in shapes)
     if not np.issubdtype(sizes.dtype, np.integer) or is_test.dtype != bool:
         raise ValueError(f"origin/sizes must be integers, origin/is_test bool; got {sizes.dtype}, {is_test.dtype}")
+    learned = [name for name in arrays if name.startswith(CORRECTIONS)]
     return Origin(
         viewmats=viewmats,
         Ks=Ks,
@@ -193,4 +195,5 @@ def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Orig
         is_test=is_test,
         transform=Similarity(float(scale), rotation, translation),
         background=(float(red), float(green), float(blue)),
+        corrections={name.removeprefix(CORRECTIONS): arrays[name] for name in learned},
     )

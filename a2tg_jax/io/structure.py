@@ -11,7 +11,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance, Banded
 from a2tg_jax.cameras import check_calibration
-from a2tg_jax.checks import check_shape, dtype_of, shortened
+from a2tg_jax.checks import check_floats, check_shape, dtype_of, shortened
 from a2tg_jax.data.world import check_similarity
 from a2tg_jax.gaussians import Gaussians, check_gaussians
 from a2tg_jax.model import Model
@@ -87,6 +87,9 @@ def check_origin(origin: Origin) -> None:
     if not np.isfinite(origin.background).all():
         raise ValueError(f"origin.background must be finite; got {origin.background}")
     check_similarity(origin.transform, "origin.transform")
+    for name, rows in origin.corrections.items():
+        check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
+        check_finite(f"origin.corrections.{name}", rows)
 
 
 def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:

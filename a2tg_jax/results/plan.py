@@ -10,7 +10,7 @@ import numpy as np
 from a2tg_jax.classes import classes_of
 from a2tg_jax.training import Stage, System
 
-STAGE_OPTIONS = ("loss", "rates", "memory_budget")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
 """Options of every system that reach training through its stages alone."""
 
 

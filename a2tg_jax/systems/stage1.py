@@ -92,8 +92,9 @@ def growing_stage(
 ) -> Stage:
     """A first stage, in which the degree of spherical harmonics rises."""
     return Stage(
-        name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate, raises_sh_degree=True
-    )
+        name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate, system.corrections_of(0),
+        raises_sh_degree=True,
+    )  # fmt: skip
 
 
 def later_stage(
@@ -105,7 +106,8 @@ def later_stage(
     params_rate: Any = 0.0,
 ) -> Stage:
     """A second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
-    return Stage(name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate)
+    corrections = system.corrections_of(1)
+    return Stage(name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate, corrections)
 
 
 def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:

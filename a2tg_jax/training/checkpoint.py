@@ -144,9 +144,9 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], where:
     wanted = _wanted(stage, gaussians, params, layout, is_ahead)
     kept = _rest(wanted), {field.name: 0 for field in dataclasses.fields(History)}
     _, (rest, columns) = _filled((gaussians, kept), arrays)
-    moments, num_live, events, iteration, status = jax.tree.map(jnp.asarray, rest)
+    moments, num_live, *others = jax.tree.map(jnp.asarray, rest)
     model = Model(gaussians, params, layout, num_live, appearance=stage.appearance)
-    state, history = TrainState(model, moments, events, iteration, status), History(**columns)
+    state, history = TrainState(model, moments, *others), History(**columns)
     check_state(state, wanted, stage)
     check_history(history)
     num_restored = header.get("num_restored", 0)
@@ -162,7 +162,7 @@ SHOWN = "shown/"
 
 def _rest(state: TrainState) -> tuple:
     """What a checkpoint keeps besides Gaussians and what they show."""
-    return state.moments, state.model.num_live, state.events, state.iteration, state.status
+    return state.moments, state.model.num_live, state.events, state.iteration, state.status, state.corrections
 
 
 def _packed(model: Model, moments: AdamState) -> AdamState:
@@ -190,6 +190,6 @@ def _filled(template, arrays: dict[str, np.ndarray]):
 def _wanted(stage: Stage, gaussians: Gaussians, params, layout, is_ahead: Sequence[bool]) -> TrainState:
     """Shapes and dtypes of a state of a stage, of which some events may be past."""
     model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
-    state = jax.eval_shape(lambda: initial_state(stage, model))
+    state = jax.eval_shape(lambda: initial_state(stage, model, [""]))
     events = (event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
     return dataclasses.replace(state, events=tuple(events))

@@ -53,15 +53,15 @@ def what_diverged(arguments: tuple, names: Sequence[str]) -> str:
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {told}" for told in _not_finite(tried.grads)]
-    model = tried.state.model
-    found += [f"after the step, {told}" for told in _not_finite((model.gaussians, model.params))]
+    model, corrections = tried.state.model, tuple(known.rows for known in tried.state.corrections)
+    found += [f"after the step, {told}" for told in _not_finite((model.gaussians, model.params, corrections))]
     return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 
 
 def _not_finite(parameters: tuple) -> Iterator[str]:
-    """Each leaf of (gaussians, params) with such numbers, and their rows."""
-    for place, prefix in enumerate(("", "params")):
-        for path, leaf in jax.tree_util.tree_flatten_with_path(parameters[place])[0]:
+    """Each leaf of (gaussians, params, corrections) with such numbers, and their rows."""
+    for prefix, part in zip(("", "params", "corrections"), parameters, strict=True):
+        for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
             numbers = np.asarray(leaf)
             is_bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
             if is_bad.any():

@@ -4,6 +4,7 @@ import dataclasses
 import warnings
 
 from a2tg_jax.budget import LARGEST_SHORTFALL
+from a2tg_jax.corrections import corrected_origin
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.model import Model
 from a2tg_jax.origin import BLACK, WHITE, Color, Origin
@@ -145,7 +146,9 @@ def fit_stage(
         start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume, num_restored)
     run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped)
-    model = dataclasses.replace(run.model, origin=Origin.of_scene(scene, BACKGROUNDS[system.background]))
+    origin = Origin.of_scene(scene, BACKGROUNDS[system.background])
+    origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
+    model = dataclasses.replace(run.model, origin=origin)
     if index == len(system.stages()) - 1:
         warn_of_budget(system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)

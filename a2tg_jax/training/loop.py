@@ -11,7 +11,9 @@ from collections.abc import Callable, Hashable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from a2tg_jax.corrections import check_corrections
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import HostEvent, StepEvent
 from a2tg_jax.memory import keep_room_for_programs, return_free_memory
@@ -83,11 +85,13 @@ class StageRun:
         self.history, self.earlier_seconds = History.empty(), 0.0
         if resume is not None:
             check_resume(resume, system, index)
+            check_corrections(resume.state.corrections, len(self.views))
             self.state: TrainState = jax.tree.map(jnp.array, resume.state)
             self.history, self.earlier_seconds = resume.history, resume.history.last_seconds
         elif start is not None:
             # Steps take over the buffers they are given: the caller keeps his own.
-            self.state = initial_state(self.stage, padded(jax.tree.map(jnp.array, start.live), self.stage, system))
+            model = padded(jax.tree.map(jnp.array, start.live), self.stage, system)
+            self.state = initial_state(self.stage, model, [view.name for view in self.views], start.origin)
         else:
             raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
@@ -199,7 +203,8 @@ class StageRun:
         """What the step of an iteration is given."""
         photographs, views = self.photographs.batch(iteration)
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
-        return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key
+        rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
+        return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments, step = self._arguments(iteration), jitted_step()

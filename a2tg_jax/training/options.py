@@ -6,6 +6,7 @@ import typing
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.budget import bytes_of, bytes_per_gaussian, megabytes_of
+from a2tg_jax.corrections import Correction, Exposure, PoseRefinement
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.stage import LearningRates, Stage
@@ -42,6 +43,18 @@ class LossConfig:
         return (first, *(term for term in optional if term.weight))
 
 
+@dataclasses.dataclass(frozen=True)
+class CorrectionConfig:
+    """How fast what `exposure` and `refine_poses` ask for is learned."""
+
+    exposure_rate: float = 1e-2
+    """Adam's learning rate of the affine maps of colours."""
+    pose_rate: float = 1e-3
+    """That of the motions, in radians and in units of the normalised world."""
+    final_factor: float = 0.1
+    """Both rates at the end of the first stage, and in later ones, over those at its start."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class System:
     """A method of training as a value: its fields are its options, `stages` says what happens.
@@ -68,6 +81,12 @@ class System:
     """Side of a tile in pixels; results do not depend on it."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
+    exposure: bool = False
+    """Learn an affine map of colours for each training photograph, for captures whose exposure or white balance
+    changes."""
+    refine_poses: bool = False
+    """Learn a small rigid motion of each training camera, for captures whose poses are not exact."""
+    corrections: CorrectionConfig = dataclasses.field(default_factory=CorrectionConfig)
 
     name: ClassVar[str] = ""
     """What the command line calls the system."""
@@ -112,6 +131,18 @@ class System:
             )
         return cap
 
+    def corrections_of(self, stage: int = 0) -> tuple[Correction, ...]:
+        """What a stage learns of each training view, as `exposure` and `refine_poses` ask for it.
+
+        Args:
+          stage: which of them, from 0; after the first, rates stay as they were at its end.
+        """
+        rates, last = self.corrections, self.corrections.final_factor
+        start, end = (1.0, last) if stage == 0 else (last, 1.0)
+        poses = (PoseRefinement(rates.pose_rate * start, end),) if self.refine_poses else ()
+        exposures = (Exposure(rates.exposure_rate * start, end),) if self.exposure else ()
+        return (*poses, *exposures)
+
     def stages(self) -> tuple[Stage, ...]:
         """What is trained, one stage after the other.
 
@@ -152,6 +183,12 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in stages:
             stage.check()
+        if (self.exposure or self.refine_poses) and not any(stage.corrections for stage in stages):
+            name = "exposure" if self.exposure else "refine_poses"
+            raise ValueError(
+                f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
+                "corrections=self.corrections_of(0), (1), …"
+            )
 
     def check_number(self, num: int) -> None:
         """Refuses what cannot be trained from so many Gaussians.
@@ -166,7 +203,7 @@ class System:
         for name, value in numbers.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise ValueError(f"{name} must be a finite number; got {value}")
-            if name.startswith(("rates.", "loss.")) and value < 0:
+            if name.startswith(("rates.", "loss.", "corrections.")) and value < 0:
                 raise ValueError(f"{name} must be at least 0; got {value}")
         for name, (least, most) in {**RANGES, **self.ranges}.items():
             if numbers[name] is not None and not least <= numbers[name] <= most:
@@ -176,6 +213,8 @@ class System:
             raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
         if self.rates.means_final_factor == 0:
             raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
+        if self.corrections.final_factor == 0:
+            raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
 
 RANGES = {

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.corrections import Correction
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.model import Model
@@ -74,6 +75,8 @@ class Stage:
     """Views seen, times the batch size."""
     params_rate: Any = 0.0
     """Learning rate of what the splats show: a number, or what `Appearance.rates` takes."""
+    corrections: tuple[Correction, ...] = ()
+    """What of each training view is learned besides, such as exposures and poses."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
     """Begins with degree 0 and adds one after every thirtieth of the stage."""
 
@@ -107,6 +110,9 @@ class Stage:
         for event in self.events:
             if isinstance(event, HostEvent):
                 event.iterations(self.iterations)
+        names = [correction.name for correction in self.corrections]
+        if len(set(names)) < len(names):
+            raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
 
     def clock(self) -> "Clock":
         """What the step has to know of the schedule (host)."""

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from a2tg_jax.checks import shortened
+from a2tg_jax.corrections import initial_corrections
 from a2tg_jax.io.structure import check_count, check_finite, check_like, check_model
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
@@ -46,9 +47,23 @@ def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
     check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
     check_finite("state.moments.mu", state.moments.mu)
     check_finite("state.moments.nu", state.moments.nu, is_signed=False)
+    _check_corrections(state, stage)
     for path, leaf in jax.tree_util.tree_leaves_with_path(state.events):
         if np.isnan(np.asarray(leaf)).any():
             raise ValueError(f"state.events{jax.tree_util.keystr(path)} must be numbers; some are NaN")
+
+
+def _check_corrections(state: TrainState, stage: Stage) -> None:
+    """Raises ValueError unless there are finite rows for each correction of a stage, all for as many views."""
+    names, dtype = [""] * len(state.corrections[0].rows) if state.corrections else [], state.model.gaussians.means.dtype
+    wanted = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
+    check_like("state.corrections", state.corrections, wanted)
+    for known in state.corrections:
+        check_finite("state.corrections.rows", known.rows)
+        check_finite("state.corrections.mu", known.moments.mu)
+        check_finite("state.corrections.nu", known.moments.nu, is_signed=False)
+        if (np.asarray(known.moments.count) < 0).any():
+            raise ValueError("state.corrections.count must be at least 0; some are below")
 
 
 def check_history(history: Any) -> None:

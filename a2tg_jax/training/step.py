@@ -6,6 +6,7 @@ as it was, with a status that makes all further steps idle: the host may look at
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,11 +15,20 @@ from jax import Array
 
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
+from a2tg_jax.corrections import (
+    CorrectionState,
+    corrected_camera,
+    corrected_color,
+    initial_corrections,
+    rows_of,
+    updated,
+)
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
 from a2tg_jax.gaussians import SH_C0, Gaussians
 from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState, adam_init, adam_update
+from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderSettings, render_traced
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.stage import Background, Clock, Stage
@@ -42,6 +52,8 @@ class TrainState:
     """int32, iterations of this stage done so far."""
     status: Array
     """int32: FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE or EXPLODED."""
+    corrections: tuple[CorrectionState, ...] = ()
+    """What each correction of the stage has learned."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,14 +80,22 @@ class StepInfo(NamedTuple):
     """Gaussians that events wanted to add, for which there was no room."""
 
 
-def initial_state(stage: Stage, model: Model) -> TrainState:
-    """The state before the first iteration of a stage."""
+def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
+    """The state before the first iteration of a stage.
+
+    Args:
+      stage: which.
+      model: with the rows and the appearance of the stage.
+      names: of the training views.
+      origin: of the model that the stage starts from, whose corrections go on.
+    """
     return TrainState(
         model=model,
         moments=adam_init((model.gaussians, model.params)),
         events=tuple(event.init(model) if stage.is_ahead(event) else None for event in stage.events),
         iteration=jnp.zeros((), jnp.int32),
         status=jnp.zeros((), jnp.int32),
+        corrections=initial_corrections(stage.corrections, names, origin, model.gaussians.means.dtype),
     )
 
 
@@ -83,8 +103,8 @@ class Attempt(NamedTuple):
     """What a step makes of a state, whether it can be taken or not."""
 
     views: "_ViewGradients"
-    grads: tuple[Gaussians, Any]
-    """Means over the views."""
+    grads: tuple[Gaussians, Any, tuple[Array, ...]]
+    """Means over the views; of the corrections, by the row of each view [V, ...]."""
     state: TrainState
     """After the step, with the status of the state before."""
     info: EventInfo
@@ -98,7 +118,7 @@ def jitted_step():
 
 def train_step(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
-    scene_scale: Array, key: Array,
+    scene_scale: Array, key: Array, rows: Any = None,
 ) -> tuple[TrainState, StepInfo]:  # fmt: skip
     """One iteration.
 
@@ -111,8 +131,9 @@ def train_step(
       views: [V] int32, which of them are looked at.
       scene_scale: factor of the means' learning rate.
       key: of the stage; each iteration folds in its number.
+      rows: [V] int32, their numbers among all training views; needed for corrections.
     """
-    tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key)
+    tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key, rows)
     status = jnp.where(state.status == FINE, _status(clock, tried), state.status)
     new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
@@ -125,7 +146,7 @@ def train_step(
 
 def attempt(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
-    scene_scale: Array, key: Array,
+    scene_scale: Array, key: Array, rows: Any = None,
 ) -> Attempt:  # fmt: skip
     """What one iteration would lead to. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
@@ -135,17 +156,23 @@ def attempt(
     batch = jax.tree.map(lambda x: x[views], photographs)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
     backgrounds = _backgrounds(keys[0], settings.background, views.shape[0], dtype)
-    found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration)
-    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads)
+    own = rows_of(state.corrections, rows)
+    found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration, own)
+    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
     progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
     decay = jnp.exp(clock.log_decay * progress)
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
     model, moments = _updated(stage, state, grads, rate)
     now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
-    seen = _seen(stage, batch, found)
+    seen = _seen(stage, batch, own, found)
     model, moments, events, info = _events(stage, clock, now, seen, model, moments, state.events)
-    return Attempt(found, grads, TrainState(model, moments, events, iteration, state.status), info)
+    corrections = tuple(
+        updated(correction, known, rows, grad, progress)
+        for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
+    )
+    after = TrainState(model, moments, events, iteration, state.status, corrections)
+    return Attempt(found, (*grads, found.grads[2]), after, info)
 
 
 class _ViewGradients(NamedTuple):
@@ -155,12 +182,15 @@ class _ViewGradients(NamedTuple):
     psnr: Array
     num_pairs: Array
     is_overflow: Array
-    grads: tuple[Gaussians, Any]
+    grads: tuple[Gaussians, Any, tuple[Array, ...]]
+    """By the Gaussians, by what they show, and by the view's row of each correction."""
     statistic: Array | None
     """[V, N, 4]."""
 
 
-def _gradients(settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration):
+def _gradients(
+    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration, own
+) -> _ViewGradients:
     """Loss and gradients of every view, one after the other."""
     height, width = batch.images.shape[1:3]
     model, highest = state.model, settings.render.sh_degree
@@ -170,27 +200,30 @@ def _gradients(settings: StepSettings, stage: Stage, clock: Clock, state: TrainS
     has_geometry = any(term.has_geometry for term in stage.losses)
 
     def one_view(view):
-        viewmat, K, image, alpha, mask, background = view
+        viewmat, K, image, alpha, mask, background, rows = view
         photograph = _black_outside(mask, _over(image, alpha, background))
-        target = Target(Camera(viewmat, K, width, height), photograph, background, mask)
 
-        def loss(gaussians, params, probe):
+        def loss(gaussians, params, rows, probe):
+            camera = corrected_camera(stage.corrections, rows, Camera(viewmat, K, width, height))
+            target = Target(camera, photograph, background, mask)
             shown = dataclasses.replace(model, gaussians=gaussians, params=params)
             output, num_pairs = render_traced(
                 gaussians, target.camera, shown.rule, background, settings.render,
                 has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, probe=probe,
                 statistic=stage.statistic,
             )  # fmt: skip
-            output = output._replace(color=_black_outside(mask, output.color))
+            color = corrected_color(stage.corrections, rows, output.color)
+            output = output._replace(color=_black_outside(mask, color))
             value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
             error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
             return value, (error, num_pairs, output.overflow)
 
-        differentiate = jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)
-        (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, probe)
-        return _ViewGradients(value, -10 * jnp.log10(error), num_pairs, overflow, grads[:2], grads[2])
+        differentiate = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)
+        (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, rows, probe)
+        return _ViewGradients(value, -10 * jnp.log10(error), num_pairs, overflow, grads[:3], grads[3])
 
-    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, batch.images, batch.alphas, batch.masks, backgrounds))
+    pictures = batch.images, batch.alphas, batch.masks
+    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
 
 
 def _over(image: Array, alpha: Array | None, background: Array) -> Array:
@@ -219,10 +252,12 @@ def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
     return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
 
 
-def _seen(stage: Stage, batch: Photographs, found: _ViewGradients) -> Seen:
+def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: _ViewGradients) -> Seen:
     """What events observe."""
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
+    if own:
+        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(own, cameras)
     colors = found.grads[0].sh[:, :, 0] / SH_C0
     if found.statistic is None:
         nothing = jnp.zeros_like(colors)
@@ -279,7 +314,8 @@ def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: Adam
 def _status(clock: Clock, tried: Attempt) -> Array:
     """Why a step may not be taken, the first reason that holds."""
     found, model = tried.views, tried.state.model
-    is_finite = _all_finite((found.loss, tried.grads, model.gaussians, model.params))
+    rows = [known.rows for known in tried.state.corrections]
+    is_finite = _all_finite((found.loss, tried.grads, model.gaussians, model.params, rows))
     status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
     status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
     status = jnp.where(is_finite, status, NOT_FINITE)
