@@ -206,7 +206,10 @@ def _record(folder: Path, file: Path) -> None:
 def _marker(folder: Path, file: Path) -> None:
     from a2tg_jax.results.folder import RunFolder, check_free
 
-    RunFolder(folder).written()
+    run = RunFolder(folder)
+    names = run.written()
+    if hasattr(run, "own_files"):
+        assert all(path.resolve().is_relative_to(folder) for path in run.own_files(names))
     check_free(folder, overwrite=True)
 
 

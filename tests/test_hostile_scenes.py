@@ -41,7 +41,7 @@ def model(request, tmp_path_factory):
 @pytest.mark.parametrize("kind", RECORDS)
 def test_whole_files_pass(model, kind):
     file = next((model / "sparse" / "0").glob(f"{kind}.*"))
-    (check_binary if file.suffix == ".bin" else check_text)(file)
+    (check_binary if file.suffix == ".bin" else check_text)(file)  # Warnings are errors here.
 
 
 @pytest.mark.parametrize("kind", RECORDS)
@@ -110,6 +110,16 @@ def test_lines_of_text_that_lie_are_refused(tmp_path, kind, line, message):
     file.write_text(line)
     with pytest.raises(ValueError, match=rf"{kind}\.txt: line 1.*" if message == "line 1" else message):
         check_text(file)
+
+
+def test_a_text_that_ends_too_early_is_told(tmp_path):
+    """Comments may be copied from elsewhere, so that it is no error."""
+    write_colmap(tmp_path, num_points=5, text=True)
+    for kind, size in (("points3D", 1), ("images", 2)):
+        file = tmp_path / "sparse" / "0" / f"{kind}.txt"
+        file.write_text("".join(file.read_text().splitlines(keepends=True)[:-size]))
+        with pytest.warns(UserWarning, match=rf"{kind}\.txt: says that it has . {kind}, and has ."):
+            check_text(file)
 
 
 # Numbers

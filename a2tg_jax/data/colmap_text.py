@@ -4,6 +4,8 @@ pycolmap takes the word before where one is missing, and counts on without end w
 """
 
 import itertools
+import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,28 +13,45 @@ from a2tg_jax.checks import shortened
 from a2tg_jax.data.colmap_binary import num_params_by_model
 
 Words = list[bytes]
+ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
+"""How many lines, or pairs of lines for images, there are: a comment of COLMAP's."""
 
 
 def check_text(path: Path) -> None:
     """Refuses a text file of a model, one that `LINES` knows, unless all its lines are such.
 
+    Warns where a comment counts other than the file: it may end too early, but other programs copy comments.
+
     Raises:
       ValueError: naming the file and the line.
     """
+    announced, found = None, 0
     with open(path, "rb") as file:
         lines = enumerate(file, 1)
         for number, line in lines:
             words = line.split()
+            if match := ANNOUNCED.match(line):
+                announced = int(match[1])
             if not words or words[0].startswith(b"#"):
                 continue
             points = next(lines, (0, None))[1] if path.stem == "images" else b""
-            try:
-                if points is None or len(points.split()) % 3:
-                    raise ValueError("the line of its points is missing or cut off")
-                LINES[path.stem](words)
-            except (ValueError, IndexError) as error:
-                told = shortened(str(error)) if isinstance(error, ValueError) else "it is cut off"
-                raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
+            _check_line(path, number, words, points)
+            found += 1
+    if announced not in (None, found):
+        message = (
+            f"{path}: says that it has {announced} {path.stem}, and has {found}: if it is cut off, export it"
+        )
+        warnings.warn(message, stacklevel=2)
+
+
+def _check_line(path: Path, number: int, words: Words, points: bytes | None) -> None:
+    try:
+        if points is None or len(points.split()) % 3:
+            raise ValueError("the line of its points is missing or cut off")
+        LINES[path.stem](words)
+    except (ValueError, IndexError) as error:
+        told = shortened(str(error)) if isinstance(error, ValueError) else "it is cut off"
+        raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
 
 
 def _check_camera(words: Words) -> None:

@@ -62,7 +62,7 @@ class RunFolder:
         """
         if not self.marker.is_file() or not self.marker.stat().st_size:
             return []
-        first, *names = self.marker.read_text(encoding="utf-8").splitlines()
+        first, *names = self.marker.read_text(encoding="utf-8", errors="replace").splitlines()
         if first != MARKER:
             raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with --out")
         return names
