@@ -23,6 +23,7 @@ from fuzz_readers import READERS, Reader
 WELL = ("read", "refused")
 SECONDS_A_CASE, SECONDS_TO_START = 60.0, 300.0
 MOST_TOLD = 200
+SEED = 7
 
 
 class Worker:
@@ -78,16 +79,18 @@ class Worker:
         return self._process.stdout.readline() if ready else None
 
 
-def case(index: int, seeds: Path) -> tuple[int, Reader, str, bytes]:
+def case(index: int, seeds: Path, seed: int = SEED) -> tuple[int, Reader, str, bytes]:
     """Number of the reader, the reader, its file, and what that is changed to."""
-    number, rng = index % len(READERS), np.random.default_rng([7, index])
+    number, rng = index % len(READERS), np.random.default_rng([seed, index])
     reader = READERS[number]
     name = reader.files[int(rng.integers(len(reader.files)))]
     change = reader.changes[int(rng.integers(len(reader.changes)))]
     return number, reader, name, change((seeds / reader.folder / name).read_bytes(), rng)
 
 
-def run(worker: Worker, cases: range, keep: Path | None = None, on_case=lambda index, answer: None) -> dict:
+def run(
+    worker: Worker, cases: range, keep: Path | None = None, on_case=lambda index, answer: None, seed: int = SEED
+) -> dict:
     """Counts of what became of cases, by reader and kind; and what was not well, with places.
 
     Args:
@@ -95,12 +98,13 @@ def run(worker: Worker, cases: range, keep: Path | None = None, on_case=lambda i
       cases: numbers.
       keep: where the changed files of cases that are not well go.
       on_case: called after each.
+      seed: another one makes other cases.
     """
     counts: dict = {"readers": {}, "bad": [], "most_seconds": 0.0, "most_megabytes": 0.0}
     try:
         worker.start()
         for index in cases:
-            answer = _run_case(index, worker, keep)
+            answer = _run_case(index, worker, keep, seed)
             add(counts, index, answer)
             on_case(index, answer)
     finally:
@@ -108,9 +112,9 @@ def run(worker: Worker, cases: range, keep: Path | None = None, on_case=lambda i
     return counts
 
 
-def _run_case(index: int, worker: Worker, keep: Path | None) -> dict:
+def _run_case(index: int, worker: Worker, keep: Path | None, seed: int) -> dict:
     seeds = worker.work / "seeds"
-    number, reader, name, changed = case(index, seeds)
+    number, reader, name, changed = case(index, seeds, seed)
     file = seeds / reader.folder / name
     sound = file.read_bytes()
     worker.start()  # It reads the sound files first.
@@ -152,6 +156,7 @@ def main() -> None:
     parser.add_argument("--state", type=Path, help="a JSON file of the counts, to go on from")
     parser.add_argument("--keep", type=Path, help="a folder for the files of cases that are not well")
     parser.add_argument("--case", type=int, help="try this case alone, and keep its file")
+    parser.add_argument("--seed", type=int, default=SEED, help="another one makes other cases")
     parser.add_argument("--seconds", type=float, default=SECONDS_A_CASE, help="how long a case may take")
     parser.add_argument("--render", action="store_true", help="draw the models that were read")
     options = parser.parse_args()
@@ -171,7 +176,7 @@ def main() -> None:
             os.replace(partial, options.state)
 
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, contextlib.suppress(KeyboardInterrupt):
-        run(Worker(Path(folder), options.seconds, options.render), cases, options.keep, on_case)
+        run(Worker(Path(folder), options.seconds, options.render), cases, options.keep, on_case, options.seed)
     print(table(counts))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from a2tg_jax.data import run_sfm
 from a2tg_jax.data.decoding import MAX_PIXELS, check_picture, read_pixels
 from a2tg_jax.data.images import check_inside, locate_image
 from a2tg_jax.results.pictures import picture_names
@@ -149,6 +150,16 @@ def test_names_within_the_scene_and_links_are_followed(tmp_path):
     for name in ("images/x.png", "./images/x.png", "images//x.png"):
         check_inside(tmp_path / "scene", name)
         assert read_pixels(locate_image(tmp_path / "scene", name, 1)[0]).shape == (3, 4, 3)
+
+
+def test_photographs_are_looked_at_before_colmap_reads_them(tmp_path):
+    for index, data in enumerate([encoded("PNG"), encoded("PNG"), png(4, 3, depth=16)]):
+        (tmp_path / f"{index}.png").write_bytes(data)
+    with pytest.raises(ValueError, match=r"2\.png: has more than 8 bits per channel"):
+        run_sfm(tmp_path, tmp_path / "scene", progress=False)
+    (tmp_path / "2.png").write_bytes(encoded("PNG")[:100])
+    with pytest.raises(ValueError, match=r"2\.png: cannot be read as an image"):
+        run_sfm(tmp_path, tmp_path / "scene", progress=False)
 
 
 def test_a_link_to_itself_is_no_image(tmp_path):

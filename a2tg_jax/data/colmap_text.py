@@ -38,9 +38,7 @@ def check_text(path: Path) -> None:
             _check_line(path, number, words, points)
             found += 1
     if announced not in (None, found):
-        message = (
-            f"{path}: says that it has {announced} {path.stem}, and has {found}: if it is cut off, export it"
-        )
+        message = f"{path}: says that it has {announced} {path.stem}, and has {found}: if it is cut off, export it"
         warnings.warn(message, stacklevel=2)
 
 
