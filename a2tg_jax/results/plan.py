@@ -137,8 +137,10 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return _name_of(type(value)), fields
+        named = ((field, getattr(value, field.name)) for field in dataclasses.fields(value))
+        # What is optional and absent says nothing, so that a new option does not make all that was trained another.
+        told = tuple((field.name, _described(own)) for field, own in named if not _is_absent(field, own))
+        return _name_of(type(value)), told
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
     if isinstance(value, Mapping):
@@ -148,6 +150,11 @@ def _described(value: Any) -> Any:
     if isinstance(value, type) or callable(value):
         return _name_of(value)
     raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
+
+
+def _is_absent(field: dataclasses.Field, value: Any) -> bool:
+    """Whether it is a tuple that is empty, as it is by default."""
+    return isinstance(value, tuple) and not value and field.default == ()
 
 
 def _name_of(value: Any) -> str:
