@@ -23,7 +23,6 @@ from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.results.checks import check_apart, check_weights
 from a2tg_jax.results.claim import opened
 from a2tg_jax.results.compress import compress, compression_text
-from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
@@ -40,7 +39,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.summary import RunResult, summary_text
-from a2tg_jax.results.whole_run import begin_run, go_on
+from a2tg_jax.results.whole_run import begin_run, go_on, measure
 from a2tg_jax.startup import configure_cpu
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -193,7 +192,7 @@ class Eval:
     def run(self) -> None:
         check_weights(self.lpips_weights)
         with opened(self.folder) as run:
-            _tell(evaluate_run(run, lpips_weights=self.lpips_weights), self.folder)
+            _tell(measure(run, lpips_weights=self.lpips_weights), self.folder)
 
 
 @dataclasses.dataclass(frozen=True)

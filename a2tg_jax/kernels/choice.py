@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import os
 import warnings
 from types import ModuleType
 from typing import Literal
@@ -14,6 +15,7 @@ import jax.extend.core
 
 from a2tg_jax.splats import Compositor
 
+DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 MAX_TILE_SIZE = 64
 """Native loops keep a tile on the stack."""
 
@@ -37,7 +39,19 @@ def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -
         return wanted
     if has_native():
         return "native"
-    return "pallas" if is_power_of_two and has_pallas() else "xla"
+    is_for_pallas = is_power_of_two and has_pallas() and not wants_determinism()
+    return "pallas" if is_for_pallas else "xla"
+
+
+def wants_determinism() -> bool:
+    """Whether the environment's XLA_FLAGS ask for a GPU that computes the same twice: Pallas' kernels do not, for they
+    add atomically."""
+    asked = dict.fromkeys(DETERMINISM_FLAGS, False)
+    for word in os.environ.get("XLA_FLAGS", "").split():
+        flag, _, value = word.partition("=")
+        if flag in asked:
+            asked[flag] = value.lower() in ("", "true", "1")
+    return any(asked.values())
 
 
 def instead_of_native(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:

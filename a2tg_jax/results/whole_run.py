@@ -48,8 +48,14 @@ def go_on(
     with _advised(run, is_replacing=replaced_by is not None):
         with signals.noted() as is_stopped:
             train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped)
-        result = evaluate_run(run, scene, lpips_weights=lpips_weights)
-    drop_old(run)
+        return measure(run, scene, lpips_weights=lpips_weights)
+
+
+def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
+    """As `evaluate_run`; where all is trained, a run that this one replaces goes."""
+    result = evaluate_run(run, scene, lpips_weights=lpips_weights)
+    if len(result.models) == len(result.plan.names):
+        drop_old(run)
     return result
 
 

@@ -1,0 +1,64 @@
+"""The same seed makes the same bits, whatever a process has trained before; where they could differ, it is said."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from bits import bits_of
+
+from a2tg_jax import A2tg, fit, synthetic_scene
+from a2tg_jax.kernels import choice
+from a2tg_jax.machine import Machine, this_machine
+from a2tg_jax.systems.a2tg import TextureConfig
+from a2tg_jax.systems.gaussians_2d import Gaussians2d
+from a2tg_jax.systems.stage1 import DensityConfig, McmcConfig
+
+FIRST = A2tg(
+    stage1_iterations=24,
+    stage2_iterations=20,
+    initial_gaussians=80,
+    densify=McmcConfig(cap=90),
+    texture=TextureConfig(upscale_at=(0.3, 0.6)),
+    seed=3,
+)
+
+
+def test_what_ran_before_in_the_process_changes_nothing():
+    """Runs in between leave larger tile lists, other buckets of textures, other programs, another seed's orders."""
+    scene = synthetic_scene(num_views=8, width=40, height=30, num_points=150)
+    before = fit(scene, FIRST, progress=False)
+    larger = dataclasses.replace(FIRST, densify=McmcConfig(cap=130), texture=TextureConfig(cap=8, fraction=0.9), seed=4)
+    fit(scene, larger, progress=False)
+    fit(scene, Gaussians2d(stage1_iterations=20, densify=DensityConfig(cap=200), batch_size=2), progress=False)
+    again = fit(scene, FIRST, progress=False)
+    assert bits_of(again.model) == bits_of(before.model)
+    jax.tree.map(np.testing.assert_array_equal, again.stages[0].model, before.stages[0].model)
+    np.testing.assert_array_equal(again.history.loss, before.history.loss)
+    assert bits_of(fit(scene, larger, progress=False).model) != bits_of(before.model)
+
+
+@pytest.mark.parametrize(
+    ("flags", "compositor"),
+    [
+        ("", "pallas"),
+        ("--xla_gpu_deterministic_ops=true", "xla"),
+        ("--xla_dump_to=x --xla_gpu_exclude_nondeterministic_ops", "xla"),
+        ("--xla_gpu_deterministic_ops=true --xla_gpu_deterministic_ops=false", "pallas"),
+    ],
+)
+def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministic(monkeypatch, flags, compositor):
+    monkeypatch.setattr(choice, "has_native", lambda: False)
+    monkeypatch.setattr(choice, "has_pallas", lambda: True)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    assert choice.choose("auto", 8) == compositor and choice.choose("pallas", 8) == "pallas"
+
+
+def test_what_may_change_bits_is_told():
+    here = this_machine()
+    assert here.differences(here) == []
+    other = Machine("0.1", here.jaxlib, "gpu: other", here.processor, here.threads + 1)
+    assert [told.split(" is ")[0] for told in other.differences(here)[:2]] == ["jax", "device"]
+    assert "A2TG_NUM_THREADS=" in other.differences(here)[2]
+    on_gpu = dataclasses.replace(here, device="gpu: other")
+    assert dataclasses.replace(on_gpu, threads=here.threads + 1).differences(on_gpu) == []
