@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from a2tg_jax.results.figures import curves_figure
-from a2tg_jax.results.folder import read_json
+from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.results.history import NAMES, read_history, write_history
 from a2tg_jax.results.info import read_psnrs
 from a2tg_jax.results.record import read_run_file
@@ -94,3 +94,14 @@ def test_a_scene_in_a_circle_of_links_is_read_as_it_stands(tmp_path):
     (tmp_path / "b").symlink_to(tmp_path / "a")
     (tmp_path / "run.toml").write_text('scene = "a"')
     assert read_run_file(tmp_path / "run.toml").scene.startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize("line", [b"x" * 5000, b"../outside", b"/etc/hostname", b"\xff\xfe", b"a\0b", b".", b"loop"])
+def test_a_marker_names_no_file_but_those_in_its_folder(tmp_path, line):
+    (tmp_path / "outside").touch()
+    run = RunFolder(tmp_path / "run")
+    run.own(run.metrics).write_text("{}")
+    (run.path / "loop").symlink_to(run.path / "loop")
+    with open(run.marker, "ab") as file:
+        file.write(line + b"\n")
+    assert run.own_files(run.written()) == [run.metrics]

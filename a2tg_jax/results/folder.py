@@ -72,7 +72,7 @@ class RunFolder:
         paths = [self.path / name for name in dict.fromkeys(names)]
         root = self.path.resolve()
         # A line that a crash has cut off may name a folder.
-        return [p for p in paths if p != self.marker and p.is_file() and p.resolve().is_relative_to(root)]
+        return [p for p in paths if p != self.marker and _is_file(p) and p.resolve().is_relative_to(root)]
 
     def clear(self) -> None:
         """Deletes what runs wrote into their folder, and the folders that are empty then. The marker stays, empty."""
@@ -205,6 +205,14 @@ def open_run(path: str | os.PathLike) -> RunFolder:
     if not run.record.is_file():
         raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml); a2tg train --out makes one")
     return run
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; False for what no file can be called, too."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def write_json(path: Path, data: Any) -> None:
