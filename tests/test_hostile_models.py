@@ -26,6 +26,7 @@ from a2tg_jax.origin import Origin
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.texture import AtlasLayout, Textures
 from a2tg_jax.training import load_checkpoint, save_checkpoint
+from a2tg_jax.training.registry import system_from_dict
 
 
 def spoiled(path, format, change):
@@ -225,6 +226,12 @@ def test_every_array_of_nan_is_refused(checkpoint):
 def test_checkpoints_out_of_range(checkpoint, change, message):
     spoiled(checkpoint, CHECKPOINT, change)
     refused(load_checkpoint, checkpoint, message)
+
+
+@pytest.mark.parametrize("data", [3, None, [], "a2tg", {}, {"name": "a2tg"}, {"name": ["a2tg"], "options": {}}])
+def test_systems_that_are_none(data):
+    with pytest.raises(ValueError, match=r"m\.npz: does not say of which system it is"):
+        system_from_dict(data, "m.npz")
 
 
 # Archives that lie

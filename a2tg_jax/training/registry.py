@@ -80,6 +80,8 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     Raises:
       ValueError: if the class is not known, or an option is missing, unknown or of another type.
     """
+    if not isinstance(data, Mapping) or not isinstance(data.get("name"), str) or "options" not in data:
+        raise ValueError(f"{where}: does not say of which system it is; it is damaged or of another version")
     name, options = data["name"], data["options"]
     if kind is None and name in SYSTEMS:
         kind = type(find_system(name))
