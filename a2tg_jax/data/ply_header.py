@@ -1,4 +1,4 @@
-"""The header of PLY files whose first element is `vertex`, and the room that their vertices take."""
+"""The header of PLY files, and the room that their vertices and other elements take."""
 
 import dataclasses
 import os
@@ -67,7 +67,7 @@ def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
     encoding, count = "", 0
     elements: list[str] = []
     fields: dict[str, str] = {}
-    for words in _header_lines(file, path):
+    for words in header_lines(file, path):
         match words:
             case ["format", encoding, *_] if encoding not in BYTE_ORDERS:
                 raise ValueError(f"{path}: is a PLY in {shortened(encoding)}; {', '.join(BYTE_ORDERS)} are known")
@@ -85,7 +85,31 @@ def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
     return VertexHeader(path, encoding, count, fields)
 
 
-def _header_lines(file: BinaryIO, path: Path) -> Iterator[list[str]]:
+def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
+    """The headers of all elements of a PLY, by their names, with the file left at the first of the first.
+
+    Raises:
+      ValueError: naming the file, if it is no PLY, its header does not end, or a property cannot be read.
+    """
+    encoding, found = "", dict[str, VertexHeader]()
+    for words in header_lines(file, path):
+        match words:
+            case ["format", name, *_]:
+                if name not in BYTE_ORDERS:
+                    raise ValueError(f"{path}: is a PLY in {shortened(name)}; {', '.join(BYTE_ORDERS)} are known")
+                encoding = name
+            case ["element", name, number]:
+                if not number.isdecimal() or len(number) > MOST_DIGITS:
+                    raise ValueError(f"{path}: announces {shortened(number)} of {shortened(name)}; a number is wanted")
+                found[name] = VertexHeader(path, encoding, int(number), {})
+            case ["property", kind, name] if found and kind in PLY_TYPES:
+                list(found.values())[-1].fields[name] = PLY_TYPES[kind]
+            case ["property", *_]:
+                raise ValueError(f"{path}: cannot read the property '{shortened(' '.join(words[1:]))}'")
+    return found
+
+
+def header_lines(file: BinaryIO, path: Path) -> Iterator[list[str]]:
     """The words of each line up to end_header."""
     if file.readline(LONGEST_LINE).strip() != b"ply":
         raise ValueError(f"{path}: is not a PLY file")

@@ -12,6 +12,7 @@ import dataclasses
 import os
 import warnings
 from pathlib import Path
+from typing import BinaryIO
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ from a2tg_jax.data.ply_header import read_vertex_header
 from a2tg_jax.data.world import Similarity
 from a2tg_jax.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.io.atomic import replacing
+from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.structure import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.sharing import LARGEST_OPACITY
@@ -109,7 +111,7 @@ def has_own_opacities(appearance: Appearance) -> bool:
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
-    """Reads Gaussians from a PLY file of 2DGS, or of a program that uses its attribute names.
+    """Reads Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
     They have the SH degree of the file; further attributes are left aside. A 3DGS file (scale_2) holds
     ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning where that is more
@@ -126,17 +128,22 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such PLY file")
     with open(path, "rb") as file:
-        header = read_vertex_header(file, path)
-        if header.encoding != ENCODING:
-            raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
-        header.require(REQUIRED, "a PLY of 2D Gaussians")
-        vertices = header.read_binary(file)
+        vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
     gaussians = _gaussians_of(vertices, path)
     try:
         check_model(Model(gaussians))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return gaussians
+
+
+def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
+    """The vertices, structured, with the attributes that 2DGS gives them."""
+    header = read_vertex_header(file, path)
+    if header.encoding != ENCODING:
+        raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
+    header.require(REQUIRED, "a PLY of 2D Gaussians")
+    return header.read_binary(file)
 
 
 def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
