@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_cases import small_numbers, write_case
+from viewer_cases import small_model, small_numbers, write_case
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.ply import ATTRIBUTES, SCALES
@@ -98,11 +98,18 @@ def test_the_page_shows_what_the_renderer_shows(node, tmp_path):
     with pytest.warns(UserWarning, match="thinnest axis"):
         cloud = open_source(ellipsoids(tmp_path.parent / "cloud.ply"))
     write_case(tmp_path / "3dgs", cloud, cameras_around(5.0))
-    run_node("test:browser", A2TG_CASES=str(tmp_path))
+    # Noise in all that there is, which rounding changes; the page must show what is left all the more exactly.
+    for name, options in (("noise", a2tg.TextureOptions()), ("official", a2tg.TextureOptions.official())):
+        write_case(tmp_path / name, Source(small_model(options), name), cameras_around(4.0), of=["the file"])
+    run_node("test:browser", "--", "compare", A2TG_CASES=str(tmp_path))
 
 
 def test_the_page_shows_a_real_scene(node, shared, tmp_path):
     scene = a2tg.load_scene(shared / "scenes" / "fox", downscale=8)
     source = trained(scene)
     write_case(tmp_path / "fox", source, [view.camera for view in scene.test[:2]])
-    run_node("test:browser", A2TG_CASES=str(tmp_path))
+    run_node("test:browser", "--", "compare", A2TG_CASES=str(tmp_path))
+
+
+def test_the_page_itself(node):
+    run_node("test:browser", "--", "page")

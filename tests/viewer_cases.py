@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax.appearance import Banded, Plain, Textured
+from a2tg_jax.appearance import Banded, Plain, Textured, TextureOptions
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.cameras import Camera
 from a2tg_jax.gaussians import Gaussians
@@ -29,7 +29,7 @@ NUM = 300
 """More than a chunk."""
 
 
-def small_model() -> Model:
+def small_model(options: TextureOptions = TextureOptions()) -> Model:  # noqa: B008 - frozen
     """Random Gaussians of all degrees and many texture sizes, none among them."""
     rng = np.random.default_rng(7)
     draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
@@ -44,7 +44,7 @@ def small_model() -> Model:
     camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
     origin = Origin.of_cameras([camera], ["<b>a</b>.png"], background=(0.25, 0.5, 0.75))
     params, layout = BandedParams(bands, textures), BandedLayout(owners, atlas)
-    return Model(gaussians, params, layout, appearance=Banded(Textured()), origin=origin)
+    return Model(gaussians, params, layout, appearance=Banded(Textured(options=options)), origin=origin)
 
 
 def write_small(folder: Path) -> None:
@@ -72,7 +72,13 @@ def small_numbers(data: bytes) -> dict[str, list]:
     return {name: np.round(np.asarray(array, np.float64), 5).ravel().tolist() for name, array in found.items()}
 
 
-def write_case(folder: Path, source: Source, cameras: Sequence[Camera], modes: Sequence[str] = ("full",)) -> None:
+def write_case(
+    folder: Path,
+    source: Source,
+    cameras: Sequence[Camera],
+    modes: Sequence[str] = ("full",),
+    of: Sequence[str] = ("the model", "the file"),
+) -> None:
     """A scene, its views, and of each the colours that the JAX renderer gives the model itself, from which the file is
     made, and those of what the file holds."""
     folder.mkdir(parents=True)
@@ -80,8 +86,9 @@ def write_case(folder: Path, source: Source, cameras: Sequence[Camera], modes: S
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
     models = {"the model": source.model, "the file": decode_web_scene(source.encoded).model}
     views = []
-    for name, model in models.items():
+    for name in of:
         for mode in modes:
+            model = models[name]
             shown = without_textures(model) if mode == "plain" else model
             renderer = Renderer(shown, cameras=cameras, settings=settings, has_geometry=False)
             for camera in cameras:

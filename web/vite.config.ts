@@ -12,6 +12,7 @@ export default defineConfig({
     outDir: "dist",
     reportCompressedSize: false,
   },
-  worker: { format: "es" },
+  // No module: browsers start none of a blob on a page that comes from the disk.
+  worker: { format: "iife" },
   plugins: [onefile()],
 });

@@ -52,7 +52,8 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
     const folder = join(FOLDER, name);
     const { background, views } = JSON.parse(readFileSync(join(folder, "views.json"), "utf8")) as Case;
     const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgw": readFileSync(join(folder, "scene.a2tgw")) });
-    const page = await browser.newPage();
+    // The canvas itself is drawn besides, slowly in software: a small one.
+    const page = await browser.newPage({ viewport: { width: 160, height: 120 } });
     const errors: string[] = [];
     page.on("pageerror", (error) => errors.push(error.message));
     page.on("console", (message) => { if (message.type() === "error") errors.push(message.text()); });

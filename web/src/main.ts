@@ -83,6 +83,7 @@ function lensOf(K: readonly number[], size: readonly number[]): Lens {
 function begin(): void {
   const viewer = new Viewer(element("view", HTMLCanvasElement));
   const panel = new Panel(viewer);
+  viewer.onFail = (reason) => { showMessage(`This browser could not sort the scene: ${reason}`); };
   const loaded = openScene().then((source) => load(viewer, panel, source));
   loaded.catch(fail);
   void findPhotographs(panel);

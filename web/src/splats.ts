@@ -24,6 +24,8 @@ export class Splats {
   readonly sample: number[] = [];
   /** Called when there is another order to draw. */
   onOrder: () => void = () => undefined;
+  /** Called when the worker cannot work. */
+  onFail: (reason: string) => void = () => undefined;
 
   private readonly gl: WebGL2RenderingContext;
   private readonly packer: Packer;
@@ -44,6 +46,7 @@ export class Splats {
     this.packer = new Packer(header);
     this.worker = new SortWorker();
     this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => { this.receive(event.data); });
+    this.worker.addEventListener("error", (event) => { this.onFail(event.message); });
   }
 
   add(chunk: Chunk): void {

@@ -31,6 +31,8 @@ export class Viewer implements Steered {
   divided: number | null = null;
   /** Called after each picture. */
   onFrame: (milliseconds: number) => void = () => undefined;
+  /** Called when the scene cannot be drawn. */
+  onFail: (reason: string) => void = () => undefined;
   /** Called when one has moved away from where one was put. */
   onLeave: () => void = () => undefined;
 
@@ -68,6 +70,7 @@ export class Viewer implements Steered {
       }
       this.draw();
     };
+    splats.onFail = (reason) => { this.onFail(reason); };
     return splats;
   }
 

@@ -1,0 +1,210 @@
+/** The page in Chromium: what it says, how it is steered, what it refuses. */
+
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+import { pathToFileURL } from "node:url";
+
+import type { Browser, Page } from "playwright-core";
+import { afterAll, beforeAll, describe, expect, test } from "vitest";
+
+import { CHROMIUM, launch, serve } from "./chromium";
+import type { Served } from "./chromium";
+
+const PAGE = readFileSync(new URL("../dist/index.html", import.meta.url), "utf8");
+const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgw", import.meta.url)));
+
+describe.skipIf(CHROMIUM === undefined)("the page", () => {
+  let browser: Browser;
+  let served: Served;
+  beforeAll(async () => {
+    browser = await launch();
+    served = await serve({ "/": PAGE, "/scene.a2tgw": SCENE, "/photographs.json": "[0]", "/photographs/0.jpg": "" });
+  });
+  afterAll(async () => {
+    await browser.close();
+    served.close();
+  });
+
+  /** A page that has loaded, of a size, at the end of an address; it counts what it asks of others. */
+  async function opened(hash = "", size = { width: 640, height: 480 }): Promise<{ page: Page; elsewhere: string[] }> {
+    const page = await browser.newPage({ viewport: size });
+    const elsewhere: string[] = [];
+    page.on("request", (request) => {
+      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address)) elsewhere.push(request.url());
+    });
+    await page.goto(served.address + hash);
+    await page.evaluate(() => window.a2tg?.loaded);
+    return { page, elsewhere };
+  }
+
+  const position = (page: Page): Promise<readonly number[]> =>
+    page.evaluate(() => [...(window.a2tg?.viewer.pose.position ?? [])]);
+
+  test("names are text, and nothing is fetched from elsewhere", async () => {
+    const { page, elsewhere } = await opened();
+    expect(await page.title()).toBe("small · a2tg view");
+    expect(await page.textContent("#note")).toBe("a note");
+    expect(await page.locator("#camera option").allTextContents()).toEqual(["free", "<b>a</b>.png"]);
+    expect(await page.locator("#camera b").count()).toBe(0);
+    expect(await page.textContent("#figures")).toContain("300");
+    expect(elsewhere).toEqual([]);
+    await page.close();
+  });
+
+  test("scripts that someone puts in do not run", async () => {
+    const { page } = await opened();
+    const isRun = await page.evaluate(async () => {
+      const script = document.createElement("script");
+      script.textContent = "window.wasRun = true";
+      document.body.append(script);
+      await new Promise((resolve) => setTimeout(resolve, 50));
+      return "wasRun" in window;
+    });
+    expect(isRun).toBe(false);
+    await page.close();
+  });
+
+  test("keys choose modes and cameras, and fly", async () => {
+    const { page } = await opened();
+    await page.focus("#view");
+    await page.keyboard.press("5");
+    expect(await page.inputValue("#mode")).toBe("depth");
+    expect(await page.textContent("#legend")).toContain("near");
+    const before = await position(page);
+    await page.keyboard.down("w");
+    await page.waitForFunction((from) => Math.hypot(...(window.a2tg?.viewer.pose.position ?? []).map((x, i) => x - from[i])) > 0.01, before);
+    await page.keyboard.up("w");
+    expect(await page.inputValue("#camera")).toBe("-1");
+    await page.keyboard.press(".");
+    expect(await page.inputValue("#camera")).toBe("0");
+    expect(await position(page)).toEqual(before);
+    await page.close();
+  });
+
+  test("dragging turns around the target, the wheel comes nearer to it", async () => {
+    const { page } = await opened();
+    const target = (): Promise<number[]> => page.evaluate(() => {
+      const { position: at, rotation, focus } = window.a2tg?.viewer.pose ?? { position: [], rotation: [[], [], []], focus: 0 };
+      return at.map((x, i) => x + focus * rotation[2][i]);
+    });
+    const [before, from] = [await target(), await position(page)];
+    await page.mouse.move(200, 200);
+    await page.mouse.down();
+    await page.mouse.move(260, 220, { steps: 4 });
+    await page.mouse.up();
+    (await target()).forEach((x, i) => { expect(x).toBeCloseTo(before[i], 5); });
+    const turned = await position(page);
+    expect(Math.hypot(...turned.map((x, i) => x - from[i]))).toBeGreaterThan(0.1);
+    await page.mouse.wheel(0, -300);
+    await page.waitForFunction((at) => window.a2tg?.viewer.pose.position.some((x, i) => Math.abs(x - at[i]) > 1e-3), turned);
+    (await target()).forEach((x, i) => { expect(x).toBeCloseTo(before[i], 5); });
+    await page.close();
+  });
+
+  test("the address carries the view", async () => {
+    const { page } = await opened();
+    await page.mouse.move(200, 200);
+    await page.mouse.down();
+    await page.mouse.move(300, 240, { steps: 3 });
+    await page.mouse.up();
+    await page.selectOption("#mode", "normals");
+    await page.waitForFunction(() => location.hash.includes("mode=normals"));
+    const hash = new URL(page.url()).hash;
+    const other = await opened(hash);
+    (await position(other.page)).forEach((x, i, all) => { expect(x).toBeCloseTo(all[i], 5); });
+    const [here, there] = [await position(page), await position(other.page)];
+    here.forEach((x, i) => { expect(there[i]).toBeCloseTo(x, 4); });
+    expect(await other.page.inputValue("#mode")).toBe("normals");
+    await page.close();
+    await other.page.close();
+  });
+
+  test("photographs lie behind a slider, where there are some", async () => {
+    const { page } = await opened();
+    await page.waitForSelector("#wipe");
+    await page.fill("#wipe", "0.5");
+    const style = await page.evaluate(() => document.getElementById("photograph")?.style.clipPath);
+    expect(style).toBe("inset(0px 50% 0px 0px)");
+    await page.mouse.move(200, 200);
+    await page.mouse.wheel(0, -300);
+    await page.waitForSelector("#photo", { state: "hidden" });
+    await page.close();
+  });
+
+  test("textures on and off, side by side", async () => {
+    const { page } = await opened();
+    await page.check("#divide");
+    await page.fill("#divider", "0.25");
+    expect(await page.evaluate(() => window.a2tg?.viewer.divided)).toBe(0.25);
+    await page.uncheck("#divide");
+    expect(await page.evaluate(() => window.a2tg?.viewer.divided)).toBeNull();
+    await page.close();
+  });
+
+  test("a phone's screen holds all of it", async () => {
+    const { page } = await opened("", { width: 390, height: 844 });
+    expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBe(390);
+    const closed = await page.locator("#panel").boundingBox();
+    expect(closed?.height).toBeLessThan(60);
+    await page.click("#panel > summary");
+    const open = await page.locator("#panel").boundingBox();
+    expect(open?.height).toBeLessThan(0.5 * 844);
+    for (const id of ["mode", "camera", "start", "keep"]) {
+      const box = await page.locator(`#${id}`).boundingBox();
+      expect((box?.x ?? -1) >= 0 && (box?.x ?? 0) + (box?.width ?? 999) <= 390).toBe(true);
+    }
+    await page.close();
+  });
+
+  test("every control has a name", async () => {
+    const { page } = await opened();
+    const unnamed = await page.evaluate(() =>
+      [...document.querySelectorAll("input, select, button, canvas, progress")].filter((found) => {
+        const labels = found instanceof HTMLInputElement || found instanceof HTMLSelectElement ? (found.labels?.length ?? 0) : 0;
+        return labels === 0 && (found.getAttribute("aria-label") ?? found.textContent) === "";
+      }).map((found) => found.id));
+    expect(unnamed).toEqual([]);
+    await page.close();
+  });
+
+  async function message(files: Record<string, Uint8Array | string>, prepare?: (page: Page) => Promise<unknown>): Promise<string | null> {
+    const other = await serve({ "/": PAGE, ...files });
+    const page = await browser.newPage();
+    await prepare?.(page);
+    await page.goto(other.address);
+    const found = await page.locator("#message:not([hidden])").textContent();
+    await page.close();
+    other.close();
+    return found;
+  }
+
+  test("a damaged scene is said to be", async () => {
+    expect(await message({ "/scene.a2tgw": SCENE.subarray(0, SCENE.length - 100) })).toContain("cut off");
+    expect(await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) })).toContain("damaged");
+    expect(await message({ "/scene.a2tgw": "<script>alert(1)</script> and more text" })).toContain("not a scene");
+    expect(await message({})).toContain("no scene.a2tgw");
+  });
+
+  test("a browser without WebGL 2 is said to lack it", async () => {
+    const found = await message({ "/scene.a2tgw": SCENE }, (page) =>
+      page.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; }));
+    expect(found).toContain("no WebGL 2");
+  });
+
+  test("a single file opens from the disk, and the page alone says that it cannot", async () => {
+    const folder = mkdtempSync(join(tmpdir(), "a2tg-"));
+    const data = `<script type="text/plain" id="scene-data">${Buffer.from(SCENE).toString("base64")}</script>`;
+    const path = join(folder, "one.html");
+    writeFileSync(path, PAGE.replace('<script type="module">', () => `${data}\n<script type="module">`));
+    const page = await browser.newPage();
+    await page.goto(pathToFileURL(path).href);
+    await page.evaluate(() => window.a2tg?.loaded);
+    expect(await page.evaluate(() => window.a2tg?.viewer.splats?.num)).toBe(300);
+    writeFileSync(path, PAGE);
+    await page.goto(pathToFileURL(path).href);
+    expect(await page.locator("#message:not([hidden])").textContent()).toContain("--single-file");
+    await page.close();
+    rmSync(folder, { recursive: true });
+  });
+});
