@@ -24,6 +24,7 @@ from a2tg_jax.results.checks import check_apart, check_weights
 from a2tg_jax.results.claim import opened
 from a2tg_jax.results.compress import compress, compression_text
 from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import (
@@ -135,19 +136,25 @@ class Train:
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: Path | None = None
     """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+    max_memory: str | None = None
+    """Refuse what would take more memory, of the process or of the GPU, than 8GB, 800MB, … (default: all that there
+    is); of the photographs, those beyond a quarter of it stay on disk. --memory-budget bounds the model instead."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
-        weights = self.lpips_weights
+        weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
         if not self.resume:
-            _tell(begin_run(self.record, self.out, overwrite=self.overwrite, lpips_weights=weights), self.out)
+            result = begin_run(self.record, self.out, overwrite=self.overwrite, lpips_weights=weights, max_memory=most)
+            _tell(result, self.out)
             return
         if self.overwrite:
             raise ValueError("--resume goes on with a run and --overwrite replaces it: give one of them")
         check_weights(weights)
         with opened(self.out) as run:
             record = self._resumed(run)
-            _tell(go_on(run, record.scene.load(), lpips_weights=weights), self.out)
+            scene = record.scene.load(room_for_photographs(most))
+            tell_forecast(scene, record.plan, most)
+            _tell(go_on(run, scene, lpips_weights=weights), self.out)
 
     @property
     def record(self) -> RunRecord:

@@ -15,7 +15,7 @@ from a2tg_jax import Gaussians2dMcmc, McmcConfig, fit, load_scene, synthetic_sce
 from a2tg_jax.data import pictures
 from a2tg_jax.data.pictures import Picture, Shelf
 from a2tg_jax.training import loop
-from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore
+from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore, stack_views
 
 SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=McmcConfig(cap=70))
 KINDS = {
@@ -148,6 +148,14 @@ def test_batches_are_made_in_order_once_and_not_too_many():
         assert ahead.first(wanted) == (iteration,)
     ahead.close()
     assert sorted(made) == [1, 2, 3, 4, 5]
+
+
+def test_photographs_on_the_device_are_not_copied(tmp_path):
+    """On a CPU the device's memory is the host's."""
+    views = [view for view in load(write_scene(tmp_path / "scene", alpha=True)).train]
+    stack = stack_views(views)
+    for array in (stack.images, stack.alphas):
+        assert jax.device_put(array).unsafe_buffer_pointer() == array.ctypes.data
 
 
 def test_going_back_makes_batches_again():

@@ -8,6 +8,7 @@ from a2tg_jax.budget import bytes_per_gaussian
 from a2tg_jax.data import Scene
 from a2tg_jax.metrics import load_lpips
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, check_free
+from a2tg_jax.results.forecast import room_for_photographs, tell_forecast
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training.start import check_start, initial_number
@@ -16,21 +17,24 @@ STATE_SIZE = 3
 """A checkpoint holds parameters and two moments of each."""
 
 
-def check_new_run(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None) -> Scene:
-    """The scene of a run that can be trained in a folder.
+def check_new_run(
+    record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None, max_memory: int | None = None
+) -> Scene:
+    """The scene of a run that can be trained in a folder. What the run will need is printed.
 
     Raises:
-      ValueError, OSError: naming what is wrong: an option, the weights, the folder, the scene, the disk.
+      ValueError, OSError: naming what is wrong: an option, the weights, the folder, the scene, the disk, the memory.
     """
     record.check()
     check_weights(lpips_weights)
     if record.scene.path != SYNTHETIC:
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=overwrite)
-    scene = record.scene.load()
+    scene = record.scene.load(room_for_photographs(max_memory))
     for system in record.systems.values():
         check_start(scene, system)
     check_room(record, scene, out)
+    tell_forecast(scene, record.plan, max_memory)
     return scene
 
 

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import jax
 
+from a2tg_jax.budget import bytes_of, megabytes_of
 from a2tg_jax.cores import num_threads
 from a2tg_jax.data import Scene
+from a2tg_jax.data.pictures import SHARE_OF_MEMORY
 from a2tg_jax.memory import memory_limit
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.training import System
@@ -39,7 +41,8 @@ ROUGHLY = 2.0
 OPTIONS = {
     "program": "--max-memory, for the program itself takes most",
     "photographs": "--downscale, or --batch-size",
-    "model": "--densify.cap, --memory-budget, --batch-size or --sh-degree",
+    "model": "--densify.cap, --memory-budget or --sh-degree",
+    "gradients": "--densify.cap, --memory-budget, --batch-size or --sh-degree",
     "pixels": "--downscale",
 }
 """What to change where most of the memory is for one thing."""
@@ -105,7 +108,7 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
         resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
-        compiling = max(COMPILER - stage.bytes.pixels, 0)
+        compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)  # before there are any of these
         phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
     shown = Bytes(
         program=(resident + REPORT) if is_host else 0,
@@ -117,12 +120,38 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
     return RunForecast({**phases, "evaluation": shown}, _disk_bytes(scene, plan, list(stages.values())), seconds)
 
 
-def allowed_memory(max_memory: float | None) -> float:
+def bytes_allowed(max_memory: float | str | None) -> int | None:
+    """Bytes of --max-memory, written as a memory budget is.
+
+    Raises:
+      ValueError: if it is not.
+    """
+    megabytes = megabytes_of(max_memory, "--max-memory")
+    return None if megabytes is None else bytes_of(megabytes)
+
+
+def allowed_memory(max_memory: int | None) -> int:
     """Bytes that a run may use: what is asked for, or what the machine, or its accelerator, has available (host)."""
     if max_memory is not None:
         return max_memory
     stats = jax.local_devices()[0].memory_stats() or {}
     return stats.get("bytes_limit", 0) or memory_limit()
+
+
+def room_for_photographs(max_memory: int | None) -> int | None:
+    """Bytes that the photographs may take where a process may take so many; None as in `load_scene`."""
+    return None if max_memory is None else int(SHARE_OF_MEMORY * max_memory)
+
+
+def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None) -> None:
+    """Prints what a run will take.
+
+    Raises:
+      ValueError: if that cannot fit, naming the options to change.
+    """
+    found, limit = forecast_run(scene, plan), allowed_memory(max_memory)
+    found.check(limit)
+    print(found.told(limit), flush=True)
 
 
 def _stages(scene: Scene, plan: RunPlan) -> dict[str, StageForecast]:

@@ -17,7 +17,14 @@ from a2tg_jax.results.summary import RunResult
 from a2tg_jax.results.train_run import train_run
 
 
-def begin_run(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None = None) -> RunResult:
+def begin_run(
+    record: RunRecord,
+    out: Path,
+    *,
+    overwrite: bool,
+    lpips_weights: Path | None = None,
+    max_memory: int | None = None,
+) -> RunResult:
     """Trains and measures a new run, once all about it has been checked.
 
     Args:
@@ -26,12 +33,13 @@ def begin_run(record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: P
       overwrite: the run that is in the folder is replaced, once this one has a checkpoint, and deleted once this one
         has its report.
       lpips_weights: a weights file for LPIPS; None leaves it out.
+      max_memory: bytes that the process may take (`forecast.allowed_memory`).
 
     Raises:
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
       Stopped: if the process is asked to end; its `advice` tells how to go on.
     """
-    scene = check_new_run(record, out, overwrite=overwrite, lpips_weights=lpips_weights)
+    scene = check_new_run(record, out, overwrite=overwrite, lpips_weights=lpips_weights, max_memory=max_memory)
     run = RunFolder(out)
     with claimed(run):
         check_free(out, overwrite=overwrite)  # Another process may have been here meanwhile.

@@ -5,7 +5,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -18,6 +17,9 @@ DEVICE_SHARE = 0.25
 ROOM_AHEAD = 2**28
 MOST_AHEAD = 10
 """Batches that are made ready before they are wanted: so many, as long as they take no more bytes than that."""
+
+ALIGNMENT = 64
+"""Bytes, of memory that XLA takes over."""
 
 
 class Photographs(NamedTuple):
@@ -123,7 +125,7 @@ class PhotoStore:
         """All the photographs of a size on the device, and where each view's is."""
         if size not in self._stacks:
             found = [index for index, view in enumerate(self._views) if view.picture.size == size]
-            stack = jax.tree.map(jnp.asarray, stack_views([self._views[index] for index in found]))
+            stack = jax.device_put(stack_views([self._views[index] for index in found]))
             self._stacks[size] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[size]
 
@@ -195,15 +197,24 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Pho
     alphas = None
     if any(view.has_alpha for view in alike):
         opaque = np.full(views[0].picture.size, 255, np.uint8)
-        alphas = np.stack([own[..., 3] if own.shape[2] == 4 else opaque for own in pixels])
+        alphas = _stacked([own[..., 3] if own.shape[2] == 4 else opaque for own in pixels])
     masks = None
     if any(view.mask is not None for view in alike):
         whole = np.ones(views[0].picture.size, bool)
-        masks = np.stack([whole if view.mask is None else view.mask.read() for view in views])
+        masks = _stacked([whole if view.mask is None else view.mask.read() for view in views])
     return Photographs(
         viewmats=np.stack([np.asarray(view.camera.viewmat) for view in views]),  # type: ignore[arg-type]
         Ks=np.stack([np.asarray(view.camera.K) for view in views]),  # type: ignore[arg-type]
-        images=np.stack([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
+        images=_stacked([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
         alphas=alphas,  # type: ignore[arg-type]
         masks=masks,  # type: ignore[arg-type]
     )
+
+
+def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
+    """`np.stack` in memory that `jax.device_put` takes over on CPUs as it stands; `jnp.asarray` would copy it twice."""
+    shape, dtype = (len(arrays), *arrays[0].shape), arrays[0].dtype
+    num_bytes = int(np.prod(shape)) * dtype.itemsize
+    room = np.empty(num_bytes + ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % ALIGNMENT
+    return np.stack(arrays, out=room[start : start + num_bytes].view(dtype).reshape(shape))

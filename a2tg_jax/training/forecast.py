@@ -55,18 +55,15 @@ class Bytes(NamedTuple):
     """The program, its libraries and what it compiles."""
     photographs: float = 0
     model: float = 0
-    """The model, its moments and gradients."""
+    """The model and its moments."""
+    gradients: float = 0
+    """What a step makes for each Gaussian."""
     pixels: float = 0
     """Renders, loss and tile lists."""
 
     @property
     def total(self) -> float:
         return sum(self)
-
-    @property
-    def data(self) -> float:
-        """All but the program: what is on the device where that is not the host."""
-        return self.total - self.program
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,12 +119,11 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
     largest, batch = largest_view(scene.train), system.batch_size
     per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * any(term.has_geometry for term in stage.losses)
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2
-    state = (STATES + 1) * model_bytes  # the model that the stage began with stays
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
-    step = STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num)
     return Bytes(
         photographs=held_bytes(scene) + fed_bytes(scene.train, batch),
-        model=state + step,
+        model=(STATES + 1) * model_bytes,  # what the stage began with stays
+        gradients=STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num),
         pixels=largest * (per_pixel + VIEW_PER_PIXEL * (batch - 1)) + STEP_PER_PAIR * pairs,
     )
 
