@@ -14,6 +14,7 @@ from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write
 
 import a2tg_jax as a2tg
 from a2tg_jax import save_compact, save_model, save_ply
+from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.folder import write_json as write_run_json
 from a2tg_jax.results.history import write_history
@@ -55,7 +56,10 @@ def write_seeds(folder: Path) -> None:
 def _write_scenes(folder: Path) -> None:
     models = tuple(CAMERAS)
     for text, name in ((False, "colmap"), (True, "colmap-text")):
-        write_colmap(folder / name, models=models, num_views=NUM_VIEWS, num_points=6, text=text)
+        reconstruction = write_colmap(folder / name, models=models, num_views=NUM_VIEWS, num_points=6, text=text)
+        _add_tracks(reconstruction)
+        write = reconstruction.write_text if text else reconstruction.write_binary
+        write(str(folder / name / "sparse" / "0"))
     frames = write_frames(folder / "nerfstudio", NUM_VIEWS)
     write_ply(folder / "nerfstudio" / "points.ply")
     _write_masks(folder / "nerfstudio" / "masks")
@@ -66,6 +70,16 @@ def _write_scenes(folder: Path) -> None:
     (folder / "points").mkdir()
     for name, encoding in (("ascii", "ascii"), ("little", "binary_little_endian"), ("big", "binary_big_endian")):
         write_ply(folder / "points" / f"{name}.ply", encoding)
+
+
+def _add_tracks(reconstruction) -> None:
+    """Every image sees every point, somewhere."""
+    points = sorted(reconstruction.points3D)
+    for key in sorted(reconstruction.images):
+        places = [pycolmap().Point2D(np.asarray([10.0 + index, 5.0])) for index in range(len(points))]
+        reconstruction.images[key].points2D = pycolmap().Point2DList(places)
+        for index, point in enumerate(points):
+            reconstruction.add_observation(point, pycolmap().TrackElement(key, index))
 
 
 def _write_masks(folder: Path) -> None:

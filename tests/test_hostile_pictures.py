@@ -98,6 +98,13 @@ def test_pictures_of_8_bits_are_read(tmp_path, kind):
     assert check_picture(tmp_path / "picture") == (16, 12)
 
 
+def test_photographs_of_several_pictures_are_read(tmp_path):
+    """As many cameras write JPEG, with a smaller picture beside it."""
+    image = Image.new("RGB", (16, 12))
+    image.save(tmp_path / "photo.jpg", "MPO", save_all=True, append_images=[image.resize((8, 6))])
+    assert read_pixels(tmp_path / "photo.jpg").shape == (12, 16, 3)
+
+
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "BMP", "PPM", "GIF", "WEBP", "JPEG", "AVIF"])
 def test_broken_pictures_are_one_clear_line(tmp_path, kind):
     """Pixels, or an error that names the file."""
