@@ -4,6 +4,8 @@ from a2tg_jax.adapt import Upscale as Upscale
 from a2tg_jax.adapt import next_sizes as next_sizes
 from a2tg_jax.adapt import reallocate as reallocate
 from a2tg_jax.adapt import select as select
+from a2tg_jax.alignment import align_poses as align_poses
+from a2tg_jax.alignment import color_fit as color_fit
 from a2tg_jax.appearance import Appearance as Appearance
 from a2tg_jax.appearance import AppearanceRule as AppearanceRule
 from a2tg_jax.appearance import Plain as Plain
@@ -18,6 +20,9 @@ from a2tg_jax.compaction import loss_on_views as loss_on_views
 from a2tg_jax.compaction import measure_choices as measure_choices
 from a2tg_jax.compaction import smallest_within as smallest_within
 from a2tg_jax.cores import set_num_threads as set_num_threads
+from a2tg_jax.corrections import Correction as Correction
+from a2tg_jax.corrections import Exposure as Exposure
+from a2tg_jax.corrections import PoseRefinement as PoseRefinement
 from a2tg_jax.data import Mask as Mask
 from a2tg_jax.data import Picture as Picture
 from a2tg_jax.data import Scene as Scene

@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.alignment import color_fit
 from a2tg_jax.appearance import Plain, Textured
 from a2tg_jax.cameras import Camera
+from a2tg_jax.corrections import exposed
 from a2tg_jax.data import View, view_image
 from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.metrics import load_lpips, lpips, psnr, ssim
@@ -76,6 +78,7 @@ def evaluate(
     background: Color | None = None,
     lpips_weights: str | os.PathLike | None = None,
     num_renders: int = 0,
+    fit_colors: bool = False,
 ) -> Evaluation:
     """Renders every view and compares it with its photograph, where its pixels count (host).
 
@@ -86,6 +89,8 @@ def evaluate(
         black.
       lpips_weights: a weights file for LPIPS; None leaves it out.
       num_renders: return the images of the first so many views, too.
+      fit_colors: before a render is compared, its colours are mapped to the photograph's by the affine map of least
+        squares (`alignment.color_fit`), for photographs whose exposure the model cannot know.
 
     Raises:
       ValueError: if there are no views, or a model is given with textures.
@@ -106,6 +111,8 @@ def evaluate(
         image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
         seconds.append(_seconds_to_draw(renderer, view.camera))
         mask = None if view.mask is None else jnp.asarray(view.mask.read())
+        if fit_colors:
+            image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
         decibels, similarity = psnr_and_ssim(image, target, mask)
         distance = None if weights is None else float(lpips(image, target, weights, mask))
         per_view.append(ViewMetrics(view.name, float(decibels), float(similarity), distance))

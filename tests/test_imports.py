@@ -31,7 +31,7 @@ LAYERS = (
     {"events"},
     {"adapt", "mcmc", "densify", "view_dependence", "corrections"},
     {"splitting"},
-    {"least_squares"},
+    {"least_squares", "alignment"},
     {"training"},
     {"systems", "evaluation", "compaction", "web"},
     {"shrinking"},

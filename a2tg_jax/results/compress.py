@@ -21,6 +21,7 @@ from a2tg_jax.io.model import load_model
 from a2tg_jax.io.rows import check_kind
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
+from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.record import read_record
@@ -100,7 +101,7 @@ def _scene_of(run: RunFolder) -> Scene | None:
 def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
     """Measures by name; the first decides."""
     if scene is not None:
-        train = scene.train[:: -(-len(scene.train) // MOST_VIEWS)]
+        train = refined_views(scene.train[:: -(-len(scene.train) // MOST_VIEWS)], model)
         losses = {"training views": loss_on_views(model, train, settings=settings)}
         return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
     if model.origin is None:

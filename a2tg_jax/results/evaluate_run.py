@@ -15,6 +15,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.origin import Color
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
+from a2tg_jax.results.corrected import measure_corrected, write_corrections
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.history import read_history
@@ -61,7 +62,7 @@ def evaluate_run(
     scene = scene or record.scene.load()
     measured = {
         name: dataclasses.replace(
-            _measure(model, scene, plan[name].system, _seconds(run, name), lpips_weights),
+            _measure(model, scene, plan, plan[name].system, _seconds(run, name), lpips_weights),
             sha256=sha256_of(run.model(name)),
         )
         for name, model in models.items()
@@ -71,6 +72,8 @@ def evaluate_run(
     result = RunResult(scene.name, record, plan, measured, is_lpips_kept=lpips_weights is None)
     write_json(run.own(run.metrics), metrics_json(result))
     write_json(run.own(run.per_view), per_view_json(result))
+    for name, model in models.items():
+        write_corrections(run, name, model)
     main = models[result.main]
     _write_curves(run, plan, list(models))
     if main.textures is not None and not isinstance(main.appearance, Billboards):
@@ -92,7 +95,7 @@ def _seconds(run: RunFolder, name: str) -> float:
     return read_history(run.history(name)).last_seconds
 
 
-def _measure(model: Model, scene: Scene, system: System, seconds: float, lpips_weights) -> ModelResult:
+def _measure(model: Model, scene: Scene, plan: RunPlan, system: System, seconds: float, lpips_weights) -> ModelResult:
     views = (*scene.test, *scene.train)
     found = evaluate(views, model, settings=settings_of(system), lpips_weights=lpips_weights)
     return ModelResult(
@@ -104,6 +107,7 @@ def _measure(model: Model, scene: Scene, system: System, seconds: float, lpips_w
         num_published_bytes=model.num_published_bytes,
         num_padding_bytes=model.num_padding_bytes,
         seconds=seconds,
+        corrected=measure_corrected(model, scene, plan, settings_of(system), lpips_weights),
     )
 
 

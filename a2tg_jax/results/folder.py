@@ -5,6 +5,7 @@
       run.toml                   the scene, the system with every number, the systems compared: repeats the run
       checkpoints/NAME-*.npz     the newest two of the stage that is being trained, to resume from
       models/NAME.npz            what each finished stage left behind, with cameras, world and background
+      corrections/NAME.json      exposure and pose of each training view, where they were learned
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
@@ -119,6 +120,9 @@ class RunFolder:
 
     def model(self, name: str) -> Path:
         return self.path / "models" / f"{name}.npz"
+
+    def corrections(self, name: str) -> Path:
+        return self.path / "corrections" / f"{name}.json"
 
     def history(self, name: str) -> Path:
         return self.path / "history" / f"{name}.csv"

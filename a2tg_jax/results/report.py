@@ -16,7 +16,7 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.markup import image, layers, page, slider, table
 from a2tg_jax.results.pictures import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.record import repeating_command
-from a2tg_jax.results.summary import RunResult, minutes, summary_table, versions
+from a2tg_jax.results.summary import ModelResult, RunResult, minutes, summary_table, versions
 
 SECTIONS = (
     ("summary", "Summary"),
@@ -106,10 +106,21 @@ def _summary(result: RunResult) -> str:
         "PSNR in dB, means over the views, images clipped to [0, 1]; the best of each figure is marked. MB (10⁶ bytes) "
         "counts all trained floats: 52 to 232 bytes a Gaussian, by its degree, and what it shows, such as 16 bytes a "
         "texel; what a method's authors count, where that is something else, and padding of the buffers stand beside "
-        f"it. Training is the time of each stage alone.{network}"
+        f"it. Training is the time of each stage alone.{network}{_corrected_told(last)}"
     )
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     return f'<div class="cards">{tiles}</div>{table(titles, rows, best)}<p class="soft">{escape(note)}</p>'
+
+
+def _corrected_told(measured: ModelResult) -> str:
+    """What further figures mean, where there are any."""
+    ways = {key.partition("_")[2] for key in measured.corrected}
+    fitted = " Colours fitted: each render's colours mapped to the photograph's by the affine map of least squares."
+    aligned = (
+        " Poses aligned: test cameras moved to where the model looks most like the photograph, training cameras to "
+    )
+    aligned += "where training moved them."
+    return (fitted if "color_fit" in ways else "") + (aligned if "aligned" in ways else "")
 
 
 def _main_first(result: RunResult, titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:

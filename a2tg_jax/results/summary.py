@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 from a2tg_jax.evaluation import Evaluation
+from a2tg_jax.results.corrected import corrected_title
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import RunRecord
 
@@ -18,6 +19,9 @@ FIGURES = (
     "test PSNR (dB)", "test SSIM", "test LPIPS", "train PSNR (dB)", "train SSIM", "train LPIPS", "Gaussians",
     "texels a Gaussian", "memory (MB)", "as published (MB)", "padding (MB)", "frames a second", "training time",
 )  # fmt: skip
+QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
+NUM_QUALITIES = 2 * len(QUALITIES)
+"""The first figures, of test and training views."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +44,14 @@ class ModelResult:
     """Training time of this stage."""
     sha256: str = ""
     """Of the model's file."""
+    corrected: Mapping[str, Evaluation] = dataclasses.field(default_factory=dict)
+    """Figures up to exposure and pose (`results.corrected`), where a system of the run learns these."""
+
+    @property
+    def splits(self) -> dict[str, Evaluation]:
+        """All that was evaluated, by its name in metrics.json."""
+        test = {} if self.test is None else {"test": self.test}
+        return {"train": self.train, **test, **self.corrected}
 
     @property
     def shown(self) -> Evaluation:
@@ -105,8 +117,7 @@ def per_view_json(result: RunResult) -> dict[str, Any]:
     return {
         name: {
             split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
-            for split, found in (("train", measured.train), ("test", measured.test))
-            if found is not None
+            for split, found in measured.splits.items()
         }
         for name, measured in result.models.items()
     }
@@ -127,9 +138,21 @@ def versions() -> dict[str, str]:
 
 def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
     """Titles and rows of the headline table: a column for each model, a row for each figure that there is."""
-    columns = [_figures(measured) for measured in result.models.values()]
-    rows = [[name, *cells] for name, *cells in zip(FIGURES, *columns, strict=True) if any(cells)]
-    return ["", *result.models], rows
+    models = result.models.values()
+    columns = [_figures(measured) for measured in models]
+    rows = [[name, *cells] for name, *cells in zip(FIGURES, *columns, strict=True)]
+    keys = dict.fromkeys(key for measured in models for key in measured.corrected)
+    further = [
+        row for key in keys for row in _corrected_rows(key, [measured.corrected.get(key) for measured in models])
+    ]
+    rows[NUM_QUALITIES:NUM_QUALITIES] = further
+    return ["", *result.models], [row for row in rows if any(row[1:])]
+
+
+def _corrected_rows(key: str, found: Sequence[Evaluation | None]) -> list[list[str]]:
+    """The rows of a table for figures up to exposure or pose."""
+    cells = zip(*(_qualities(evaluation) for evaluation in found), strict=True)
+    return [[f"{corrected_title(key)}: {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
@@ -194,8 +217,7 @@ def minutes(seconds: float) -> str:
 def _model_json(measured: ModelResult) -> dict[str, Any]:
     quality = {
         split: {"psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "views": len(found.per_view)}
-        for split, found in (("train", measured.train), ("test", measured.test))
-        if found is not None
+        for split, found in measured.splits.items()
     }
     names = (
         "num_gaussians", "num_texels", "num_bytes", "num_published_bytes", "num_padding_bytes", "seconds", "sha256"
@@ -204,13 +226,15 @@ def _model_json(measured: ModelResult) -> dict[str, Any]:
     return {**quality, **counts, "frames_per_second": measured.shown.frames_per_second}
 
 
+def _qualities(found: Evaluation | None) -> list[str]:
+    """PSNR, SSIM and LPIPS; empty where there is no figure."""
+    if found is None:
+        return ["", "", ""]
+    return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
+
+
 def _figures(measured: ModelResult) -> list[str]:
     """One model's column of the headline table; empty where there is no figure."""
-
-    def quality(found: Evaluation | None) -> list[str]:
-        if found is None:
-            return ["", "", ""]
-        return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
 
     def megabytes(num_bytes: int) -> str:
         return f"{num_bytes / 1e6:.2f}"
@@ -218,8 +242,8 @@ def _figures(measured: ModelResult) -> list[str]:
     is_textured = measured.num_texels > 0
     is_counted_otherwise = measured.num_published_bytes != measured.num_bytes
     return [
-        *quality(measured.test),
-        *quality(measured.train),
+        *_qualities(measured.test),
+        *_qualities(measured.train),
         f"{measured.num_gaussians:,}",
         f"{measured.num_texels / measured.num_gaussians:.2f}" if is_textured else "",
         megabytes(measured.num_bytes),
