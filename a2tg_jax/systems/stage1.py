@@ -8,7 +8,7 @@ from a2tg_jax.appearance import Appearance, Plain
 from a2tg_jax.densify import CloneSplitPrune, FillingDensity, OpacityReset
 from a2tg_jax.events import Event
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
-from a2tg_jax.training.options import System
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import LearningRates, Stage
 
 QUICK_CAP = 10_000
@@ -24,9 +24,9 @@ SMOKE: dict[str, Any] = {
 }  # fmt: skip
 SMOKE_CAP = 1_000
 FLOATS_PER_TEXEL = 4
-ANY_RATE = (0.0, math.inf)
-LOOKUP_RANGES = {"texture.lookup.max_alpha": (1e-3, 0.9999), "texture.lookup.initial_rgb": (-1.0, 1.0)}
-DENSITY_RANGES = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0.0, 0.99)}
+ANY_RATE = (0, math.inf)
+LOOKUP_RANGES: Ranges = {"texture.lookup.max_alpha": (1e-3, 0.9999), "texture.lookup.initial_rgb": (-1.0, 1.0)}
+DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0, 0.99)}
 
 
 @dataclasses.dataclass(frozen=True)
