@@ -26,35 +26,49 @@ declare global {
   interface Window { a2tg?: PageApi }
 }
 
+/** While a scene comes it is drawn again when there is so much more of it. */
+const GROWTH = 1.7;
+
 async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void> {
   const progress = element("progress", HTMLProgressElement);
   progress.hidden = false;
   let splats: Splats | null = null;
-  let numBytes = 1;
+  let [numBytes, numShown] = [1, 0];
   await readScene(source, {
     onHeader: (header, length) => {
       numBytes = length;
       splats = viewer.begin(header);
       panel.begin(header);
     },
-    onChunk: (chunk, numRead) => {
+    onChunk: async (chunk, numRead) => {
       if (splats === null) return;
-      const isFirst = splats.num === 0;
       splats.add(chunk);
-      if (isFirst) {
+      progress.value = numRead / numBytes;
+      tell(splats, numBytes);
+      if (numShown === 0) {
         viewer.settle(splats);
         viewer.splats ??= splats;
         panel.ready();
       }
+      if (splats.num < GROWTH * numShown && splats.num < splats.header.num) return;
       viewer.sort(splats);
-      progress.value = numRead / numBytes;
-      tell(splats, numBytes);
+      // The first rows are on the screen before more is read.
+      if (numShown === 0) await splats.settled().then(nextFrame);
+      numShown = splats.num;
     },
   });
   progress.hidden = true;
   const last = splats as Splats | null;
   if (last === null || last.num === 0) throw new SceneError("The scene is empty.");
   await last.settled();
+}
+
+/** Resolves after the next picture; soon in a window that is hidden and draws none. */
+function nextFrame(): Promise<void> {
+  return new Promise((resolve) => {
+    requestAnimationFrame(() => setTimeout(resolve));
+    setTimeout(resolve, 200);
+  });
 }
 
 function tell(splats: Splats, numBytes: number): void {

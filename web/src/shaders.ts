@@ -131,8 +131,10 @@ vec2 clippedCorner(vec3 M[3], float reach, vec2 middle, float radius, vec2 side)
   return mix(max(low - margin, -1.0), min(high + margin, size + 1.0), side);
 }
 
-// The corner of the smallest turned box around an ellipse and the low-pass filter's circle.
-vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side) {
+// The corner of the smallest turned box around an ellipse and the low-pass filter's circle, and whether all of these lie
+// beside the picture.
+vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side, out bool isBeside) {
+  isBeside = false;
   float depth = M[2].z;
   vec2 last = M[2].xy, xs = M[0].xy - middle.x * last, ys = M[1].xy - middle.y * last;
   float spread = r2 * dot(last, last);
@@ -142,6 +144,9 @@ vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side) {
   float xx = (shift.x * shift.x + factor * dot(xs, xs)) * 1.0001 + SLACK;
   float xy = (shift.x * shift.y + factor * dot(xs, ys)) * 1.0001;
   float yy = (shift.y * shift.y + factor * dot(ys, ys)) * 1.0001 + SLACK;
+  vec2 centre = middle + shift, extent = sqrt(vec2(xx, yy));
+  vec2 least = min(centre - extent, middle - radius), most = max(centre + extent, middle + radius);
+  isBeside = any(lessThan(most, vec2(0.0))) || any(greaterThan(least, size));
   float mid = 0.5 * (xx + yy), half_ = 0.5 * (xx - yy), root = length(vec2(half_, xy));
   float angle = root > 1e-6 * mid ? 0.5 * atan(xy, half_) : 0.0;
   vec2 major = vec2(cos(angle), sin(angle)), minor = vec2(-major.y, major.x);
@@ -149,7 +154,7 @@ vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side) {
   vec2 offset = vec2(dot(-shift, major), dot(-shift, minor));
   vec2 low = min(-reach, offset - radius), high = max(reach, offset + radius);
   vec2 place = mix(low, high, side);
-  return middle + shift + place.x * major + place.y * minor;
+  return centre + place.x * major + place.y * minor;
 }
 
 void main() {
@@ -175,7 +180,9 @@ void main() {
   vec2 middle = vec2(M[0].z, M[1].z) / depth;
   vec2 side = vec2(gl_VertexID & 1, gl_VertexID >> 1);
   float radius = sqrt(cutoff / 2.0 + SLACK);
-  vec2 at = corner(M, cutoff, middle, radius, side);
+  bool isBeside;
+  vec2 at = corner(M, cutoff, middle, radius, side, isBeside);
+  if (isBeside) return;
   gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);
 
   // Seen from the projected mean, p0 = depth (b.y, -a.y, 0), p1 = depth (-b.x, a.x, 0), p2 = depth plane.

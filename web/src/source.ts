@@ -49,7 +49,8 @@ function fromBase64(text: string): Uint8Array<ArrayBuffer> {
 export interface Listener {
   /** First of all, once. */
   readonly onHeader: (header: Header, numBytes: number) => void;
-  readonly onChunk: (chunk: Chunk, numBytesRead: number) => void;
+  /** What it returns is waited for before more is read. */
+  readonly onChunk: (chunk: Chunk, numBytesRead: number) => Promise<void>;
 }
 
 /** Reads a scene to its end. Throws a SceneError where it is damaged, before room is made for what is not there. */
@@ -95,7 +96,7 @@ async function readBody(reader: Reader, first: Uint8Array<ArrayBuffer>, header: 
   try {
     const pieces = coded.pipeThrough(new DecompressionStream("deflate")).getReader();
     for (let piece = await pieces.read(); !piece.done; piece = await pieces.read()) {
-      for (const chunk of chunks.push(piece.value)) listener.onChunk(chunk, numRead);
+      for (const chunk of chunks.push(piece.value)) await listener.onChunk(chunk, numRead);
     }
   } catch (error) {
     throw error instanceof SceneError ? error : new SceneError("The scene is damaged: it does not unpack.");

@@ -15,7 +15,7 @@ async function read(bytes: Uint8Array<ArrayBuffer>): Promise<{ header: Header; c
   const headers: Header[] = [];
   await readScene(fromBytes(bytes), {
     onHeader: (found) => { headers.push(found); },
-    onChunk: (chunk) => { chunks.push(chunk); },
+    onChunk: (chunk) => { chunks.push(chunk); return Promise.resolve(); },
   });
   expect(headers.length).toBe(1);
   return { header: headers[0], chunks };
