@@ -23,7 +23,7 @@ from a2tg_jax.results.forecast import (
     tell_forecast,
 )
 from a2tg_jax.results.plan import plan_run
-from a2tg_jax.training import SYSTEMS
+from a2tg_jax.training import SYSTEMS, progress
 from a2tg_jax.training.forecast import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.progress import Pace
@@ -202,3 +202,14 @@ def test_the_pace_is_told_once_when_enough_was_timed():
     assert pace.told(20) is None
     assert pace.told(60) == "50 ms an iteration, about 0:00:47 for the other 940"
     assert pace.told(70) is None
+
+
+@pytest.mark.parametrize("is_shown", [True, False])
+def test_the_pace_stands_above_the_bar(capsys, monkeypatch, is_shown):
+    monkeypatch.setattr(progress, "TIMED_SECONDS", 0.0)
+    with progress.ProgressBar("a-stage", 0, 100, is_shown=is_shown) as bar:
+        for done in (10, 20, 30):
+            bar.tell_pace(done)
+    told = capsys.readouterr().out
+    assert told.count("an iteration, about") == is_shown
+    assert not is_shown or re.search(r"a-stage: \S+ ms an iteration, about \S+ for the other 80", told)

@@ -28,10 +28,10 @@ from a2tg_jax.training.forecast import (
     largest_view,
 )
 
-REPORT = 250 * MB
+REPORT = 290 * MB
 """What evaluation, figures and the report compile and import."""
-EVALUATION_PER_PIXEL = 105
-"""Bytes of a view that is rendered, compared and drawn."""
+EVALUATION_PER_PIXEL = 150
+"""Bytes of a view that is rendered, with depth and normals, compared and drawn."""
 KEPT_STATES = 3
 """Checkpoints of a stage on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
