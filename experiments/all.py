@@ -13,7 +13,8 @@ from lab.pages import refresh
 NAMES = (
     "claim", "texel_rate", "defaults", "ablation", "where_textures_pay", "fixed_memory", "texture_resolution",
     "fixed_number", "quick_preset", "memory_charts", "resolution_shares", "decomposition", "comparison_pictures",
-    "equal_bytes", "upscale_gains", "polish", "shrink", "on_disk", "efficiency",
+    "equal_bytes", "upscale_gains", "polish", "shrink", "on_disk",
+    "efficiency", "equal_bytes_speed",
 )  # fmt: skip
 
 PAGE = EXPERIMENTS.parent / "docs" / "results.md"

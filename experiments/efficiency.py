@@ -27,9 +27,7 @@ TIMED_ROUNDS = 3
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Ours, measured once on this machine, then the paper's."""
     (grid,) = grids
-    rows = [_row(result, times) for result, times in measured_once(lab, EXPERIMENT.name, grid, _times)]
-    header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
-    text = tables.markdown([*header, "machine"], rows)
+    text = table_of_times(lab, EXPERIMENT.name, grid)
     columns = (
         ("mb", "MB"),
         ("fps", "frames/s"),
@@ -38,6 +36,13 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     )
     paper = tables.paper_table(EXPERIMENT.name, "gaussians", columns, "Deep Blending")
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{text}\n## In the paper\n\n{paper}")
+
+
+def table_of_times(lab: Lab, name: str, grid: Grid) -> str:
+    """Size and speed of a grid's models, measured once and kept in NAME.json."""
+    rows = [_row(result, times) for result, times in measured_once(lab, name, grid, _times)]
+    header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
+    return tables.markdown([*header, "machine"], rows)
 
 
 def _row(result: tables.Result, times: Figures) -> list[str]:

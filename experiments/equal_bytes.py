@@ -17,7 +17,7 @@ FIGURES = (("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Quality at each size, what each method gains over the reference, speed, and a chart."""
+    """Quality at each size, what each method gains over the reference, and a chart."""
     grid = grids[0]
     results = unique(result for own in grids for result in tables.results_of(own, lab.records))
     parts = [
@@ -25,8 +25,6 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         f"dB above {grid.reference.label}, mean over scenes and seeds that both have (of how many), test views. "
         f"The scene held out counts with the others.\n\n{gains(results, grid.reference.label)}",
         *(_quality(grid, seed, results) for seed in sorted({result.run.cell.seed for result in results})),
-        f"## Speed\n\nFrames a second on test views, and milliseconds a step of the last stage, as measured while "
-        f"training, other work beside it; means over scenes.\n\n{speeds(results)}",
     ]
     lab.write(EXPERIMENT.name, "\n\n".join(part.strip() for part in parts) + "\n")
     save_figure(lab.pages / f"{EXPERIMENT.name}.png", plots.charts(panels(results)))
@@ -72,20 +70,6 @@ def _told(pairs: Sequence[tuple[tables.Result, tables.Result]]) -> str:
     decibels, distance = (np.mean([a[figure] - b[figure] for a, b in pairs]) for figure in ("psnr", "lpips"))
     lpips = tables.MISSING if np.isnan(distance) else f"{distance:+.3f}"
     return f"{decibels:+.2f} · {lpips} ({len(pairs)})"
-
-
-def speeds(results: Sequence[tables.Result]) -> str:
-    """A row a method, a column a budget."""
-    budgets = sorted({result.run.cell.budget or 0.0 for result in results})
-    rows = []
-    for label, sizes in by_budget(results).items():
-        shown = []
-        for size in budgets:
-            own = sizes.get(size, [])
-            pace = tables.mean(own, "fps"), tables.mean(own, "ms_per_step")
-            shown.append(f"{pace[0]:.0f} · {pace[1]:.0f}" if own else tables.MISSING)
-        rows.append([label, *shown])
-    return tables.markdown(["method", *(f"{size:g} MB" for size in budgets)], rows)
 
 
 def panels(results: Sequence[tables.Result]) -> list:
