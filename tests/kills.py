@@ -110,7 +110,7 @@ def kill_at(process: subprocess.Popen, out: Path, moment: Moment) -> tuple[float
         is_due = num_files >= moment.num_files and now - last >= moment.share * gap
         if is_due and (not moment.is_writing or partial_files(out)):
             process.send_signal(signal.SIGKILL)
-            process.wait()
+            process.communicate()
             return now - began, partial_files(out)
         time.sleep(POLL)
     finish(process)
