@@ -17,7 +17,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax import signals
 from a2tg_jax.arguments import parse
-from a2tg_jax.cli_view import Export, View
+from a2tg_jax.cli_view import Export, View, in_browser
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.results.checks import check_apart, check_weights
@@ -40,7 +40,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.summary import RunResult, summary_text
-from a2tg_jax.results.whole_run import begin_run, go_on, measure
+from a2tg_jax.results.whole_run import begin_run, go_on, measure, unseen
 from a2tg_jax.startup import configure_cpu
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -136,6 +136,8 @@ class Train:
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: Path | None = None
     """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+    view: bool = False
+    """Show the training in a browser as it runs, where it can be paused."""
     max_memory: str | None = None
     """Refuse what would take more memory, of the process or of the GPU, than 8GB, 800MB, … (default: all that there
     is); of the photographs, those beyond a quarter of it stay on disk. --memory-budget bounds the model instead."""
@@ -143,8 +145,11 @@ class Train:
 
     def run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
+        watched = in_browser if self.view else unseen
         if not self.resume:
-            result = begin_run(self.record, self.out, overwrite=self.overwrite, lpips_weights=weights, max_memory=most)
+            result = begin_run(
+                self.record, self.out, overwrite=self.overwrite, lpips_weights=weights, max_memory=most, watched=watched
+            )
             _tell(result, self.out)
             return
         if self.overwrite:
@@ -154,7 +159,7 @@ class Train:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
             tell_forecast(scene, record.plan, most)
-            _tell(go_on(run, scene, lpips_weights=weights), self.out)
+            _tell(go_on(run, scene, lpips_weights=weights, watched=watched), self.out)
 
     @property
     def record(self) -> RunRecord:

@@ -1,16 +1,20 @@
-"""Commands that show scenes in browsers: view, export."""
+"""What shows scenes in browsers: the commands view and export, and a training that is looked at."""
 
 import dataclasses
 import os
 import sys
 import webbrowser
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.data import Scene
+from a2tg_jax.results.live import shown_live
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
+from a2tg_jax.training.loop import Watch
 from a2tg_jax.web.server import serve
 
 
@@ -40,8 +44,8 @@ class View:
 
     def _started(self, address: str) -> None:
         print(f"{address} shows {self.source}; Ctrl-C ends it", flush=True)
-        if self.open and _has_screen():
-            webbrowser.open(address)
+        if self.open:
+            _open(address)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +75,18 @@ class Export:
         print(f"page: {result.path}")
 
 
-def _has_screen() -> bool:
-    """Whether a browser can show itself: on Linux, where there is an X or Wayland display."""
-    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
+    """Somebody who looks at the training of a scene in a browser."""
+
+    def started(address: str) -> None:
+        print(f"{address} shows the training", flush=True)
+        _open(address)
+
+    return shown_live(scene, scene.name, started)
+
+
+def _open(address: str) -> None:
+    """Opens a browser where one can show itself: on Linux, where there is an X or Wayland display."""
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if has_display or sys.platform in ("win32", "darwin"):
+        webbrowser.open(address)

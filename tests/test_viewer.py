@@ -7,7 +7,6 @@ import importlib
 import io
 import json
 import re
-import threading
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ from a2tg_jax.origin import Origin
 from a2tg_jax.results.viewing import Photographs, Source, open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
 from a2tg_jax.web.page import page, page_with
-from a2tg_jax.web.server import Route, application, open_server
+from a2tg_jax.web.server import Route, application, served
 
 
 def ask(app, path="/", method="GET", host="127.0.0.1:80"):
@@ -74,24 +73,20 @@ def test_other_methods_are_refused():
 
 
 def test_a_server_listens_on_the_loopback_alone():
-    server = open_server({"/": Route("text/plain", b"here")})
-    assert server.effective_host == "127.0.0.1" and int(server.effective_port) > 0
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    try:
-        connection = http.client.HTTPConnection("127.0.0.1", int(server.effective_port), timeout=20)
+    with served({"/": Route("text/plain", b"here")}) as address:
+        port = int(address.rstrip("/").rpartition(":")[2])
+        assert address == f"http://127.0.0.1:{port}/"
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
         connection.request("GET", "/")
         answer = connection.getresponse()
         assert (answer.status, answer.read()) == (200, b"here")
         connection.request("GET", "/elsewhere")
         assert connection.getresponse().read() == b"404 Not Found"
-        connection.close()
-        with pytest.raises(ValueError, match=f"port {server.effective_port} cannot be used"):
-            open_server({}, port=int(server.effective_port))
-    finally:
-        server.close()
-        server.task_dispatcher.shutdown()
-        thread.join(timeout=20)
+        with pytest.raises(ValueError, match=f"port {port} cannot be used"), served({}, port=port):
+            pass
+    with pytest.raises(OSError):
+        http.client.HTTPConnection("127.0.0.1", port, timeout=20).request("GET", "/")
+    connection.close()
 
 
 def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys):
@@ -216,7 +211,7 @@ def test_point_clouds_are_measured_from_cameras_around_them(tmp_path):
 def test_photographs_are_those_of_the_cameras():
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     origin = Origin.of_scene(scene)
-    photographs = Photographs(Source(Model(some_gaussians(), origin=origin), "a", load_scene=lambda: scene))
+    photographs = Photographs(origin, lambda: scene)
     assert sorted(photographs.views) == [0, 1, 2, 3] and photographs.jpeg(9) is None
     found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
     by_name = {view.name: view for view in (*scene.train, *scene.test)}

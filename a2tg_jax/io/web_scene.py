@@ -59,7 +59,9 @@ def check_viewable(appearance: Appearance) -> None:
         )
 
 
-def encode_web_scene(model: Model, *, title: str = "", note: str = "", near_plane: float = 0.2) -> bytes:
+def encode_web_scene(
+    model: Model, *, title: str = "", note: str = "", near_plane: float = 0.2, level: int = 9
+) -> bytes:
     """The bytes of a file.
 
     Args:
@@ -67,6 +69,7 @@ def encode_web_scene(model: Model, *, title: str = "", note: str = "", near_plan
       title: what the page is called.
       note: what the viewer says about the scene.
       near_plane: hits nearer than this do not show.
+      level: of zlib, 1 quickest to 9 smallest.
 
     Raises:
       ValueError: if the model shows anything else, has more rows than a file may hold, or a number that is not finite.
@@ -95,7 +98,7 @@ def encode_web_scene(model: Model, *, title: str = "", note: str = "", near_plan
         **codes.ends,
         **_origin_to_dict(model.origin),
     }
-    return _framed(header, body)
+    return _framed(header, body, level)
 
 
 def decode_web_scene(data: bytes, where: str = "the web scene") -> WebScene:
@@ -144,9 +147,9 @@ def _as_shown(model: Model) -> Model:
 # The frame
 
 
-def _framed(header: Mapping[str, Any], body: bytes) -> bytes:
+def _framed(header: Mapping[str, Any], body: bytes, level: int) -> bytes:
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
-    coded = zlib.compress(body, 9)
+    coded = zlib.compress(body, level)
     if len(body) > _room(len(coded)):
         coded = zlib.compress(body, 0)  # So alike are its numbers that the file would be taken for a bomb.
     return HEAD.pack(MAGIC, VERSION, len(text), len(coded), zlib.crc32(text)) + text + coded

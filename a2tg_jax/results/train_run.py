@@ -23,7 +23,7 @@ from a2tg_jax.training import (
     load_checkpoint,
     save_checkpoint,
 )
-from a2tg_jax.training.loop import IsStopped, never
+from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 
 LONGEST_WITHOUT_CHECKPOINT = 500
@@ -39,6 +39,7 @@ def train_run(
     replaced_by: RunRecord | None = None,
     progress: bool = True,
     is_stopped: IsStopped = never,
+    watch: Watch = unwatched,
 ) -> None:
     """Trains every stage that the run's record asks for and that is not finished yet.
 
@@ -51,6 +52,7 @@ def train_run(
       replaced_by: what takes the place of the run that is in the folder, which is set aside at the first checkpoint.
       progress: show a progress bar.
       is_stopped: asked between steps. Once it says True, there is a checkpoint and a KeyboardInterrupt.
+      watch: called between steps with the stage under way (`training.loop.Watch`).
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other numbers
@@ -58,7 +60,7 @@ def train_run(
     """
     record = replaced_by or read_record(run)
     for planned in record.plan.stages:
-        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped)
+        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch)
         if replaced_by is not None:
             result = training.train(replaced_by)
         elif run.model(planned.name).is_file():
@@ -83,6 +85,7 @@ class _Training:
     on_nan: OnNan
     progress: bool
     is_stopped: IsStopped
+    watch: Watch
 
     def train(self, replaced_by: RunRecord | None = None) -> StageResult:
         """From its newest checkpoint, or from its beginning; again from there where it diverges and may."""
@@ -110,6 +113,7 @@ class _Training:
             title=planned.name,
             is_stopped=self.is_stopped,
             num_restored=num_restored,
+            watch=self.watch,
         )
 
     def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:

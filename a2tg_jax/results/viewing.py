@@ -18,6 +18,7 @@ from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
+from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
@@ -109,8 +110,12 @@ def _source_of_ply(path: Path) -> Source:
 class Photographs:
     """Those of the cameras that a model knows, as JPEG, read when they are asked for."""
 
-    def __init__(self, source: Source):
-        self._source = source
+    def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None]):
+        """Args:
+        origin: the cameras, and the background behind photographs that are transparent; None where there are none.
+        load_scene: finds the photographs, or None.
+        """
+        self._origin, self._load_scene = origin, load_scene
         self._lock = threading.Lock()
         self._views: dict[int, View] | None = None
 
@@ -125,16 +130,27 @@ class Photographs:
     def jpeg(self, index: int) -> bytes | None:
         """A photograph over the model's background, of its camera's size."""
         view = self.views.get(index)
-        if view is None:
+        if view is None or self._origin is None:
             return None
         buffer = io.BytesIO()
-        pixels = to_uint8(view_image(view, self._source.model.background))
+        pixels = to_uint8(view_image(view, self._origin.background))
         Image.fromarray(pixels).save(buffer, format="JPEG", quality=QUALITY)
         return buffer.getvalue()
 
+    @property
+    def routes(self) -> dict[str, Route]:
+        """What the viewer's server answers."""
+        names = () if self._origin is None else self._origin.names
+        listed = Route("application/json", lambda: json.dumps(sorted(self.views)).encode())
+        each = {
+            f"/{photograph_name(index)}": Route("image/jpeg", functools.partial(self.jpeg, index))
+            for index in range(len(names))
+        }
+        return {f"/{PHOTOGRAPHS_NAME}": listed, **each}
+
     def _found(self) -> dict[int, View]:
-        origin = self._source.model.origin
-        scene = None if origin is None else self._source.load_scene()
+        origin = self._origin
+        scene = None if origin is None else self._load_scene()
         if origin is None or scene is None:
             return {}
         by_name = {view.name: view for view in (*scene.train, *scene.test)}
@@ -143,17 +159,11 @@ class Photographs:
 
 def routes_of(source: Source) -> dict[str, Route]:
     """What the viewer's server answers."""
-    photographs = Photographs(source)
-    num_cameras = 0 if source.model.origin is None else len(source.model.origin.names)
-    routes = {
+    return {
         "/": Route("text/html; charset=utf-8", page().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
-        f"/{PHOTOGRAPHS_NAME}": Route("application/json", lambda: json.dumps(sorted(photographs.views)).encode()),
+        **Photographs(source.model.origin, source.load_scene).routes,
     }
-    for index in range(num_cameras):
-        jpeg = functools.partial(photographs.jpeg, index)
-        routes[f"/{photograph_name(index)}"] = Route("image/jpeg", jpeg)
-    return routes
 
 
 def middle_of(model: Model) -> tuple[np.ndarray, float]:

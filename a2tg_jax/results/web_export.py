@@ -61,7 +61,7 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
     files = {out / SCENE_NAME: source.encoded}
     if photographs:
-        found = Photographs(source)
+        found = Photographs(source.model.origin, source.load_scene)
         if not found.views:
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}

@@ -2,7 +2,8 @@
 
 import contextlib
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from a2tg_jax import signals
@@ -15,6 +16,15 @@ from a2tg_jax.results.record import RunRecord, read_record, write_record
 from a2tg_jax.results.replacement import drop_old
 from a2tg_jax.results.summary import RunResult
 from a2tg_jax.results.train_run import train_run
+from a2tg_jax.training.loop import Watch, unwatched
+
+Watched = Callable[[Scene], AbstractContextManager[Watch]]
+"""Of a scene, somebody who looks at its training meanwhile."""
+
+
+def unseen(scene: Scene) -> AbstractContextManager[Watch]:
+    """Nobody looks."""
+    return contextlib.nullcontext(unwatched)
 
 
 def begin_run(
@@ -24,6 +34,7 @@ def begin_run(
     overwrite: bool,
     lpips_weights: Path | None = None,
     max_memory: int | None = None,
+    watched: Watched = unseen,
 ) -> RunResult:
     """Trains and measures a new run, once all about it has been checked.
 
@@ -34,6 +45,7 @@ def begin_run(
         has its report.
       lpips_weights: a weights file for LPIPS; None leaves it out.
       max_memory: bytes that the process may take (`forecast.allowed_memory`).
+      watched: who looks at the training of a scene meanwhile.
 
     Raises:
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
@@ -44,18 +56,24 @@ def begin_run(
     with claimed(run):
         check_free(out, overwrite=overwrite)  # Another process may have been here meanwhile.
         if overwrite and run.is_begun:
-            return go_on(run, scene, lpips_weights=lpips_weights, replaced_by=record)
+            return go_on(run, scene, lpips_weights=lpips_weights, replaced_by=record, watched=watched)
         write_record(create_run(out), record)
-        return go_on(run, scene, lpips_weights=lpips_weights)
+        return go_on(run, scene, lpips_weights=lpips_weights, watched=watched)
 
 
 def go_on(
-    run: RunFolder, scene: Scene, *, lpips_weights: Path | None = None, replaced_by: RunRecord | None = None
+    run: RunFolder,
+    scene: Scene,
+    *,
+    lpips_weights: Path | None = None,
+    replaced_by: RunRecord | None = None,
+    watched: Watched = unseen,
 ) -> RunResult:
-    """Trains what is not trained yet, and measures. Arguments as of `train_run`, errors as of `begin_run`."""
+    """Trains what is not trained yet, and measures. Arguments as of `train_run` and `begin_run`, errors as of
+    `begin_run`."""
     with _advised(run, is_replacing=replaced_by is not None):
-        with signals.noted() as is_stopped:
-            train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped)
+        with signals.noted() as is_stopped, watched(scene) as watch:
+            train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped, watch=watch)
         return measure(run, scene, lpips_weights=lpips_weights)
 
 

@@ -10,7 +10,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.origin import BLACK, WHITE, Color, Origin
 from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
-from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, check_resume, never
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, Watch, check_resume, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
@@ -126,6 +126,7 @@ def fit_stage(
     title: str | None = None,
     is_stopped: IsStopped = never,
     num_restored: int | None = None,
+    watch: Watch = unwatched,
 ) -> StageResult:
     """Trains one stage of a system. Arguments as in `fit`.
 
@@ -135,6 +136,7 @@ def fit_stage(
       title: of the progress bar; None: the stage's name.
       num_restored: how often the stage went back because it diverged: another number is another order of the views.
         None: that of the checkpoint, or 0.
+      watch: called between steps with the stage under way (`training.loop.Watch`).
     """
     system.check()
     if not 0 <= index < len(system.stages()):
@@ -145,7 +147,7 @@ def fit_stage(
     if start is None and resume is None:
         start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume, num_restored)
-    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped)
+    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
     origin = Origin.of_scene(scene, BACKGROUNDS[system.background])
     origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
     model = dataclasses.replace(run.model, origin=origin)

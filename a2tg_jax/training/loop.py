@@ -54,6 +54,16 @@ def never() -> bool:
     return False
 
 
+Watch = Callable[["StageRun", IsStopped], float]
+"""Called between steps with the stage under way, whose state it may read but not keep: the next step takes over its
+buffers. It returns for how many seconds it held the training up, which are not counted."""
+
+
+def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
+    """Training that nobody looks at."""
+    return 0.0
+
+
 def read(infos: list[StepInfo]) -> list[StepInfo]:
     """The scalars of some steps as numbers of the host: the one place where the loop waits for the device."""
     return jax.device_get(infos)
@@ -125,13 +135,14 @@ class StageRun:
         progress: bool,
         title: str | None = None,
         is_stopped: IsStopped = never,
+        watch: Watch = unwatched,
     ) -> None:
         """Runs the stage to its end, or, with a last checkpoint and a KeyboardInterrupt, to where it is stopped.
 
         Its photographs are let go then.
         """
         try:
-            self._train(on_checkpoint, checkpoint_every, progress, title, is_stopped)
+            self._train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
         finally:
             self.photographs.close()
 
@@ -142,6 +153,7 @@ class StageRun:
         progress: bool,
         title: str | None,
         is_stopped: IsStopped,
+        watch: Watch,
     ) -> None:
         first, end = int(self.state.iteration), self.stage.iterations
         iteration = first
@@ -155,6 +167,7 @@ class StageRun:
                 bar.tell_pace(iteration)
                 if iteration == stop:
                     self._host_events(iteration)
+                self.started += watch(self, is_stopped)
                 is_asked = is_stopped() and iteration > first
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
                 if on_checkpoint is not None and (is_due or is_asked or iteration == end):

@@ -7,6 +7,8 @@ SCENE_NAME = "scene.a2tgw"
 """What the page looks for beside itself."""
 PHOTOGRAPHS_NAME = "photographs.json"
 """A list of the cameras whose photographs lie beside the page, as `photograph_name` names them."""
+STATUS_NAME = "training.json"
+"""What is told of a training that runs; the page asks again and again while it is there."""
 
 
 def page() -> str:

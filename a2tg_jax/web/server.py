@@ -1,10 +1,12 @@
 """A page and its files, from memory, for browsers of this machine alone; the server itself is waitress'."""
 
+import contextlib
 import dataclasses
 import importlib
 import socket
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 LOOPBACK = "127.0.0.1"
@@ -28,12 +30,15 @@ class Route:
     content: bytes | Callable[[], bytes | None]
     """The bytes; or what finds them each time that they are asked for, None where there are none."""
 
+    act: Callable[[], None] | None = None
+    """What is done first: such a path is asked for by POST, from the page itself."""
+
     def read(self) -> bytes | None:
         return self.content() if callable(self.content) else self.content
 
 
 def application(routes: Mapping[str, Route], port: int) -> Application:
-    """Answers GET and HEAD at the paths of `routes`, such as "/", and nothing else.
+    """Answers GET and HEAD, or POST, at the paths of `routes`, such as "/", and nothing else.
 
     A request must name this machine as the host it asks: a page from elsewhere, whose name is made to lead here, cannot
     read the scene.
@@ -47,14 +52,19 @@ def application(routes: Mapping[str, Route], port: int) -> Application:
 
         if environ.get("HTTP_HOST") not in hosts:
             return refuse("403 Forbidden")
-        if environ["REQUEST_METHOD"] not in ("GET", "HEAD"):
-            return refuse("405 Method Not Allowed")
         route = routes.get(environ["PATH_INFO"] or "/")
+        is_action = route is not None and route.act is not None
+        if environ["REQUEST_METHOD"] not in (("POST",) if is_action else ("GET", "HEAD")):
+            return refuse("405 Method Not Allowed")
+        if route is not None and route.act is not None:
+            if environ.get("HTTP_ORIGIN") != f"http://{environ['HTTP_HOST']}":
+                return refuse("403 Forbidden")
+            route.act()
         body = None if route is None else route.read()
         if route is None or body is None:
             return refuse("404 Not Found")
         start_response("200 OK", [("Content-Type", route.content_type), ("Content-Length", str(len(body))), *HEADERS])
-        return [body] if environ["REQUEST_METHOD"] == "GET" else []
+        return [] if environ["REQUEST_METHOD"] == "HEAD" else [body]
 
     return answer
 
@@ -70,20 +80,36 @@ def serve(routes: Mapping[str, Route], *, port: int = 0, on_start: Callable[[str
     Raises:
       ValueError: if waitress is not installed, or the port is taken.
     """
-    server = open_server(routes, port=port)
+    server = _opened(routes, port, {})
     on_start(f"http://{LOOPBACK}:{server.effective_port}/")
     server.run()
 
 
-def open_server(routes: Mapping[str, Route], *, port: int = 0) -> Any:
-    """A server of waitress that listens, and answers once it is run. Raises as `serve` does."""
+@contextlib.contextmanager
+def served(routes: Mapping[str, Route], *, port: int = 0) -> Iterator[str]:
+    """Serves meanwhile, in a thread; yields the address. Arguments and errors as of `serve`."""
+    connections: dict[int, Any] = {}
+    server = _opened(routes, port, connections)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    try:
+        yield f"http://{LOOPBACK}:{server.effective_port}/"
+    finally:
+        # In the server's own thread, which ends when all is closed.
+        server.trigger.pull_trigger(lambda: [connection.close() for connection in list(connections.values())])
+        thread.join()
+        server.task_dispatcher.shutdown()
+
+
+def _opened(routes: Mapping[str, Route], port: int, connections: dict[int, Any]) -> Any:
+    """A server of waitress that listens, and answers once it is run; it keeps what it holds open in `connections`."""
     try:
         waitress: Any = importlib.import_module("waitress")
     except ImportError as error:
         raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
     listening = _listening(port)
     app = application(routes, listening.getsockname()[1])
-    return waitress.create_server(app, sockets=[listening], threads=4, ident=None)
+    return waitress.create_server(app, map=connections, sockets=[listening], threads=4, ident=None)
 
 
 def _listening(port: int) -> socket.socket:

@@ -11,6 +11,7 @@ import { MODES } from "./shaders";
 import { openScene, readScene } from "./source";
 import type { Source } from "./source";
 import type { Splats } from "./splats";
+import { followTraining } from "./training";
 import { Viewer } from "./viewer";
 
 /** What other scripts of a page may ask for, tests among them. */
@@ -34,26 +35,26 @@ async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void>
   progress.hidden = false;
   let splats: Splats | null = null;
   let [numBytes, numShown] = [1, 0];
+  const isFirst = viewer.splats === null;
   await readScene(source, {
     onHeader: (header, length) => {
       numBytes = length;
       splats = viewer.begin(header);
-      panel.begin(header);
+      if (isFirst) panel.begin(header);
     },
     onChunk: async (chunk, numRead) => {
       if (splats === null) return;
       splats.add(chunk);
       progress.value = numRead / numBytes;
-      tell(splats, numBytes);
-      if (numShown === 0) {
-        viewer.settle(splats);
-        viewer.splats ??= splats;
+      if (isFirst || splats.num === splats.header.num) tell(splats, numBytes);
+      if (numShown === 0 && isFirst) {
+        viewer.splats = splats;
         panel.ready();
       }
       if (splats.num < GROWTH * numShown && splats.num < splats.header.num) return;
       viewer.sort(splats);
-      // The first rows are on the screen before more is read.
-      if (numShown === 0) await splats.settled().then(nextFrame);
+      // The first rows are on the screen before more is read; another scene waits until it is whole.
+      if (numShown === 0 && isFirst) await splats.settled().then(nextFrame);
       numShown = splats.num;
     },
   });
@@ -98,7 +99,9 @@ function begin(): void {
   const viewer = new Viewer(element("view", HTMLCanvasElement));
   const panel = new Panel(viewer);
   viewer.onFail = (reason) => { showMessage(`This browser could not sort the scene: ${reason}`); };
-  const loaded = openScene().then((source) => load(viewer, panel, source));
+  const show = async (): Promise<void> => { await load(viewer, panel, await openScene()); };
+  const isHeld = document.getElementById("scene-data") !== null;
+  const loaded = (isHeld ? Promise.resolve(false) : followTraining(show)).then((isLive) => isLive ? undefined : show());
   loaded.catch(fail);
   void findPhotographs(panel);
   window.a2tg = {

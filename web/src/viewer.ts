@@ -60,11 +60,11 @@ export class Viewer implements Steered {
     new ResizeObserver(() => { this.draw(); }).observe(canvas);
   }
 
-  /** Begins a scene; it takes the place of the one before once its first rows are sorted. */
+  /** Begins a scene; it takes the place of the one before once all of it is sorted. */
   begin(header: Header): Splats {
     const splats = new Splats(this.gl, header);
     splats.onOrder = () => {
-      if (this.splats !== splats) {
+      if (this.splats !== splats && splats.numDrawn === header.num) {
         this.splats?.delete();
         this.splats = splats;
       }

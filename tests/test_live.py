@@ -1,0 +1,158 @@
+"""A training as the viewer shows it: snapshots, figures, pause and resume; its result does not depend on them."""
+
+import json
+import threading
+import time
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+from test_compact import plain, textured
+
+from a2tg_jax import A2tg, fit, synthetic_scene
+from a2tg_jax.appearance import Billboards
+from a2tg_jax.io.web_scene import decode_web_scene
+from a2tg_jax.model import Model
+from a2tg_jax.results.live import SECONDS, SHARE, LiveView, shown_live
+from a2tg_jax.results.whole_run import unseen
+from a2tg_jax.systems.a2tg import TextureConfig
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import fit_stage
+from a2tg_jax.training.checkpoint import History
+from a2tg_jax.training.loop import never
+from a2tg_jax.web.server import application
+
+SCENE = synthetic_scene(num_views=4, width=24, height=16, num_points=40)
+SYSTEM = A2tg(
+    stage1_iterations=24,
+    stage2_iterations=4,
+    densify=McmcConfig(cap=50),
+    texture=TextureConfig(fraction=0.5, upscale_at=(0.5,)),
+)
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self):
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+class SlowClock(Clock):
+    """Each look at it takes some seconds."""
+
+    def __call__(self) -> float:
+        self.seconds += 0.5
+        return self.seconds
+
+
+def stage_run():
+    """Something like a stage under way."""
+    state = SimpleNamespace(model=textured())
+    stage = SimpleNamespace(name="textures", iterations=30)
+    history = History.empty().with_point(1, 20, 0.5, 17.0, 40, 1.25, 3.0)
+    return SimpleNamespace(state=state, stage=stage, history=history, system=SYSTEM)
+
+
+def encoded(live: LiveView) -> None:
+    """Waits for the thread."""
+    live._encoder.join(timeout=60)
+
+
+def status(live: LiveView) -> dict:
+    return json.loads(live.routes["/training.json"].read())
+
+
+def test_snapshots_and_figures():
+    clock = Clock()
+    live, run = LiveView(SCENE, "scene", clock), stage_run()
+    assert live.routes["/scene.a2tgw"].read() is None and status(live)["version"] == 0
+    assert live(run, never) == 0
+    encoded(live)
+    scene = decode_web_scene(live.routes["/scene.a2tgw"].read())
+    assert scene.header["title"] == "scene" and scene.model.num == run.state.model.num
+    found = status(live)
+    assert (found["version"], found["stage"], found["iteration"], found["psnr"]) == (1, "textures", 20, 17.0)
+    assert found["bytes"] == 1.25e6 and not found["is_paused"]
+    live(run, never)
+    clock.seconds = SECONDS - 0.1
+    live(run, never)
+    assert status(live)["version"] == 1
+    clock.seconds = SECONDS + 0.1
+    live(run, never)
+    encoded(live)
+    assert status(live)["version"] == 2
+
+
+def test_slow_snapshots_are_rare():
+    live = LiveView(SCENE, "scene", SlowClock())
+    live(stage_run(), never)
+    encoded(live)
+    # A second went by while it was made.
+    assert live._due > 1.0 / SHARE
+
+
+def test_pause_holds_the_training_up_until_it_is_resumed_or_stopped():
+    live, run = LiveView(SCENE, "scene"), stage_run()
+    app = application(live.routes, 80)
+
+    def post(path: str, **more) -> str:
+        told = []
+        environ = {"REQUEST_METHOD": "POST", "PATH_INFO": path, "HTTP_HOST": "127.0.0.1:80", **more}
+        list(app(environ, lambda status, headers: told.append(status)))
+        return told[0]
+
+    own = {"HTTP_ORIGIN": "http://127.0.0.1:80"}
+    assert post("/pause").startswith("403") and post("/pause", HTTP_ORIGIN="http://evil.example").startswith("403")
+    assert post("/", **own).startswith("405") and not status(live)["is_paused"]
+    assert post("/pause", **own).startswith("200") and status(live)["is_paused"]
+    threading.Timer(0.3, lambda: post("/resume", **own)).start()
+    began = time.perf_counter()
+    held = live(run, never)
+    assert 0.2 < held <= time.perf_counter() - began and not status(live)["is_paused"]
+    assert post("/pause", **own).startswith("200")
+    assert live(run, lambda: True) < 0.2
+
+
+def test_systems_that_cannot_be_shown_are_said_to_be():
+    gaussians = plain(1).gaussians
+    params, layout = Billboards().allocate(jax.random.key(0), gaussians)
+    run = stage_run()
+    run.state.model = Model(gaussians, params, layout, appearance=Billboards())
+    live = LiveView(SCENE, "scene")
+    live(run, never)
+    encoded(live)
+    assert "bbsplat" in status(live)["message"] and status(live)["version"] == 0
+
+
+def test_a_training_that_is_looked_at_gives_the_same_bits():
+    seen: list[int] = []
+    addresses: list[str] = []
+    with shown_live(SCENE, "scene", addresses.append) as live:
+
+        def watch(run, is_stopped):
+            seen.append(int(run.state.iteration))
+            live._due = -np.inf  # A snapshot at every occasion.
+            return live(run, is_stopped)
+
+        looked_at = fit_stage(SCENE, SYSTEM, 0, progress=False, watch=watch)
+        encoded(live)
+    assert seen == [10, 20, 24] and addresses[0].startswith("http://127.0.0.1:")
+    alone = fit(SCENE, SYSTEM, progress=False).stages[0]
+    for a, b in zip(jax.tree.leaves(looked_at.model), jax.tree.leaves(alone.model), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_holds_a_training_up_is_not_counted():
+    def watch(run, is_stopped):
+        return 1000.0
+
+    assert fit_stage(SCENE, SYSTEM, 0, progress=False, watch=watch).seconds < -1000
+
+
+def test_nobody_looks_where_nobody_is_asked_to():
+    with unseen(SCENE) as watch:
+        assert watch(stage_run(), never) == 0.0

@@ -1,0 +1,99 @@
+/** A training that runs: its figures beside the picture, a new scene when there is one, pause and resume. */
+
+import { bytesText, countText, element, setText } from "./page";
+
+const STATUS_FILE = "training.json";
+const PERIOD = 1000;
+
+/** What the server tells of it. */
+export interface Status {
+  /** Counts the scenes; 0 before the first. */
+  readonly version: number;
+  readonly message: string;
+  readonly stage: string;
+  readonly isPaused: boolean;
+  readonly iterations: number;
+  readonly iteration: number;
+  /** NaN before the first tenth iteration, as the following. */
+  readonly loss: number;
+  readonly psnr: number;
+  readonly num: number;
+  readonly bytes: number;
+}
+
+/** null where that is no status. */
+export function statusOf(value: unknown): Status | null {
+  if (typeof value !== "object" || value === null) return null;
+  const fields = value as Readonly<Record<string, unknown>>;
+  const number = (name: string, otherwise: number): number => {
+    const found = fields[name];
+    return typeof found === "number" && Number.isFinite(found) ? found : otherwise;
+  };
+  const text = (name: string): string => (typeof fields[name] === "string" ? fields[name] : "");
+  if (!Number.isInteger(fields.version)) return null;
+  return {
+    version: number("version", 0),
+    message: text("message"),
+    stage: text("stage"),
+    isPaused: fields.is_paused === true,
+    iterations: number("iterations", 0),
+    iteration: number("iteration", 0),
+    loss: number("loss", NaN),
+    psnr: number("psnr", NaN),
+    num: number("num", NaN),
+    bytes: number("bytes", NaN),
+  };
+}
+
+export function statusText(status: Status): string {
+  if (status.message !== "") return status.message;
+  if (Number.isNaN(status.loss)) return status.stage === "" ? "The training begins." : `${status.stage} begins.`;
+  const state = status.isPaused ? ", paused" : "";
+  return `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
+    `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`;
+}
+
+async function ask(path: string, method: "GET" | "POST"): Promise<Status | null> {
+  try {
+    const response = await fetch(path, { method, cache: "no-store" });
+    return response.ok ? statusOf(await response.json()) : null;
+  } catch {
+    return null;
+  }
+}
+
+/**
+ * Follows a training while there is one; resolves at once to false where there is none.
+ *
+ * @param show shows the scene beside the page, which is another each time.
+ */
+export async function followTraining(show: () => Promise<void>): Promise<boolean> {
+  let status = await ask(STATUS_FILE, "GET");
+  if (status === null) return false;
+  element("training", HTMLElement).hidden = false;
+  const button = element("pause", HTMLButtonElement);
+  button.addEventListener("click", () => {
+    const isPaused = button.dataset.paused === "yes";
+    void ask(isPaused ? "resume" : "pause", "POST").then((found) => { if (found !== null) tell(found); });
+  });
+  for (let version = 0; status !== null; status = await ask(STATUS_FILE, "GET")) {
+    tell(status);
+    if (status.version > version) {
+      version = status.version;
+      await show();
+    }
+    await new Promise((resolve) => setTimeout(resolve, PERIOD));
+  }
+  button.disabled = true;
+  setText("state", "The training has ended, or this page is cut off from it. a2tg view shows what it left.");
+  return true;
+}
+
+function tell(status: Status): void {
+  setText("state", statusText(status));
+  const bar = element("trained", HTMLProgressElement);
+  [bar.max, bar.value] = [Math.max(status.iterations, 1), status.iteration];
+  const button = element("pause", HTMLButtonElement);
+  button.textContent = status.isPaused ? "Resume" : "Pause";
+  button.dataset.paused = status.isPaused ? "yes" : "no";
+}
