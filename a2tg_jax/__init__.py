@@ -73,6 +73,7 @@ from a2tg_jax.optim import adam_init as adam_init
 from a2tg_jax.optim import adam_update as adam_update
 from a2tg_jax.optim import exponential_decay as exponential_decay
 from a2tg_jax.origin import Origin as Origin
+from a2tg_jax.paths import path_through as path_through
 from a2tg_jax.paths import smooth_path as smooth_path
 from a2tg_jax.render import RenderOutput as RenderOutput
 from a2tg_jax.render import RenderSettings as RenderSettings

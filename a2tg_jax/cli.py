@@ -216,12 +216,13 @@ class Render:
     Examples:
       a2tg render runs/fox --frames 240
       a2tg render runs/fox --path test --out fox-test
+      a2tg render runs/fox --path path.json --out fox-flight
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
-    path: Route = "smooth"
-    """A smooth flight past the cameras, or the test views."""
+    path: Route | Path = "smooth"
+    """A smooth flight past the cameras, the test views, or a flight through the views that a2tg view saved (*.json)."""
     frames: int = 120
     """Length of the flight in frames, 30 a second."""
     out: Path | None = None
@@ -234,7 +235,7 @@ class Render:
         out = self.out or run.path / "frames"
         paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model)
         print(f"{len(paths)} frames in {out}")
-        if self.path == "smooth":
+        if self.path != "test":
             video = out / "flight.mp4"
             made = write_video(out, video)
             print(f"video: {video}" if made else "no video: ffmpeg is not installed")

@@ -1,12 +1,14 @@
-"""A smooth camera path past the cameras of a scene."""
+"""Smooth camera paths: past the cameras of a scene, or through views that someone chose."""
 
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, Slerp
 
-from a2tg_jax.cameras import Camera
+from a2tg_jax.cameras import Camera, resize_camera
 from a2tg_jax.data.world import camera_centers
 
 SMOOTHING = 0.06
@@ -43,6 +45,43 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     ]
 
 
+def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
+    """Cameras of a smooth flight through some views, in their order, of constant speed between two of them.
+
+    Positions follow a cubic spline; directions turn evenly, and intrinsics change evenly, from view to view.
+
+    Args:
+      views: at least one; the first one's image size is used throughout.
+      num_frames: number of cameras on the path, at least one.
+
+    Raises:
+      ValueError: if there are no views or no frames.
+    """
+    if not views or num_frames < 1:
+        raise ValueError(f"a path needs a view and a frame; got {len(views)} views, {num_frames} frames")
+    first = views[0]
+    views = [resize_camera(view, first.width, first.height) for view in views]
+    if len(views) == 1:
+        return [first] * num_frames
+    viewmats = np.stack([np.asarray(view.viewmat, np.float64) for view in views])
+    rotations = Rotation.from_matrix(viewmats[:, :3, :3])
+    centers = camera_centers(viewmats)
+    # As much time as the way and the turn take, so that one does not run through a view.
+    ways = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
+    steps = ways / max(ways.mean(), 1e-12) + turns / max(turns.mean(), 1e-12)
+    knots = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-3))])
+    times = np.linspace(0.0, knots[-1], num_frames)
+    places, turned = CubicSpline(knots, centers, bc_type="natural")(times), Slerp(knots, rotations)(times).as_matrix()
+    Ks = np.stack([np.asarray(view.K, np.float64).ravel() for view in views])
+    lenses = np.stack([np.interp(times, knots, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
+    dtype, size = first.viewmat.dtype, (first.width, first.height)
+    return [
+        Camera(jnp.asarray(_viewmat(R, c), dtype), jnp.asarray(K, dtype), *size)
+        for R, c, K in zip(turned, places, lenses, strict=True)
+    ]
+
+
 def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:
     """An order of the cameras that goes to the nearest unvisited one, starting at an end of the set."""
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
@@ -75,7 +114,11 @@ def _look(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarr
     z = forward / np.linalg.norm(forward)
     x = np.cross(down, z)
     x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
+    return _viewmat(np.stack([x, np.cross(z, x), z]), center)
+
+
+def _viewmat(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """World-to-camera matrix [4, 4] of a camera's axes, as rows, and its place."""
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
     return viewmat

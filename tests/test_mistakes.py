@@ -82,7 +82,7 @@ MISTAKES = {
     "info": "Missing from a2tg info",
     "info photo.png": "is not a run folder",
     "render done --frames -3": "number of frames must be at least 1",
-    "render done --path round": "Expected one of ('test', 'smooth')",
+    "render done --path round": "round: no such path",
     "render done --model stage2": "the run has the models",
     "render done --out photo.png": "photo.png",
     "render run": "has no finished",

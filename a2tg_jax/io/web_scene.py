@@ -20,6 +20,7 @@ from a2tg_jax.gaussians import check_gaussians
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.rows import Rows, model_of, ordered, rows_of
 from a2tg_jax.io.web_codes import codes_of, rows_of_body
+from a2tg_jax.json_text import parse_json
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Origin
 from a2tg_jax.sh_bands import MAX_DEGREE
@@ -171,7 +172,7 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     text = data[HEAD.size : HEAD.size + num_text]
     if zlib.crc32(text) != checksum:
         raise ValueError("is damaged: the checksum of its header differs")
-    header = json.loads(text)
+    header = parse_json(text)
     _check_counts(header, num_coded)
     reader = zlib.decompressobj()
     try:

@@ -1,8 +1,8 @@
-"""Frames of a finished run: its test views, or a smooth path past the cameras, and a video of that."""
+"""Frames of a finished run: its test views, or a smooth path past the cameras or drawn by hand, and a video of that."""
 
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -10,8 +10,9 @@ from tqdm import tqdm
 
 from a2tg_jax.cameras import Camera
 from a2tg_jax.io.model import load_model
+from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
-from a2tg_jax.paths import smooth_path
+from a2tg_jax.paths import path_through, smooth_path
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder
@@ -22,19 +23,20 @@ Route = Literal["test", "smooth"]
 
 
 def render_frames(
-    run: RunFolder, out: Path, *, route: Route = "smooth", num_frames: int = 120, name: str | None = None
+    run: RunFolder, out: Path, *, route: Route | Path = "smooth", num_frames: int = 120, name: str | None = None
 ) -> list[Path]:
     """Writes one PNG per frame and returns their paths. The photographs are not needed: a model knows its cameras.
 
     Args:
       run: an opened run folder.
       out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views.
-      route: the test views, or a smooth path past all cameras.
+      route: the test views, a smooth path past all cameras, or a file of views that the viewer saved, through which a
+        path goes.
       num_frames: length of the path.
       name: whose model is drawn; None: the last stage of the run's main system.
 
     Raises:
-      FileNotFoundError: if that stage is not finished.
+      FileNotFoundError: if that stage is not finished, or there is no such path.
       FileExistsError: if `out` is a file.
       ValueError: if no frame is wanted, the run has no such stage, or there are no test views and these are wanted.
     """
@@ -72,17 +74,24 @@ def write_video(folder: Path, path: Path, *, frames_per_second: int = 30) -> boo
     return True
 
 
-def _cameras(model: Model, route: Route, num_frames: int) -> Iterator[tuple[str, Camera]]:
+def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:
     """File names and cameras of the frames."""
+    if isinstance(route, Path):
+        yield from _numbered(path_through(load_views(route), num_frames))
+        return
     if model.origin is None:
         raise ValueError("the model does not know where it was trained, so there are no cameras to render")
     views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
     if route == "smooth":
-        path = smooth_path([camera for _, _, camera in views], num_frames)
-        yield from ((f"frame_{index:04d}.png", camera) for index, camera in enumerate(path))
+        yield from _numbered(smooth_path([camera for _, _, camera in views], num_frames))
         return
     if not model.origin.is_test.any():
         raise ValueError("the run has no test views; render a path instead with --path smooth")
     tests = {name: camera for name, is_test, camera in views if is_test}
     names = picture_names(tests)
     yield from ((names[name], camera) for name, camera in tests.items())
+
+
+def _numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
+    """The cameras of a flight by the names that `write_video` looks for."""
+    return ((f"frame_{index:04d}.png", camera) for index, camera in enumerate(path))

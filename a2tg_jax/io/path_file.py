@@ -1,0 +1,71 @@
+"""Views that someone kept in the viewer, as JSON: what a flight goes through."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.checks import shortened
+from a2tg_jax.json_text import parse_json
+
+FORMAT, VERSION = "a2tg-jax path", 1
+LARGEST_SIDE = 16384
+MOST_VIEWS = 10_000
+ROUNDING = 1e-3
+"""How far from a rotation a matrix may be."""
+
+
+def load_views(path: Path) -> list[Camera]:
+    """The cameras of a file, in the world of the model that was looked at, float32.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: naming the file, if it holds anything else.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such path; the viewer's 'Save path' makes one")
+    try:
+        data = parse_json(path.read_bytes())
+        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+            raise ValueError(f"is not a path of version {VERSION} that the viewer saved")
+        views = data.get("views")
+        if not isinstance(views, list) or not 1 <= len(views) <= MOST_VIEWS:
+            raise ValueError(f"must hold 1 to {MOST_VIEWS:,} views")
+        return [_camera(view, f"views[{index}]") for index, view in enumerate(views)]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _camera(view: Any, where: str) -> Camera:
+    if not isinstance(view, dict):
+        raise ValueError(f"{where} must be an object; got {shortened(view)}")
+    viewmat, K = _numbers(view, "viewmat", (4, 4), where), _numbers(view, "K", (3, 3), where)
+    width, height = _numbers(view, "size", (2,), where)
+    rotation = viewmat[:3, :3]
+    is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROUNDING and np.linalg.det(rotation) > 0
+    if not is_rigid or np.abs(viewmat[3] - [0, 0, 0, 1]).max() > ROUNDING:
+        raise ValueError(f"{where}.viewmat must be a rigid motion")
+    if not (K[0, 0] > 0 and K[1, 1] > 0) or np.abs(K[2] - [0, 0, 1]).max() > ROUNDING:
+        raise ValueError(f"{where}.K must be intrinsics with positive focal lengths")
+    if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
+        raise ValueError(f"{where}.size must be 1 to {LARGEST_SIDE} pixels; got {width:g} and {height:g}")
+    as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return Camera(as_float(viewmat), as_float(K), int(width), int(height))
+
+
+def _numbers(view: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """Finite numbers of a shape, which stand row by row in a list."""
+    values, count = view.get(name), int(np.prod(shape))
+    is_number = lambda x: isinstance(x, int | float) and not isinstance(x, bool)  # noqa: E731
+    if not isinstance(values, list) or len(values) != count or not all(map(is_number, values)):
+        raise ValueError(f"{where}.{name} must be {count} numbers; got {shortened(values)}")
+    try:
+        found = np.array(values, np.float64)
+    except OverflowError:
+        found = np.full(count, np.inf)
+    if not np.abs(found).max() < 1e9:
+        raise ValueError(f"{where}.{name} must be finite numbers; got {shortened(values)}")
+    return found.reshape(shape)

@@ -1,0 +1,123 @@
+"""Flights through views that someone chose: they pass through them, smoothly, and no file is believed unseen."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from a2tg_jax.cameras import Camera
+from a2tg_jax.data.world import camera_centers
+from a2tg_jax.io.path_file import load_views
+from a2tg_jax.paths import path_through
+
+
+def some_views(num: int = 4, size=(64, 48)) -> list[Camera]:
+    rng = np.random.default_rng(num)
+    views = []
+    for index in range(num):
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * 0.4).as_matrix()
+        viewmat[:3, 3] = rng.normal(size=3) + np.array([0, 0, index])
+        K = np.array([[60 + 5 * index, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
+        views.append(Camera(viewmat, K, *size))
+    return views
+
+
+def saved(path, views: list[Camera], changes: dict | None = None):
+    """As the viewer saves it."""
+    data = {
+        "format": "a2tg-jax path",
+        "version": 1,
+        "views": [
+            {
+                "viewmat": np.asarray(view.viewmat, np.float64).ravel().tolist(),
+                "K": np.asarray(view.K, np.float64).ravel().tolist(),
+                "size": [view.width, view.height],
+            }
+            for view in views
+        ],
+    }
+    path.write_text(json.dumps(data | (changes or {})))
+    return path
+
+
+def test_a_flight_begins_and_ends_at_views_and_passes_the_others():
+    views = some_views()
+    path = path_through(views, 400)
+    viewmats = np.array([camera.viewmat for camera in path])
+    for view in views:
+        assert np.abs(viewmats - np.asarray(view.viewmat)).max(axis=(1, 2)).min() < 0.05
+    for end in (0, -1):
+        np.testing.assert_allclose(path[end].viewmat, views[end].viewmat, atol=1e-5)
+        np.testing.assert_allclose(path[end].K, views[end].K, rtol=1e-5)
+
+
+def test_a_flight_is_smooth_and_rigid():
+    path = path_through(some_views(), 300)
+    viewmats = np.array([camera.viewmat for camera in path], np.float64)
+    steps = np.linalg.norm(np.diff(camera_centers(viewmats), axis=0), axis=1)
+    assert steps.max() < 4 * steps.mean()
+    products = viewmats[:, :3, :3] @ viewmats[:, :3, :3].transpose(0, 2, 1)
+    assert np.abs(products - np.eye(3)).max() < 1e-5
+
+
+def test_views_of_other_sizes_become_the_first_ones():
+    views = [*some_views(2), *some_views(1, (128, 96))]
+    path = path_through(views, 5)
+    assert {(camera.width, camera.height) for camera in path} == {(64, 48)}
+    np.testing.assert_allclose(path[-1].K[0], [30, 0, 16])
+
+
+def test_one_view_stands_still_and_equal_views_do_no_harm():
+    (view,) = some_views(1)
+    assert path_through([view], 3) == [view] * 3
+    still = path_through([view, view, view], 4)
+    np.testing.assert_allclose(still[2].viewmat, view.viewmat, atol=1e-5)
+    with pytest.raises(ValueError, match="a path needs a view and a frame"):
+        path_through([], 3)
+    with pytest.raises(ValueError, match="a path needs a view and a frame"):
+        path_through([view], 0)
+
+
+def test_files_come_back(tmp_path):
+    views = some_views()
+    for found, wanted in zip(load_views(saved(tmp_path / "path.json", views)), views, strict=True):
+        np.testing.assert_array_equal(found.viewmat, wanted.viewmat)
+        np.testing.assert_array_equal(found.K, wanted.K)
+        assert (found.width, found.height) == (wanted.width, wanted.height)
+
+
+GOOD = {"viewmat": np.eye(4).ravel().tolist(), "K": [9, 0, 4, 0, 9, 3, 0, 0, 1], "size": [8, 6]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"format": "another"}, "is not a path"),
+        ({"version": 2}, "is not a path of version 1"),
+        ({"views": []}, "must hold 1 to"),
+        ({"views": 3}, "must hold 1 to"),
+        ({"views": [3]}, r"views\[0\] must be an object"),
+        ({"views": [GOOD, {}]}, r"views\[1\]\.viewmat must be 16 numbers"),
+        ({"views": [GOOD | {"viewmat": [1.0] * 16}]}, "must be a rigid motion"),
+        ({"views": [GOOD | {"viewmat": [True, *GOOD["viewmat"][1:]]}]}, "must be 16 numbers"),
+        ({"views": [GOOD | {"K": [10**400] * 9}]}, "must be finite"),
+        ({"views": [GOOD | {"K": [-9, 0, 4, 0, 9, 3, 0, 0, 1]}]}, "positive focal lengths"),
+        ({"views": [GOOD | {"size": [8, 0]}]}, "must be 1 to 16384 pixels"),
+        ({"views": [GOOD | {"size": [8.5, 6]}]}, "must be 1 to 16384 pixels"),
+        ({"views": [GOOD | {"size": [1e6, 6]}]}, "must be 1 to 16384 pixels"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, changes, match):
+    path = saved(tmp_path / "bad.json", some_views(1), changes)
+    with pytest.raises(ValueError, match=rf"bad\.json: .*{match}"):
+        load_views(path)
+
+
+def test_what_is_no_json_is_refused(tmp_path):
+    (tmp_path / "bad.json").write_bytes(b"\xff{")
+    with pytest.raises(ValueError, match=r"bad\.json"):
+        load_views(tmp_path / "bad.json")
+    with pytest.raises(FileNotFoundError, match="Save path"):
+        load_views(tmp_path / "nowhere.json")
