@@ -14,6 +14,7 @@ from a2tg_jax.json_text import parse_json
 FORMAT, VERSION = "a2tg-jax path", 1
 LARGEST_SIDE = 16384
 MOST_VIEWS = 10_000
+LARGEST_NUMBER = 1e9
 ROUNDING = 1e-3
 """How far from a rotation a matrix may be."""
 
@@ -62,10 +63,6 @@ def _numbers(view: Mapping[str, Any], name: str, shape: tuple[int, ...], where: 
     is_number = lambda x: isinstance(x, int | float) and not isinstance(x, bool)  # noqa: E731
     if not isinstance(values, list) or len(values) != count or not all(map(is_number, values)):
         raise ValueError(f"{where}.{name} must be {count} numbers; got {shortened(values)}")
-    try:
-        found = np.array(values, np.float64)
-    except OverflowError:
-        found = np.full(count, np.inf)
-    if not np.abs(found).max() < 1e9:
-        raise ValueError(f"{where}.{name} must be finite numbers; got {shortened(values)}")
-    return found.reshape(shape)
+    if max(map(abs, values)) > LARGEST_NUMBER:
+        raise ValueError(f"{where}.{name} must be numbers up to {LARGEST_NUMBER:g}; got {shortened(values)}")
+    return np.array(values, np.float64).reshape(shape)

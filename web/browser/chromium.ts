@@ -26,10 +26,11 @@ export interface Served {
   close(): void;
 }
 
-/** Answers with files by path, such as "/scene.a2tgw". */
-export function serve(files: Readonly<Record<string, Uint8Array | string>>): Promise<Served> {
+/** Answers with files by path, such as "/scene.a2tgw", or with what a function makes each time. */
+export function serve(files: Readonly<Record<string, Uint8Array | string | (() => string)>>): Promise<Served> {
   const server = createServer((request, response) => {
-    const body = Object.entries(files).find(([path]) => path === request.url)?.[1];
+    const found = Object.entries(files).find(([path]) => path === request.url)?.[1];
+    const body = typeof found === "function" ? found() : found;
     const isPage = request.url === "/";
     response.writeHead(body === undefined ? 404 : 200, { "Content-Type": isPage ? "text/html" : "application/octet-stream" });
     response.end(body);

@@ -142,6 +142,49 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
+  test("views that were kept are saved as a path", async () => {
+    const { page } = await opened();
+    expect(await page.isDisabled("#save")).toBe(true);
+    await page.click("#keep");
+    await page.click("#keep");
+    const [download] = await Promise.all([page.waitForEvent("download"), page.click("#save")]);
+    const path = JSON.parse(readFileSync(await download.path(), "utf8")) as { format: string; version: number; views: unknown[] };
+    expect([path.format, path.version, path.views.length]).toEqual(["a2tg-jax path", 1, 2]);
+    const { viewmat, K, size } = path.views[0] as { viewmat: number[]; K: number[]; size: number[] };
+    const camera = await page.evaluate(() => window.a2tg?.viewer.splats?.header.cameras[0]);
+    viewmat.forEach((x, i) => { expect(x).toBeCloseTo(camera?.viewmat[i] ?? NaN, 5); });
+    expect([K, size]).toEqual([camera?.K, camera?.size]);
+    await page.close();
+  });
+
+  test("a training is followed, paused and resumed", async () => {
+    const status = { version: 0, stage: "textures", iteration: 20, iterations: 100, loss: 0.1, psnr: 20, num: 300, bytes: 9e4, is_paused: false };
+    const tell = (is_paused: boolean): string => JSON.stringify(Object.assign(status, { is_paused }));
+    const other = await serve({
+      "/": PAGE, "/scene.a2tgw": SCENE, "/training.json": () => tell(status.is_paused), "/pause": () => tell(true), "/resume": () => tell(false),
+    });
+    const page = await browser.newPage({ viewport: { width: 640, height: 480 } });
+    await page.goto(other.address);
+    await page.waitForSelector("#training:not([hidden])");
+    expect(await page.textContent("#state")).toContain("20 of 100");
+    expect(await page.evaluate(() => window.a2tg?.viewer.splats)).toBeNull();
+    const shown = (): Promise<unknown> => page.waitForFunction(() => window.a2tg?.viewer.splats?.numDrawn === 300);
+    status.version = 1;
+    await shown();
+    const before = await page.evaluateHandle(() => window.a2tg?.viewer.splats);
+    status.version = 2;
+    await page.waitForFunction((old) => window.a2tg?.viewer.splats !== old, before);
+    await shown();
+    await page.click("#pause");
+    await page.waitForFunction(() => document.getElementById("pause")?.textContent === "Resume");
+    expect(status.is_paused).toBe(true);
+    await page.click("#pause");
+    await page.waitForFunction(() => document.getElementById("pause")?.textContent === "Pause");
+    other.close();
+    await page.waitForFunction(() => document.getElementById("state")?.textContent.includes("has ended"));
+    await page.close();
+  });
+
   test("a phone's screen holds all of it", async () => {
     const { page } = await opened("", { width: 390, height: 844 });
     expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBe(390);
