@@ -17,10 +17,12 @@ from a2tg_jax.compaction import measure_choices
 from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import load_ply
+from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import compress as compress_module
 from a2tg_jax.results import train_run as train_run_module
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.record import SceneSource, read_record
+from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.training import SYSTEMS
 
 TINY = [
@@ -360,6 +362,8 @@ def test_run_folder_is_complete(tiny_run):
     assert len(list(run.test.glob("*.png"))) == main["test"]["views"]
     assert load_ply(run.point_cloud).num == 60
     assert "http" not in run.report.read_text(encoding="utf-8").replace("http-equiv", "")
+    assert '<a href="viewer.html">' in run.report.read_text(encoding="utf-8")
+    assert 'id="scene-data"' in run.viewer.read_text(encoding="utf-8")
 
 
 def test_info(tiny_run, capsys):
@@ -411,6 +415,30 @@ def test_render(tiny_run, tmp_path, monkeypatch, capsys):
     assert len(list((tmp_path / "test").glob("*.png"))) == len(list(run.test.glob("*.png")))
     capsys.readouterr()
     assert "the run has the models a2tg-gaussians, " in fails(capsys, "render", run.path, "--model", "stage2")
+
+
+def test_render_a_path_that_was_kept_in_the_viewer(tiny_run, tmp_path, capsys):
+    run, *_ = tiny_run
+    view = {"viewmat": np.eye(4).ravel().tolist(), "K": [20, 0, 10, 0, 20, 8, 0, 0, 1], "size": [20, 16]}
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"format": "a2tg-jax path", "version": 1, "views": [view, view]}))
+    assert (
+        cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--out", str(tmp_path / "out")]) == 0
+    )
+    assert Image.open(tmp_path / "out" / "frame_0001.png").size == (20, 16)
+    assert "2 frames" in capsys.readouterr().out
+
+
+def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
+    """With the run's photographs; a model of the run by its name."""
+    run, *_ = tiny_run
+    assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--photographs"]) == 0
+    assert "dB of PSNR lost, test views" in capsys.readouterr().out
+    listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
+    assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
+    routes = routes_of(open_source(run.path, "a2tg-gaussians"))
+    assert decode_web_scene(routes["/scene.a2tgw"].read()).header["num_texels"] is None
+    assert json.loads(routes["/photographs.json"].read()) == listed
 
 
 def test_compress(tiny_run, tmp_path, monkeypatch, capsys):

@@ -50,10 +50,16 @@ class WebScene:
     """As the file has it."""
 
 
+def is_viewable(appearance: Appearance) -> bool:
+    """Whether browsers can show what splats show."""
+    inner = appearance.inner if isinstance(appearance, Banded) else appearance
+    return type(inner) in (Plain, Textured) and type(appearance) in (Plain, Textured, Banded)
+
+
 def check_viewable(appearance: Appearance) -> None:
     """Raises ValueError, naming what the splats show, unless a browser can show it."""
-    inner = appearance.inner if isinstance(appearance, Banded) else appearance
-    if type(inner) not in (Plain, Textured) or type(appearance) not in (Plain, Textured, Banded):
+    if not is_viewable(appearance):
+        inner = appearance.inner if isinstance(appearance, Banded) else appearance
         system = {Billboards: " of bbsplat", MovableKernels: " of supergaussians"}.get(type(inner), "")
         raise ValueError(
             f"the viewer cannot show {type(inner).__name__}{system}: it shows Gaussians with or without textures"

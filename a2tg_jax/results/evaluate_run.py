@@ -11,6 +11,7 @@ from a2tg_jax.evaluation import evaluate
 from a2tg_jax.io.atomic import replacing
 from a2tg_jax.io.model import load_model
 from a2tg_jax.io.ply import save_ply
+from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Color
 from a2tg_jax.render import RenderSettings
@@ -37,6 +38,7 @@ from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, comparison_html, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.training import System
+from a2tg_jax.web.page import page_with
 
 REPORTED_VIEWS = 4
 
@@ -81,8 +83,16 @@ def evaluate_run(
     save_ply(run.own(run.point_cloud), main)
     _write_surface(run, main, plan[result.main].system, scene)
     _write_flight(run, main, plan[result.main].system)
+    _write_viewer(run, main, f"{scene.name} · {result.main}")
     _write_pictures(run, result, models, scene)
     return result
+
+
+def _write_viewer(run: RunFolder, model: Model, title: str) -> None:
+    """The page that shows a model in a browser, where browsers can."""
+    if is_viewable(model.appearance):
+        with replacing(run.own(run.viewer)) as temporary:
+            temporary.write_text(page_with(encode_web_scene(model, title=title)), encoding="utf-8")
 
 
 def settings_of(system: System) -> RenderSettings:

@@ -11,6 +11,7 @@
       test/NAME.png              photograph, renders and error side by side
       figures/                   curves, texture resolutions, some textures, depth, normals, a flight
       point_cloud.ply            the Gaussians in the original world
+      viewer.html                the model in a browser, on one page
       report.html                all of it on one page
       diverged/NAME-*.npz        the state before a step whose numbers were not finite, a checkpoint
       .a2tg-old/                 the run that this one replaces, until this one has its report
@@ -105,6 +106,10 @@ class RunFolder:
     @property
     def point_cloud(self) -> Path:
         return self.path / "point_cloud.ply"
+
+    @property
+    def viewer(self) -> Path:
+        return self.path / "viewer.html"
 
     @property
     def report(self) -> Path:

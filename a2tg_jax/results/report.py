@@ -65,7 +65,8 @@ def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) 
     sections = "".join(f'<section id="{name}"><h2>{title}</h2>{bodies[name]}</section>\n' for name, title in SECTIONS)
     links = "".join(f'<a href="#{name}">{title}</a>' for name, title in SECTIONS)
     title = f"{next(iter(result.plan.chains))} on {result.scene}"
-    told = f'<p class="soft">{escape(_system_told(result))} {_views_told(result)}</p>'
+    viewer = f' <a href="{run.viewer.name}">Look at the scene.</a>' if run.viewer.is_file() else ""
+    told = f'<p class="soft">{escape(_system_told(result))} {_views_told(result)}{viewer}</p>'
     body = f"<h1>{escape(title)}</h1>{told}<nav>{links}</nav>\n{sections}"
     style, script = (files("a2tg_jax.results").joinpath(f"report.{kind}").read_text("utf-8") for kind in ("css", "js"))
     with replacing(run.own(run.report)) as temporary:
@@ -178,6 +179,7 @@ def _geometry(run: RunFolder) -> str:
 def _files(run: RunFolder, result: RunResult) -> str:
     """Links to what lies beside the page."""
     told = {
+        run.viewer: "the scene in a browser, to turn and to fly through; one file that opens from the disk",
         run.model(result.main): "the model, for a2tg and for load_model",
         run.point_cloud: "the Gaussians for other programs, without textures",
         run.metrics: "all figures",
