@@ -420,12 +420,11 @@ def test_render(tiny_run, tmp_path, monkeypatch, capsys):
 def test_render_a_path_that_was_kept_in_the_viewer(tiny_run, tmp_path, capsys):
     run, *_ = tiny_run
     view = {"viewmat": np.eye(4).ravel().tolist(), "K": [20, 0, 10, 0, 20, 8, 0, 0, 1], "size": [20, 16]}
-    path = tmp_path / "path.json"
+    path, out = tmp_path / "path.json", tmp_path / "out"
     path.write_text(json.dumps({"format": "a2tg-jax path", "version": 1, "views": [view, view]}))
-    assert (
-        cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--out", str(tmp_path / "out")]) == 0
-    )
-    assert Image.open(tmp_path / "out" / "frame_0001.png").size == (20, 16)
+    assert cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--out", str(out)]) == 0
+    with Image.open(out / "frame_0001.png") as frame:
+        assert frame.size == (20, 16)
     assert "2 frames" in capsys.readouterr().out
 
 
