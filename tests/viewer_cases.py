@@ -20,6 +20,7 @@ from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Origin
+from a2tg_jax.render import RenderOutput
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.viewing import Source
 from a2tg_jax.sh_bands import split_sh
@@ -90,12 +91,22 @@ def write_case(
         for mode in modes:
             model = models[name]
             shown = without_textures(model) if mode == "plain" else model
-            renderer = Renderer(shown, cameras=cameras, settings=settings, has_geometry=False)
+            renderer = Renderer(shown, cameras=cameras, settings=settings, has_geometry=mode in ("depth", "normals"))
             for camera in cameras:
-                np.asarray(renderer(camera).color, "<f4").tofile(folder / f"{len(views)}.f32")
+                _picture(renderer(camera), mode).tofile(folder / f"{len(views)}.f32")
                 views.append(_view(camera, mode, name))
     described = {"background": list(source.model.background), "views": views}
     (folder / "views.json").write_text(json.dumps(described))
+
+
+def _picture(output: RenderOutput, mode: str) -> np.ndarray:
+    """[H, W, 3] float32: what the page draws in a mode, before it is put on the screen."""
+    shown = output.color
+    if mode == "depth":
+        shown = np.repeat(np.asarray(output.depth)[..., None], 3, axis=2)
+    elif mode == "normals":
+        shown = 0.5 * (np.asarray(output.alpha)[..., None] + np.asarray(output.normal))
+    return np.asarray(shown, "<f4")
 
 
 def without_textures(model: Model) -> Model:

@@ -11,7 +11,7 @@ import { afterAll, beforeAll, describe, expect, test } from "vitest";
 import { CHROMIUM, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
-const PAGE = readFileSync(new URL("../dist/index.html", import.meta.url), "utf8");
+const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
 const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgw", import.meta.url)));
 
 describe.skipIf(CHROMIUM === undefined)("the page", () => {
