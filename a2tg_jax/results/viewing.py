@@ -87,7 +87,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     def load_scene() -> Scene | None:
         try:
             return record.scene.load()
-        except (FileNotFoundError, ValueError):
+        except (OSError, ValueError):
             return None  # The photographs are gone; the model shows itself.
 
     title = f"{Path(record.scene.path).name} · {planned.name}"
