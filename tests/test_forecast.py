@@ -101,7 +101,7 @@ def test_textures_grow_to(event, expected):
 def test_more_of_anything_takes_more():
     scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc(densify=a2tg.McmcConfig(cap=50_000))
     before = run_of(scene, system).peak[1].total
-    changes = ({"batch_size": 4}, {"densify": a2tg.McmcConfig(cap=200_000)}, {"sh_degree": 0})
+    changes = ({"batch_size": 32}, {"densify": a2tg.McmcConfig(cap=200_000)}, {"sh_degree": 0})
     one, two, three = (run_of(scene, dataclasses.replace(system, **change)).peak[1].total for change in changes)
     assert one > before and two > before and three < before
     assert run_of(scene_of(1200, 800), system).peak[1].total > before

@@ -44,6 +44,16 @@ TRAIN = [
 ]
 
 
+@pytest.fixture(autouse=True)
+def no_signal_is_ignored():
+    """As nohup has SIGHUP ignored, and shells SIGINT in what they run in the background."""
+    wanted = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="module")
 def scene():
     return SOURCE.load()
