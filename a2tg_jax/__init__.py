@@ -37,6 +37,7 @@ from a2tg_jax.densify import FillingDensity as FillingDensity
 from a2tg_jax.densify import OpacityReset as OpacityReset
 from a2tg_jax.evaluation import evaluate as evaluate
 from a2tg_jax.events import Change as Change
+from a2tg_jax.events import Due as Due
 from a2tg_jax.events import EventInfo as EventInfo
 from a2tg_jax.events import HostEvent as HostEvent
 from a2tg_jax.events import StepEvent as StepEvent

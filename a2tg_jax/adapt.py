@@ -14,7 +14,7 @@ import numpy as np
 
 from a2tg_jax.budget import bytes_of, event_budget, within_budget
 from a2tg_jax.checks import check_shape
-from a2tg_jax.events import Change, HostEvent, Seen, Statistic, event, iterations_at, static
+from a2tg_jax.events import Change, Due, HostEvent, Seen, Statistic, event, iterations_at, static
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
@@ -101,7 +101,7 @@ class Upscale(HostEvent):
     def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
         return state.observe_views(seen.gradients, seen.is_visible)
 
-    def apply(self, index: int, count: int, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
+    def apply(self, due: Due, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         if model.textures is None:
             raise ValueError(f"{type(model.appearance).__name__} has no textures that could grow; Textured has")
         textures, layout = model.textures
@@ -113,10 +113,10 @@ class Upscale(HostEvent):
             sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap,
             anisotropic=self.anisotropic, axes=self.axes,
         )  # fmt: skip
-        how = self._how_to_select(model.num_bytes, index, count)
+        how = self._how_to_select(model.num_bytes, due)
         mask = select(averages[:num], sizes, proposed, **how)
         grown = np.where(mask[:, None], proposed, sizes)
-        if self.select == "budget" and index == count and (grown == proposed).all():
+        if self.select == "budget" and due.index == due.count and (grown == proposed).all():
             left = how["budget_bytes"] - _bytes_between(sizes, grown)
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
         new_sizes[:num] = grown
@@ -143,10 +143,10 @@ class Upscale(HostEvent):
                 sizes = grown
         return sizes
 
-    def _how_to_select(self, used_bytes: int, index: int, count: int) -> dict[str, float]:
+    def _how_to_select(self, used_bytes: int, due: Due) -> dict[str, float]:
         """The keyword that tells `select` how to choose."""
         if self.select == "budget":
-            return {"budget_bytes": event_budget(bytes_of(self.budget_mb or 0.0), used_bytes, index, count)}
+            return {"budget_bytes": event_budget(bytes_of(self.budget_mb or 0.0), used_bytes, due.index, due.count)}
         return {self.select: getattr(self, self.select)}
 
 

@@ -7,10 +7,12 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from a2tg_jax.cameras import Camera
@@ -74,6 +76,18 @@ class Now(NamedTuple):
     """When the event happens; None: after every iteration."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Due:
+    """What an event on the host is told."""
+
+    index: int = 1
+    """Which of its kind in the stage it is, from 1."""
+    count: int = 1
+    """How many there are."""
+    cameras: Sequence[Camera] = ()
+    """Of the training views, as the scene has them."""
+
+
 class EventInfo(NamedTuple):
     """What an event did inside the step, traced."""
 
@@ -91,6 +105,8 @@ class Change(NamedTuple):
     """Of (gaussians, params)."""
     state: Any
     info: EventInfo = EventInfo()
+    rows: np.ndarray | None = None
+    """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved."""
 
 
 class Event:
@@ -109,9 +125,14 @@ class Event:
     def init(self, model: Model) -> Any:
         """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered.
 
-        It does not follow rows that another event moves: what gathers per row wants a stage in which none does.
+        It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
+        none does. `gather` follows those that move on the host.
         """
         return ()
+
+    def gather(self, state: Any, rows: np.ndarray) -> Any:
+        """The state where row i is the former row rows[i] (host): as here where its arrays have a row per Gaussian."""
+        return jax.tree.map(lambda leaf: leaf[rows] if leaf.ndim else leaf, state)
 
     def observe(self, state: Any, model: Model, seen: Seen) -> Any:
         """The state after the views of an iteration; traced, and called while the event is still ahead."""
@@ -124,6 +145,10 @@ class Event:
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         """How many Gaussians the event can reach from `num`: so many rows are allocated (host)."""
+        return num
+
+    def num_left(self, num: int, num_iterations: int) -> int:
+        """How many of `num` Gaussians are left at the end of the stage (host)."""
         return num
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
@@ -155,8 +180,12 @@ class HostEvent(Event):
         """After which iterations of a stage of so many it happens, ascending."""
         raise NotImplementedError(f"{type(self).__name__} must say when it happens")
 
-    def apply(self, index: int, count: int, model: Model, moments: AdamState, state: Any) -> Change:
-        """The model after the event, which is number `index` of `count` of its kind, from 1 (host)."""
+    def num_programs(self, num_iterations: int) -> int:
+        """About how many programs are compiled because of it, for forecasts: one each time, as shapes change (host)."""
+        return len(self.iterations(num_iterations))
+
+    def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
+        """The model after the event (host)."""
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 

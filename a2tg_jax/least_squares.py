@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Banded, Plain, RuleAround, Textured
+from a2tg_jax.appearance import Banded, GivenColors, Plain, Textured
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
 from a2tg_jax.data import View, view_image
-from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.optim import solve_cg
 from a2tg_jax.render import RenderSettings, plan_render, render_traced
@@ -38,18 +37,6 @@ class Colors(NamedTuple):
     """Those beyond, or ()."""
     rgb: tuple[Array, ...]
     """[capacity, Tv, Tu, 3] of each bucket of textures."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class GivenColors(RuleAround):
-    """Another rule, with the colours of the Gaussians given."""
-
-    given: Array
-    """[N, 3]."""
-
-    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        return self.given
 
 
 class Photographs(NamedTuple):

@@ -14,7 +14,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Banded
 from a2tg_jax.budget import BYTES_PER_FLOAT, bytes_of, event_budget, within_budget
-from a2tg_jax.events import Change, HostEvent, Seen, event, iterations_at, static
+from a2tg_jax.events import Change, Due, HostEvent, Seen, event, iterations_at, static
 from a2tg_jax.model import Model
 from a2tg_jax.numerics import normalize
 from a2tg_jax.optim import AdamState
@@ -91,13 +91,13 @@ class AdaptDegrees(HostEvent):
         centers = jax.vmap(lambda camera: camera.center)(seen.cameras)
         return state.observe(model.gaussians.means, centers, seen.colors)
 
-    def apply(self, index: int, count: int, model: Model, moments: AdamState, state: ViewDependence) -> Change:
+    def apply(self, due: Due, model: Model, moments: AdamState, state: ViewDependence) -> Change:
         if not isinstance(model.appearance, Banded):
             raise ValueError(f"{type(model.appearance).__name__} has no degrees that could rise; Banded has")
         bands, layout, num = model.params.bands, model.layout.bands, model.num
         degrees = without_idle(bands, layout, self.idle)
         used = model.num_bytes - saved_bytes(layout, degrees, num)
-        budget = event_budget(bytes_of(self.budget_mb), used, index, count)
+        budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
         degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget, self.highest)
         bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
         model = dataclasses.replace(

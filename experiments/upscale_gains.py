@@ -27,7 +27,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.adapt import reallocate
 from a2tg_jax.appearance import Plain, TexelRates, Textured
 from a2tg_jax.data import view_image
-from a2tg_jax.events import Change, HostEvent, event
+from a2tg_jax.events import Change, Due, HostEvent, event
 from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.losses import photometric_loss
 from a2tg_jax.model import Model
@@ -63,7 +63,7 @@ class GrowRows(HostEvent):
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return (1,)
 
-    def apply(self, index: int, count: int, model: Model, moments, state) -> Change:
+    def apply(self, due: Due, model: Model, moments, state) -> Change:
         textures, layout = model.textures
         sizes = np.where(np.asarray(self.rows)[:, None], SIZE, (0, 0))
         grown = reallocate(textures, layout, sizes, moments)

@@ -10,6 +10,7 @@ import pytest
 from a2tg_jax.adapt import Upscale, next_sizes, reallocate, select
 from a2tg_jax.appearance import Textured
 from a2tg_jax.budget import event_budget
+from a2tg_jax.events import Due
 from a2tg_jax.gaussians import init_from_points
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
@@ -202,7 +203,7 @@ def test_what_adam_remembers_of_a_texture_that_grows(moments):
     model = Model(gaussians, params, layout, appearance=Textured())
     ones = jax.tree.map(jnp.ones_like, adam_init((gaussians, params)))
     state = GradientStatistics.init(12, jnp.float32).observe(jnp.arange(12, dtype=jnp.float32), jnp.ones(12, bool))
-    change = Upscale(fraction=0.5, moments=moments).apply(1, 1, model, ones, state)
+    change = Upscale(fraction=0.5, moments=moments).apply(Due(), model, ones, state)
     found = texture_arrays(change.moments.mu[1], change.model.layout)
     assert [array.shape[0] for array in found] == [1] * 6 + [2] * 6
     assert [float(array.min()) for array in found] == [1] * 6 + [float(moments == "copied")] * 6
@@ -247,7 +248,7 @@ def test_rows_that_do_not_exist_take_no_share(select, number):
     seen = GradientStatistics(jnp.asarray([0.0, 0.0, *[9.0] * 8]), jnp.ones(10, jnp.int32))
     if select == "fraction":
         seen = GradientStatistics(jnp.asarray([1.0, 2.0, *[0.0] * 8]), jnp.ones(10, jnp.int32))
-    change = event.apply(1, 1, model, adam_init((gaussians, params)), seen)
+    change = event.apply(Due(), model, adam_init((gaussians, params)), seen)
     sizes = change.model.layout.sizes
     assert np.prod(sizes[:2], axis=1).sum() == 1 + 4 and np.all(sizes[2:] == 1)
 

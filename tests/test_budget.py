@@ -17,7 +17,7 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Textured
 from a2tg_jax.budget import bytes_per_gaussian, megabytes_of, number_to_reach
 from a2tg_jax.densify import FillingDensity
-from a2tg_jax.events import Now, Times
+from a2tg_jax.events import Due, Now, Times
 from a2tg_jax.gaussians import floats_per_gaussian, init_from_points, logit
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
@@ -182,7 +182,7 @@ def test_textures_take_what_gaussians_leave(budget, shape, texture_cap, rounds):
         assert model.num_bytes <= system.budget_bytes
         sums = jnp.asarray(rng.exponential(size=num) * rng.integers(0, 2, num), jnp.float32)
         state = GradientStatistics(sums, jnp.ones(num, jnp.int32))
-        change = upscale.apply(index + 1, rounds, model, moments, state)
+        change = upscale.apply(Due(index + 1, rounds), model, moments, state)
         model, moments = change.model, change.moments
     assert 0.995 * system.budget_bytes <= model.num_bytes <= system.budget_bytes
     if texture_cap > 2:

@@ -15,7 +15,7 @@ from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels,
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.budget import within_budget
 from a2tg_jax.data.world import Similarity
-from a2tg_jax.events import Seen
+from a2tg_jax.events import Due, Seen
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.optim import adam_init
 from a2tg_jax.sh_bands import allocate_bands, dense_sh, gather_bands, reallocate_bands, split_sh
@@ -211,7 +211,7 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
     params, layout = model.appearance.allocate(jax.random.key(0), model.gaussians)
     base = dataclasses.replace(model, params=params, layout=layout)
     state = event.observe(event.init(base), base, seen)
-    after = event.apply(1, 1, base, adam_init((base.gaussians, base.params)), state).model
+    after = event.apply(Due(), base, adam_init((base.gaussians, base.params)), state).model
     assert 1e6 * budget_mb - 36 < after.num_bytes <= 1e6 * budget_mb
     np.testing.assert_allclose(after.render(camera).color, base.render(camera).color, atol=1e-6)
 
@@ -247,7 +247,7 @@ def test_degrees_rise_in_banded_models_only():
     model = Model(as_gaussians(draw_scene(1, num=NUM), "float32"))
     event = AdaptDegrees(1.0)
     with pytest.raises(ValueError, match="Plain has no degrees that could rise; Banded has"):
-        event.apply(1, 1, model, adam_init((model.gaussians, ())), event.init(model))
+        event.apply(Due(), model, adam_init((model.gaussians, ())), event.init(model))
 
 
 def test_a_ply_file_of_nothing(tmp_path):

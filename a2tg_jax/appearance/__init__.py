@@ -14,6 +14,7 @@ from a2tg_jax.appearance.movable_kernels import MovableKernels as MovableKernels
 from a2tg_jax.appearance.movable_kernels import MovableKernelsRule as MovableKernelsRule
 from a2tg_jax.appearance.plain import Plain as Plain
 from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
+from a2tg_jax.appearance.rule import GivenColors as GivenColors
 from a2tg_jax.appearance.rule import PlainRule as PlainRule
 from a2tg_jax.appearance.rule import RuleAround as RuleAround
 from a2tg_jax.appearance.rule import StaticRule as StaticRule

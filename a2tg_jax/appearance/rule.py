@@ -147,6 +147,18 @@ class RuleAround(AppearanceRule):
         return self.inner.cutoff(opacities)
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class GivenColors(RuleAround):
+    """Another rule, with the colours of the Gaussians given."""
+
+    given: Array
+    """[N, 3]."""
+
+    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        return self.given
+
+
 @dataclasses.dataclass(frozen=True)
 class StaticRule:
     """A rule without its arrays; hashable, so that code can be compiled for it."""

@@ -9,7 +9,8 @@ from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured
 from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.gaussians import floats_per_gaussian
-from a2tg_jax.mcmc import Noise
+from a2tg_jax.mcmc import Noise, densify_times
+from a2tg_jax.pruning import Prune
 from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
@@ -29,10 +30,20 @@ class CapConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class PruneConfig:
+    """Gaussians that show least, which go while others grow in their place."""
+
+    share: float = 0.1
+    """Of the Gaussians, each time; 0: none."""
+    at: tuple[float, ...] = (0.3, 0.45, 0.6, 0.75)
+    """Fractions of the first stage, before growth ends at 5/6 of it."""
+
+
+@dataclasses.dataclass(frozen=True)
 class ViewDependenceConfig:
     """Spherical harmonics above the Gaussians' own degree."""
 
-    share: float = 0.1
+    share: float = 0.2
     """Of the bytes; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
@@ -67,6 +78,7 @@ class Bytewise(System):
     base_degree: int = 0
     """Degree of spherical harmonics that all Gaussians have; those that need it get more, up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
+    prune: PruneConfig = dataclasses.field(default_factory=PruneConfig)
     view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
     texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
 
@@ -79,13 +91,23 @@ class Bytewise(System):
 
     def stages(self) -> tuple[Stage, ...]:
         shown, rates = self._appearance()
-        growth = (Noise(), SplitByGradient(self._num_gaussians()))
-        first = growing_stage(self, self.stage1_iterations, growth, Plain(self.texture.lookup.max_alpha))
+        plain = Plain(self.texture.lookup.max_alpha)
+        first = growing_stage(self, self.stage1_iterations, self._growth(), plain)
         return first, later_stage(self, "details", shown, self._details(), self.stage2_iterations, rates)
 
-    def _num_gaussians(self) -> int:
-        """As many as there is room for beside degrees and texels."""
-        share = self.view_dependence.share + self.texture.share
+    def _growth(self) -> tuple[Event, ...]:
+        """Gaussians that fill all bytes. Those that show least go while others grow, and in the end for the details."""
+        prune = (Prune(self.prune.share, at=self.prune.at),) if self.prune.share else ()
+        last = (Prune(keep=self._num_gaussians(self._share)),) if self._share else ()
+        return Noise(), SplitByGradient(self._num_gaussians(0.0)), *prune, *last
+
+    @property
+    def _share(self) -> float:
+        """Of the bytes, for degrees and texels."""
+        return self.view_dependence.share + self.texture.share
+
+    def _num_gaussians(self, share: float) -> int:
+        """As many as there is room for beside such a share of the bytes."""
         num = self.budget_cap(floats_per_gaussian(self.base_degree) * share / (1 - share))
         return math.floor(self.densify.cap * (1 - share)) if num is None else num
 
@@ -126,6 +148,7 @@ class Bytewise(System):
         view, texture = self.view_dependence, self.texture
         ranges = {
             "base_degree": (self.base_degree, 0, self.sh_degree),
+            "prune.share": (self.prune.share, 0, 0.5),
             "view_dependence.share": (view.share, 0, 1),
             "view_dependence.rate": (view.rate, 0, math.inf),
             "view_dependence.idle": (view.idle, 0, math.inf),
@@ -147,13 +170,21 @@ class Bytewise(System):
                 f"already: set it so, or lower base_degree; got {view.share}"
             )
         self._check_times()
-        if self._num_gaussians() < 2:
+        if self._num_gaussians(self._share) < 2:
             raise ValueError(f"densify.cap must leave room for 2 Gaussians; got {self.densify.cap}")
         super().check()
 
     def _check_times(self) -> None:
-        """Refuses times that do not exist, or at which degrees find the bytes taken by textures."""
+        """Refuses times that do not exist, after which nothing grows, or at which textures have taken the bytes."""
         view, texture = self.view_dependence, self.texture
+        if self.prune.share:
+            growth = densify_times(self.stage1_iterations)
+            last = growth.last - growth.last % growth.every
+            if any(at >= last for at in iterations_at(self.prune.at, self.stage1_iterations, "prune.at")):
+                raise ValueError(
+                    f"prune.at must be over before growth ends, after {last:,} of the {self.stage1_iterations:,} "
+                    f"iterations of the first stage; got {self.prune.at}"
+                )
         asked = {"view_dependence.at": (view.share, view.at), "texture.at": (texture.share, texture.at)}
         times = {name: iterations_at(at, self.stage2_iterations, name) for name, (share, at) in asked.items() if share}
         for name, found in times.items():

@@ -94,9 +94,11 @@ def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
         for event in stage.events:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
         floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
-        programs = 1 + sum(len(e.iterations(stage.iterations)) for e in stage.events if isinstance(e, HostEvent))
+        programs = 1 + sum(e.num_programs(stage.iterations) for e in stage.events if isinstance(e, HostEvent))
         seconds = stage.iterations * system.batch_size * _seconds(scene.train, num)
         yield StageForecast(stage_bytes(scene, system, stage, num, model_bytes), model_bytes, num, programs, seconds)
+        for event in stage.events:
+            num = event.num_left(num, stage.iterations)
 
 
 def floats_shown(stage: Stage, system: System) -> float:

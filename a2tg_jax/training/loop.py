@@ -15,7 +15,7 @@ import numpy as np
 
 from a2tg_jax.corrections import check_corrections
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import HostEvent, StepEvent
+from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.memory import keep_room_for_programs, return_free_memory
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
@@ -274,11 +274,20 @@ class StageRun:
                 due = event.iterations(self.stage.iterations)
                 if iteration not in due:
                     continue
-                change = event.apply(due.index(iteration) + 1, len(due), self.state.model, self.state.moments, state)
+                told = Due(due.index(iteration) + 1, len(due), [view.camera for view in self.views])
+                change = event.apply(told, self.state.model, self.state.moments, state)
                 self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
+                if change.rows is not None:
+                    self._move_rows(change.rows)
                 self._keep(place, None if iteration == due[-1] else change.state)
             elif times is not None and event.observes and iteration == times.last:
                 self._keep(place, None)
+
+    def _move_rows(self, rows: np.ndarray) -> None:
+        """What the events have gathered follows the Gaussians."""
+        pairs = zip(self.stage.events, self.state.events, strict=True)
+        events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
+        self.state = dataclasses.replace(self.state, events=events)
 
     def _keep(self, place: int, gathered) -> None:
         events = list(self.state.events)

@@ -296,7 +296,8 @@ def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, mome
 def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: AdamState, state):
     """The change that an event makes, if it is due; events that are past make none."""
     if times is None:
-        return event.apply(now, model, moments, state)
+        change = event.apply(now, model, moments, state)
+        return change.model, change.moments, change.state, change.info
     if state is None:
         return model, moments, state, EventInfo()
 
