@@ -37,6 +37,11 @@ class Times(NamedTuple):
         return self.last // self.every - (iteration - 1) // self.every
 
     @property
+    def last_time(self) -> int:
+        """The iteration of the last one (host)."""
+        return self.last - self.last % self.every
+
+    @property
     def num_times(self) -> int:
         """How often it happens in all (host)."""
         return max(0, self.num_left(max(1, self.first)))

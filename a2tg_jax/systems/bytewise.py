@@ -9,7 +9,7 @@ from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured
 from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.gaussians import floats_per_gaussian
-from a2tg_jax.mcmc import Noise, densify_times
+from a2tg_jax.mcmc import GROWTH_ENDS, Noise, densify_times
 from a2tg_jax.pruning import Prune
 from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
@@ -35,7 +35,7 @@ class PruneConfig:
 
     share: float = 0.1
     """Of the Gaussians, each time; 0: none."""
-    at: tuple[float, ...] = (0.3, 0.45, 0.6, 0.75)
+    at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
     """Fractions of the first stage, before growth ends at 5/6 of it."""
 
 
@@ -43,7 +43,7 @@ class PruneConfig:
 class ViewDependenceConfig:
     """Spherical harmonics above the Gaussians' own degree."""
 
-    share: float = 0.2
+    share: float = 0.23
     """Of the bytes; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
@@ -57,7 +57,7 @@ class ViewDependenceConfig:
 class DetailTextureConfig:
     """Textures of the Gaussians that get one."""
 
-    share: float = 0.05
+    share: float = 0.02
     """Of the bytes; 0: none."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
@@ -97,9 +97,13 @@ class Bytewise(System):
 
     def _growth(self) -> tuple[Event, ...]:
         """Gaussians that fill all bytes. Those that show least go while others grow, and in the end for the details."""
-        prune = (Prune(self.prune.share, at=self.prune.at),) if self.prune.share else ()
+        grow = SplitByGradient(self._num_gaussians(0.0))
+        # In a short stage the last growth may come too early for the last of them.
+        num, last_growth = self.stage1_iterations, densify_times(self.stage1_iterations).last_time
+        at = tuple(fraction for fraction in self.prune.at if round(fraction * num) < last_growth)
+        prune = (Prune(self.prune.share, at=at),) if self.prune.share and at else ()
         last = (Prune(keep=self._num_gaussians(self._share)),) if self._share else ()
-        return Noise(), SplitByGradient(self._num_gaussians(0.0)), *prune, *last
+        return Noise(), grow, *prune, *last
 
     @property
     def _share(self) -> float:
@@ -177,14 +181,11 @@ class Bytewise(System):
     def _check_times(self) -> None:
         """Refuses times that do not exist, after which nothing grows, or at which textures have taken the bytes."""
         view, texture = self.view_dependence, self.texture
-        if self.prune.share:
-            growth = densify_times(self.stage1_iterations)
-            last = growth.last - growth.last % growth.every
-            if any(at >= last for at in iterations_at(self.prune.at, self.stage1_iterations, "prune.at")):
-                raise ValueError(
-                    f"prune.at must be over before growth ends, after {last:,} of the {self.stage1_iterations:,} "
-                    f"iterations of the first stage; got {self.prune.at}"
-                )
+        iterations_at(self.prune.at, self.stage1_iterations, "prune.at")
+        if self.prune.share and max(self.prune.at, default=0) > GROWTH_ENDS:
+            raise ValueError(
+                f"prune.at must be over when growth ends, at {GROWTH_ENDS:.3f} of the first stage; got {self.prune.at}"
+            )
         asked = {"view_dependence.at": (view.share, view.at), "texture.at": (texture.share, texture.at)}
         times = {name: iterations_at(at, self.stage2_iterations, name) for name, (share, at) in asked.items() if share}
         for name, found in times.items():
