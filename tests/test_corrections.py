@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from kept_checkpoints import fit_keeping_checkpoints
 from scipy.linalg import expm
 from toy_system import Toy
 
@@ -42,12 +43,7 @@ def scene():
 @pytest.fixture(scope="module")
 def trained(scene):
     """A run, and copies of its checkpoints."""
-    kept = []
-
-    def keep(checkpoint):
-        kept.append(dataclasses.replace(checkpoint, state=jax.tree.map(np.array, checkpoint.state)))
-
-    return fit(scene, SYSTEM, on_checkpoint=keep, checkpoint_every=8, progress=False), kept
+    return fit_keeping_checkpoints(scene, SYSTEM)
 
 
 def hat(rotvec):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from kept_checkpoints import fit_keeping_checkpoints
 
 from a2tg_jax import (
     A2tg,
@@ -51,14 +52,8 @@ def scene():
 @pytest.fixture(scope="module")
 def trained(scene):
     """A whole run, its checkpoints, and how many traces it took."""
-    checkpoints = []
-
-    def keep(checkpoint):
-        # The loop donates the state's buffers to the next step.
-        checkpoints.append(dataclasses.replace(checkpoint, state=jax.tree.map(np.array, checkpoint.state)))
-
     before = jitted_step().num_compiled()
-    result = fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, progress=False)
+    result, checkpoints = fit_keeping_checkpoints(scene, CONFIG)
     return result, checkpoints, jitted_step().num_compiled() - before
 
 

@@ -19,6 +19,7 @@
 NAME is that of a stage, such as `a2tg-gaussians` or `a2tg-textures`: the system's, and the stage's in it (`plan`).
 """
 
+import contextlib
 import dataclasses
 import glob
 import json
@@ -153,6 +154,9 @@ class RunFolder:
         old = self.checkpoints(name)[: -keep or None]
         for path in old if keep else [*old, *self._checkpoints(name, DAMAGED)]:
             path.unlink()
+        if not keep:
+            with contextlib.suppress(OSError):  # Where other stages have theirs in it.
+                (self.path / "checkpoints").rmdir()
 
     def _checkpoints(self, name: str, ending: str) -> list[Path]:
         pattern = re.compile(re.escape(name) + r"-(\d{6,})\.npz" + re.escape(ending))
