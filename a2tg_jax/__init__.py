@@ -76,6 +76,7 @@ from a2tg_jax.optim import exponential_decay as exponential_decay
 from a2tg_jax.origin import Origin as Origin
 from a2tg_jax.paths import path_through as path_through
 from a2tg_jax.paths import smooth_path as smooth_path
+from a2tg_jax.pruning import Prune as Prune
 from a2tg_jax.render import RenderOutput as RenderOutput
 from a2tg_jax.render import RenderSettings as RenderSettings
 from a2tg_jax.render import plan_render as plan_render
@@ -83,6 +84,7 @@ from a2tg_jax.render import render_appearance as render_appearance
 from a2tg_jax.render import render_image as render_image
 from a2tg_jax.renderer import Renderer as Renderer
 from a2tg_jax.shrinking import shrink_textures as shrink_textures
+from a2tg_jax.splitting import SplitByGradient as SplitByGradient
 from a2tg_jax.startup import configure_cpu as configure_cpu
 from a2tg_jax.systems.a2tg import A2tg as A2tg
 from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig
@@ -117,3 +119,4 @@ from a2tg_jax.training import like as like
 from a2tg_jax.training import load_checkpoint as load_checkpoint
 from a2tg_jax.training import save_checkpoint as save_checkpoint
 from a2tg_jax.transform import transform_gaussians as transform_gaussians
+from a2tg_jax.view_dependence import AdaptDegrees as AdaptDegrees

@@ -21,7 +21,7 @@ class TextureRegion(NamedTuple):
     first: Array
     """Index of its first texel."""
     height: Array
-    """In texels, as the width."""
+    """In texels, as the width; both are 0 where the splat has no texture."""
     width: Array
 
 
@@ -61,15 +61,16 @@ class Lookup(NamedTuple):
 
 
 def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
-    """The texels above left, above right, below left and below right of (x, y)."""
-    right_most, bottom_most = region.width - 1, region.height - 1
+    """The texels above left, above right, below left and below right of (x, y); of no weight where there is none."""
+    right_most, bottom_most = jnp.maximum(region.width - 1, 0), jnp.maximum(region.height - 1, 0)
     # Whatever x and y are, nothing outside of the texture is read.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
     top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
     right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
     above, below = region.first + top * region.width, region.first + bottom * region.width
-    fx, fy = x - left.astype(x.dtype), y - top.astype(y.dtype)
-    gx, gy = 1 - fx, 1 - fy
+    exists = (region.width > 0).astype(x.dtype)
+    fx, fy = exists * (x - left.astype(x.dtype)), exists * (y - top.astype(y.dtype))
+    gx, gy = exists - fx, exists - fy
     return (
         Corner(above + left, gx * gy, -gy, -gx),
         Corner(above + right, fx * gy, gy, -fx),
@@ -88,6 +89,14 @@ def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ..
         )
 
     return Sample(*(weighed([corner[k] for corner in corners]) for k in (1, 2, 3)))
+
+
+def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) -> Sample:
+    """The sample, or the values of a splat without a texture where the region has no texels."""
+    if not empty:
+        return sample
+    values = zip(empty, sample.values, strict=True)
+    return sample._replace(values=tuple(jnp.where(region.width > 0, value, none) for none, value in values))
 
 
 def follow(sample: Sample, x: Array, y: Array) -> tuple[Array, ...]:

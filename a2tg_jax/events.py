@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.cameras import Camera
+from a2tg_jax.data import View
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
 from a2tg_jax.pixel import Statistic
@@ -86,11 +87,11 @@ class Due:
     """What an event on the host is told."""
 
     index: int = 1
-    """Which of its kind in the stage it is, from 1."""
+    """Which of the event's times in the stage it is, from 1."""
     count: int = 1
-    """How many there are."""
-    cameras: Sequence[Camera] = ()
-    """Of the training views, as the scene has them."""
+    """How many times it has."""
+    views: Sequence[View] = ()
+    """Those that are trained on, with the cameras that the scene gives."""
 
 
 class EventInfo(NamedTuple):
@@ -111,7 +112,8 @@ class Change(NamedTuple):
     state: Any
     info: EventInfo = EventInfo()
     rows: np.ndarray | None = None
-    """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved."""
+    """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
+    Model, moments and state are those of the new order; what other events have gathered then follows."""
 
 
 class Event:
@@ -136,8 +138,21 @@ class Event:
         return ()
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """The state where row i is the former row rows[i] (host): as here where its arrays have a row per Gaussian."""
-        return jax.tree.map(lambda leaf: leaf[rows] if leaf.ndim else leaf, state)
+        """The state where row i is the former row rows[i] (host). As here where arrays have a row for each Gaussian.
+
+        Raises:
+          ValueError: if an array has not.
+        """
+
+        def moved(leaf: Array) -> Array:
+            if leaf.ndim and leaf.shape[0] != len(rows):
+                raise ValueError(
+                    f"{type(self).__name__} has gathered an array {[*leaf.shape]}, without a row for each of the "
+                    f"{len(rows):,} Gaussians, and rows have moved: override gather"
+                )
+            return leaf[rows] if leaf.ndim else leaf
+
+        return jax.tree.map(moved, state)
 
     def observe(self, state: Any, model: Model, seen: Seen) -> Any:
         """The state after the views of an iteration; traced, and called while the event is still ahead."""
@@ -152,8 +167,8 @@ class Event:
         """How many Gaussians the event can reach from `num`: so many rows are allocated (host)."""
         return num
 
-    def num_left(self, num: int, num_iterations: int) -> int:
-        """How many of `num` Gaussians are left at the end of the stage (host)."""
+    def num_after(self, num: int, num_iterations: int) -> int:
+        """How many of `num` Gaussians there are at the end of the stage at most, for forecasts (host)."""
         return num
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:

@@ -19,7 +19,7 @@ from jax import Array
 from a2tg_jax.appearance import Banded, GivenColors, Plain, Textured
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
-from a2tg_jax.data import View, view_image
+from a2tg_jax.data import View, counted_pixels, view_image
 from a2tg_jax.model import Model
 from a2tg_jax.optim import solve_cg
 from a2tg_jax.render import RenderSettings, plan_render, render_traced
@@ -172,15 +172,7 @@ def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
             jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
             jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),
-            _weights(own, dtype),
+            jnp.asarray(counted_pixels(own), dtype),
         )
         for own in by_size.values()
     ]
-
-
-def _weights(views: Sequence[View], dtype) -> Array:
-    """What each pixel counts, of views of one size."""
-    if all(view.mask is None for view in views):
-        return jnp.ones((len(views), 1, 1, 1), dtype)
-    masks = [np.ones(view.picture.size, bool) if view.mask is None else view.mask.read() for view in views]
-    return jnp.asarray(np.stack(masks)[..., None], dtype)

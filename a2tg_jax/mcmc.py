@@ -26,8 +26,6 @@ from a2tg_jax.texture import bucket_capacity
 NOISE_SCALE = 5e5
 NOISE_STEEPNESS = 100.0
 NOISE_TRANSPARENCY = 0.995
-GROWTH_ENDS = 5 / 6
-"""Of a stage: the paper's iteration 25,000 of 30,000."""
 
 
 class MoveInfo(NamedTuple):
@@ -255,7 +253,7 @@ def _check_moments(gaussians: Gaussians, moments) -> None:
             raise ValueError(f"every leaf of moments must have {gaussians.num} rows; got shape {leaf.shape}")
 
 
-def densify_times(num_iterations: int, last: float = GROWTH_ENDS) -> Times:
+def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
     """When densification happens: the paper's 500, 25,000 and every 100 of 30,000 iterations, scaled."""
     every = max(10, round(num_iterations / 300))
     return Times(round(num_iterations / 60), int(last * num_iterations + 1e-9), every)

@@ -1,7 +1,8 @@
 """Pruning: the Gaussians that show least go, so that their bytes are spent where they show.
 
-What a Gaussian shows is the sum of its blending weights w = α·T over all pixels of the training views: how much of the
-pictures is its colour. Many that densification leaves are hidden, or too faint to matter.
+What a Gaussian shows is the sum of its blending weights w = α·T over the pixels of the training views that count: how
+much of the pictures is its colour. Many that densification leaves are hidden, or too faint to matter. This event
+renders, where others take statistics of the steps: a weight is no gradient of the loss.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from jax import Array
 from a2tg_jax.appearance import Banded, GivenColors
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
+from a2tg_jax.data import View, counted_pixels
 from a2tg_jax.events import Change, Due, HostEvent, event, gather_moments, gather_rows, static
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
@@ -25,12 +27,15 @@ from a2tg_jax.render import RenderSettings, plan_render, render_traced
 
 @event
 class Prune(HostEvent):
-    """Removes those Gaussians whose blending weights, summed over the training views, are least."""
+    """Removes those Gaussians whose blending weights, summed over the training views, are least.
+
+    The views are seen from the cameras that the scene gives, not from refined ones.
+    """
 
     share: float = 0.1
-    """Of the Gaussians, removed each time."""
+    """Of the Gaussians, in [0, 1), removed each time; not used where `keep` is given."""
     keep: int | None = static(default=None)
-    """How many are left instead."""
+    """How many are left each time, at most."""
     at: tuple[float, ...] = static(default=(1.0,))
     """Fractions of the stage at which it happens; 1: at its end."""
 
@@ -39,55 +44,74 @@ class Prune(HostEvent):
             raise ValueError(f"at must be ascending fractions above 0, up to 1; got {self.at}")
         return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in self.at))
 
-    def num_left(self, num: int, num_iterations: int) -> int:
+    def num_after(self, num: int, num_iterations: int) -> int:
         return num if self.keep is None else min(num, self.keep)
 
     def num_programs(self, num_iterations: int) -> int:
-        return 1
+        return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         if isinstance(model.appearance, Banded):
             raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
-        num = model.num
-        left = num - round(num * float(self.share)) if self.keep is None else min(num, self.keep)
-        order = np.argsort(-blending_weights(model, due.cameras)[:num], kind="stable")
+        num, left = model.num, self._num_left(model.num)
+        order = np.argsort(-blending_weights(model, due.views)[:num], kind="stable")
         rows = np.arange(model.gaussians.num)
         rows[:num] = np.concatenate([np.sort(order[:left]), np.sort(order[left:])])
         moments = gather_moments(model, moments, jnp.asarray(rows))
         model = dataclasses.replace(gather_rows(model, jnp.asarray(rows)), num_live=jnp.asarray(left, jnp.int32))
         return Change(model, moments, state, rows=rows)
 
+    def _num_left(self, num: int) -> int:
+        if self.keep is not None:
+            if self.keep < 1:
+                raise ValueError(f"keep must be at least 1 Gaussian; got {self.keep}")
+            return min(num, self.keep)
+        if not 0 <= self.share < 1:
+            raise ValueError(f"share must lie in [0, 1); got {self.share}")
+        return num - round(num * float(self.share))
 
-def blending_weights(model: Model, cameras: Sequence[Camera]) -> np.ndarray:
-    """[N] sum of Σ α·T over the pixels of all views, of each Gaussian; in pixels (host).
+
+def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
+    """[N] Σ α·T of each Gaussian over the pixels of all views that count, in pixels (host).
+
+    Args:
+      model: N rows; those that do not exist have weight 0.
+      views: at least one; their photographs are not looked at, their masks are.
 
     Raises:
       ValueError: if there is no view.
     """
-    if not cameras:
-        raise ValueError("cameras must hold at least one view; got none")
-    dtype = model.gaussians.means.dtype
-    settings = plan_render(model.gaussians, cameras, rule=model.rule)
-    by_size: dict[tuple[int, int], list[Camera]] = {}
-    for camera in cameras:
-        by_size.setdefault((camera.width, camera.height), []).append(camera)
+    if not views:
+        raise ValueError("views must hold at least one view; got none")
     total = np.zeros(model.gaussians.num)
+    if not len(total):
+        return total
+    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    # Programs are compiled for a capacity: for few of them.
+    settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
+    by_size: dict[tuple[int, ...], list[View]] = {}
+    for view in views:
+        by_size.setdefault(view.picture.size, []).append(view)
+    dtype = model.gaussians.means.dtype
     for own in by_size.values():
-        stacked: Any = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, dtype) for leaf in leaves]), *own)
-        total += np.asarray(_jitted()(model, stacked, settings), np.float64)
+        cameras = [jax.tree.map(lambda leaf: np.asarray(leaf, dtype), view.camera) for view in own]
+        stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *cameras)
+        total += np.asarray(_jitted()(model, stacked, jnp.asarray(counted_pixels(own), dtype), settings), np.float64)
     return total
 
 
 @functools.cache
 def _jitted() -> jit:
-    return jit(_weights, static_argnums=(2,))
+    return jit(_weights, static_argnums=(3,))
 
 
-def _weights(model: Model, cameras: Camera, settings: RenderSettings) -> Array:
+def _weights(model: Model, cameras: Camera, counted: Array, settings: RenderSettings) -> Array:
     """The sums over views of one size: a picture is linear in the colours, and this is the backward pass of ones."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
-    def of_view(total: Array, camera: Camera) -> tuple[Array, None]:
+    def of_view(total: Array, view: tuple[Camera, Array]) -> tuple[Array, None]:
+        camera, weight = view
+
         def draw(colors: Array) -> Array:
             rule = GivenColors(model.rule, colors)
             output, _ = render_traced(
@@ -97,7 +121,7 @@ def _weights(model: Model, cameras: Camera, settings: RenderSettings) -> Array:
             return output.color
 
         color, back = jax.vjp(draw, nothing)
-        (weights,) = back(jnp.ones_like(color))
+        (weights,) = back(jnp.broadcast_to(weight, color.shape))
         return total + weights[:, 0], None
 
-    return jax.lax.scan(of_view, nothing[:, 0], cameras)[0]
+    return jax.lax.scan(of_view, nothing[:, 0], (cameras, counted))[0]

@@ -18,7 +18,7 @@ from a2tg_jax.appearance import Textured
 from a2tg_jax.budget import bytes_per_gaussian, megabytes_of, number_to_reach
 from a2tg_jax.densify import FillingDensity
 from a2tg_jax.events import Due, Now, Times
-from a2tg_jax.gaussians import floats_per_gaussian, init_from_points, logit
+from a2tg_jax.gaussians import init_from_points, logit
 from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
@@ -153,9 +153,7 @@ def test_caps_use_up_every_budget(name):
     for budget, sh_degree in itertools.product(np.exp(rng.uniform(-4, 6, 50)), range(4)):
         degree = "base_degree" if name == "bytewise" else "sh_degree"
         system = dataclasses.replace(a2tg.find_system(name), memory_budget=float(budget), **{degree: sh_degree})
-        # Bytewise leaves 15 % of the bytes to degrees and textures.
-        more = floats_per_gaussian(sh_degree) * 0.15 / 0.85 if name == "bytewise" else floats.get(name, 0)
-        needed = bytes_per_gaussian(sh_degree, more)
+        needed = bytes_per_gaussian(sh_degree, floats.get(name, 0))
         assert needed * filling(system).cap <= system.budget_bytes < needed * (filling(system).cap + 1)
 
 

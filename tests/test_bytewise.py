@@ -55,7 +55,7 @@ def test_without_a_budget_the_cap_says_how_many_bytes():
     degrees, textures = system.stages()[1].events
     assert isinstance(degrees, AdaptDegrees) and isinstance(textures, Upscale)
     assert textures.budget_mb == pytest.approx(52e-6 * system.densify.cap)
-    assert degrees.budget_mb == pytest.approx(0.95 * textures.budget_mb)
+    assert degrees.budget_mb == pytest.approx((1 - system.texture.share) * textures.budget_mb)
 
 
 def test_beside_another_system_it_stays_what_it_is():
@@ -79,9 +79,12 @@ def test_beside_another_system_it_stays_what_it_is():
         ({"base_degree": 3}, "view_dependence.share must be 0 where all Gaussians have the highest degree, 3"),
         ({"texture": {"at": [0.5, 0.2]}}, "texture.at must be ascending"),
         ({"texture": {"at": []}}, "texture.at must say when"),
+        ({"prune": {"share": 1.0}}, "prune.share must lie in 0..0.9; got 1.0"),
+        ({"prune": {"at": [0.5, 0.83]}}, "prune.at must hold fractions up to 0.8, .* lower the last"),
+        ({"prune": {"at": []}}, "prune.at must hold fractions"),
         ({"view_dependence": {"at": [0.5]}}, "view_dependence.at must be over when textures begin"),
         ({"memory_budget": None, "densify": {"cap": 2}}, "densify.cap must leave room for 2 Gaussians"),
-        ({"memory_budget": "0.06kB"}, "has room for 0 Gaussians"),
+        ({"memory_budget": "0.05kB"}, "has room for 0 Gaussians"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_by_name(changes, message):

@@ -30,13 +30,14 @@ LAYERS = (
     {"io", "renderer", "gradients"},
     {"events"},
     {"adapt", "mcmc", "densify", "view_dependence", "corrections"},
-    {"splitting"},
+    {"splitting", "pruning"},
     {"least_squares", "alignment"},
     {"training"},
     {"systems", "evaluation", "compaction", "web"},
     {"shrinking"},
     {"results"},
     {"cli_view"},
+    {"cli_train"},
     {"cli"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""

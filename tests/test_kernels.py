@@ -8,15 +8,17 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import AppearanceRule, PlainRule, gaussian_cutoff
+from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, gaussian_cutoff, textured_rule
 from a2tg_jax.bilinear import TextureRegion
 from a2tg_jax.geometry import homographies
 from a2tg_jax.kernels import native, threads
 from a2tg_jax.render import appearance_of, render_traced
+from a2tg_jax.texture import texture_arrays, textures_from_arrays
 from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
 
 
@@ -162,6 +164,43 @@ def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
     assert expected.alpha.max() > 0.5 and wanted[2][:, 3].max() > 10
     for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("options", [TextureOptions(), TextureOptions("align-corners", "identity", "unit")])
+@pytest.mark.parametrize("compositor", ["native", "xla", "pallas"])
+def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
+    """As one with a texel that changes nothing: the oracle's image, and the same gradients of all else."""
+    scene = draw_scene(4, num=16, width=19, height=13)
+    is_empty = np.arange(16) % 3 == 0
+    pairs = zip(is_empty, scene.textures, strict=True)
+    neutral = [np.array([[[0.0, 0.0, 0.0, 1.0]]]) if none else texture for none, texture in pairs]
+    empty = [np.zeros((0, 0, 4)) if none else texture for none, texture in zip(is_empty, neutral, strict=True)]
+    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    settings = RenderSettings(compositor=compositor, capacity=1024)
+
+    def loss(gaussians, textures, probe, layout):
+        rule = textured_rule(textures, layout, options)
+        background = jnp.asarray(scene.background)
+        output, _ = render_traced(gaussians, camera, rule, background, settings, probe=probe)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth), output.color
+
+    def differentiate(textures):
+        textures, layout = textures_from_arrays([jnp.asarray(texture) for texture in textures])
+        found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True))
+        (_, color), grads = found(gaussians, textures, jnp.zeros((16, 4)), layout)
+        return color, grads[0], texture_arrays(grads[1], layout), grads[2]
+
+    wanted, found = differentiate(neutral), differentiate(empty)
+    # A neutral texel has a gradient, what is empty has none.
+    for arrays in (wanted[2], found[2]):
+        arrays[:] = [array for none, array in zip(is_empty, arrays, strict=True) if not none]
+    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-10, atol=1e-12 * float(jnp.abs(a).max()))
+    if options == TextureOptions():
+        expected = oracle.render(scene._replace(textures=neutral))
+        assert expected.margin.min() > 1e-9
+        np.testing.assert_allclose(found[0], expected.color, atol=1e-9)
 
 
 @pytest.mark.usefixtures("x64")

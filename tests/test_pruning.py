@@ -7,17 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from bits import bits_of
+from kept_checkpoints import fit_keeping_checkpoints
 from scenes_random import as_camera, as_gaussians, draw_scene
 from test_splitting import some_state
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
+from a2tg_jax.data import View
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
 from a2tg_jax.optim import adam_init
 from a2tg_jax.pruning import Prune, blending_weights
 from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.bytewise import PruneConfig
+from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.start import initial_model
 
 
 @pytest.mark.usefixtures("x64")
@@ -26,9 +31,15 @@ def test_weights_are_those_of_the_oracle(seed):
     scene = draw_scene(seed)._replace(textures=None)
     expected = oracle.render(scene).weights.sum(axis=(1, 2))
     model = Model(as_gaussians(scene, "float64"))
-    once = blending_weights(model, [as_camera(scene, "float64")])
+    camera = as_camera(scene, "float64")
+    once = blending_weights(model, [seen_from(camera)])
     np.testing.assert_allclose(once, expected, rtol=1e-9, atol=1e-9)
     assert (expected > 1).sum() > 3
+    # Pixels that a mask leaves out do not count, in one view of two.
+    mask = np.random.default_rng(seed).random((scene.height, scene.width)) < 0.5
+    masked = blending_weights(model, [seen_from(camera, mask), seen_from(camera)])
+    shown = (oracle.render(scene).weights * mask).sum(axis=(1, 2))
+    np.testing.assert_allclose(masked, shown + expected, rtol=1e-9, atol=1e-9)
 
 
 def test_weights_are_summed_over_views_of_any_size():
@@ -36,39 +47,48 @@ def test_weights_are_summed_over_views_of_any_size():
         Model(some_state()[0].gaussians),
         a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera,
     )
-    small = dataclasses.replace(camera, width=20, height=10)
-    parts = [blending_weights(model, [one]) for one in (camera, small, camera)]
-    np.testing.assert_allclose(blending_weights(model, [camera, small, camera]), sum(parts), rtol=1e-6)
+    views = [seen_from(one) for one in (camera, dataclasses.replace(camera, width=20, height=10), camera)]
+    parts = [blending_weights(model, [view]) for view in views]
+    np.testing.assert_allclose(blending_weights(model, views), sum(parts), rtol=1e-6)
     with pytest.raises(ValueError, match="at least one view"):
         blending_weights(model, [])
+    assert blending_weights(Model(model.gaussians[:0]), views).shape == (0,)
+
+
+def seen_from(camera, mask=None) -> View:
+    """A view whose photograph does not matter."""
+    return View("black.png", camera, np.zeros((camera.height, camera.width, 3), np.uint8), mask)
 
 
 def pruned(event: Prune):
-    """What an event makes of a model with rows to spare, whose moments and statistics are the rows' numbers."""
+    """What an event makes of a model with rows to spare, whose moments are the rows' numbers."""
     model, _, statistics = some_state()
     camera = a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
     moments = adam_init((model.gaussians, model.params))
     numbers = jnp.arange(model.gaussians.num, dtype=jnp.float32)
     by_row = lambda x: jnp.broadcast_to(numbers.reshape(-1, *[1] * (x.ndim - 1)), x.shape)  # noqa: E731
-    moments = dataclasses.replace(moments, mu=jax.tree.map(by_row, moments.mu))
-    change = event.apply(Due(cameras=[camera]), model, moments, ())
+    mu, nu = jax.tree.map(by_row, moments.mu), jax.tree.map(lambda x: 2 * by_row(x), moments.nu)
+    moments = dataclasses.replace(moments, mu=mu, nu=nu)
+    change = event.apply(Due(views=[seen_from(camera)]), model, moments, ())
     return model, camera, statistics, change
 
 
-def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along():
-    model, camera, statistics, change = pruned(Prune(share=0.25))
-    weights = blending_weights(model, [camera])
+@pytest.mark.parametrize("share", [0.8, 0.9])
+def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along(share):
+    model, camera, statistics, change = pruned(Prune(share=share))
+    weights = blending_weights(model, [seen_from(camera)])
     left = int(change.model.num_live)
-    assert left == model.num - round(0.25 * model.num)
+    assert left == model.num - round(share * model.num)
     kept, gone = change.rows[:left], change.rows[left : model.num]
-    assert weights[kept].min() >= weights[gone].max()
+    assert weights[kept].min() >= weights[gone].max() > 0
+    np.testing.assert_array_equal(change.rows[model.num :], np.arange(model.num, model.gaussians.num))
     assert (np.diff(kept) > 0).all()
     assert sorted(change.rows) == list(range(model.gaussians.num))
     for name in ("means", "sh", "logit_opacities"):
         old, new = (np.asarray(getattr(one.gaussians, name)) for one in (model, change.model))
         np.testing.assert_array_equal(new, old[change.rows])
-    gaussians, _ = change.moments.mu
-    np.testing.assert_array_equal(gaussians.quats[:, 0], change.rows)
+    np.testing.assert_array_equal(change.moments.mu[0].quats[:, 0], change.rows)
+    np.testing.assert_array_equal(change.moments.nu[0].means[:, 2], 2 * change.rows)
     moved = SplitByGradient(400).gather(statistics, change.rows)
     np.testing.assert_array_equal(moved.total, np.asarray(statistics.total)[change.rows])
 
@@ -82,7 +102,7 @@ def test_so_many_are_kept_as_were_asked_for():
 def test_degrees_stay_with_their_gaussians():
     model, _, camera = banded(0)
     with pytest.raises(ValueError, match="prune before"):
-        Prune().apply(Due(cameras=[camera]), model, adam_init((model.gaussians, model.params)), ())
+        Prune().apply(Due(views=[seen_from(camera)]), model, adam_init((model.gaussians, model.params)), ())
 
 
 @pytest.mark.parametrize("at", [(0.5, 0.2), (0.0,), (0.5, 1.1)])
@@ -92,19 +112,62 @@ def test_times_must_exist(at):
     assert Prune(at=(0.5, 1.0)).iterations(100) == (50, 100)
 
 
-def test_others_grow_where_some_were_pruned():
-    """Up to the cap again, within the bytes, and down to what is kept at the end."""
-    scene = a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=120)
-    system = dataclasses.replace(
-        a2tg.Bytewise.preset("smoke"),
-        stage1_iterations=200,
-        stage2_iterations=10,
-        memory_budget="30kB",
-        initial_gaussians=None,
-        prune=PruneConfig(share=0.4),
-    )
-    result = a2tg.fit(scene, system, progress=False)
+@pytest.mark.parametrize(
+    "event, message",
+    [(Prune(share=1.0), r"share must lie in \[0, 1\); got 1.0"), (Prune(share=-0.1), "share"), (Prune(keep=0), "keep")],
+)
+def test_more_than_there_are_cannot_go(event, message):
+    with pytest.raises(ValueError, match=message):
+        pruned(event)
+
+
+def test_what_has_no_row_for_each_gaussian_does_not_move_by_itself():
+    with pytest.raises(ValueError, match=r"SplitByGradient has gathered an array \[3\], .* override gather"):
+        SplitByGradient(10).gather(jnp.arange(3.0), np.arange(5))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=120)
+
+
+SYSTEM = dataclasses.replace(
+    a2tg.Bytewise.preset("smoke"),
+    stage1_iterations=200,
+    stage2_iterations=10,
+    memory_budget="30kB",
+    initial_gaussians=None,
+    prune=PruneConfig(share=0.4),
+)
+
+
+def test_others_grow_where_some_were_pruned(scene):
+    """Up to the cap again, within the bytes, and down to what is kept at the end; after a checkpoint, too."""
+    result, checkpoints = fit_keeping_checkpoints(scene, SYSTEM, every=70)
     numbers = result.stages[0].history.num_gaussians
     assert (np.diff(numbers) < 0).any() and numbers.max() == 30_000 // 52
     assert result.history.megabytes.max() <= 0.03
-    assert result.stages[0].model.num < numbers.max()
+    assert result.stages[0].model.num == 30_000 * 3 // 4 // 52
+    assert 0.995 * 30_000 <= result.model.num_bytes <= 30_000
+    assert [int(one.state.iteration) for one in checkpoints[:2]] == [70, 140]
+    again = a2tg.fit(scene, SYSTEM, resume=checkpoints[1], progress=False)
+    assert bits_of(again.model) == bits_of(result.model)
+
+
+def test_what_other_events_have_gathered_follows(scene):
+    run = StageRun(scene, SYSTEM, 0, initial_model(scene, SYSTEM))
+    first = SYSTEM.stages()[0].events[2].iterations(200)[0]
+    run.steps(1, first)
+    totals = {tuple(mean): total for mean, total in zip(*gathered(run), strict=True)}
+    assert len(set(totals.values())) > 20
+    num = run.model.num
+    run._host_events(first)
+    assert run.model.num < num
+    means, moved = gathered(run)
+    assert [totals[tuple(mean)] for mean in means] == list(moved)
+
+
+def gathered(run: StageRun) -> tuple[np.ndarray, np.ndarray]:
+    """Where the Gaussians are, and what was gathered of each."""
+    num = run.model.num
+    return np.asarray(run.state.model.gaussians.means)[:num], np.asarray(run.state.events[1].total)[:num]

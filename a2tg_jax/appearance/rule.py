@@ -40,6 +40,9 @@ class AppearanceRule:
     """Static. The low-pass filter of 2DGS shows splats that are smaller than a pixel, or seen edge-on. Without it, ρ is
     u² + v² where the pixel's ray meets the splat, and nothing shows where it does not."""
 
+    empty: tuple[float, ...] = ()
+    """Static. The C values of a splat without a texture, whose region has no texels; () where all splats have one."""
+
     texels: Array
     """[T, C] the texels of all splats, differentiable; T >= 1, and C >= 1 where there are textures."""
     regions: TextureRegion | None
@@ -116,6 +119,10 @@ class RuleAround(AppearanceRule):
     @property
     def has_low_pass(self) -> bool:  # type: ignore[override]
         return self.inner.has_low_pass
+
+    @property
+    def empty(self) -> tuple[float, ...]:  # type: ignore[override]
+        return self.inner.empty
 
     @property
     def texels(self) -> Array:  # type: ignore[override]

@@ -62,6 +62,8 @@ class TexturedRule(AppearanceRule):
     """[N] the largest alpha factor of each splat; bounds only, without gradient."""
     options: TextureOptions = dataclasses.field(metadata={"static": True})
 
+    empty = NEUTRAL_TEXEL
+
     @property
     def max_alpha(self) -> float:  # type: ignore[override]
         return self.options.max_alpha
@@ -87,9 +89,9 @@ class TexturedRule(AppearanceRule):
 def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedRule:
     """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels.
 
-    An empty texture is shown as one texel that changes nothing, of which nothing is trained.
+    An empty texture changes nothing: it has a region of no texels.
     """
-    textures = _without_empty(shown_textures(textures, layout, options))
+    textures = shown_textures(textures, layout, options)
     resolutions = [bucket.shape[1:3] for bucket in textures.buckets]
     areas = [height * width for height, width in resolutions]
     capacities = [bucket.shape[0] for bucket in textures.buckets]
@@ -99,9 +101,10 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
     peaks = jnp.stack([_padded_peaks(bucket, max(capacities)) for bucket in textures.buckets])
     peaks = jax.lax.stop_gradient(peaks[layout.bucket, layout.row])
     offsets = bucket_starts[layout.bucket] + layout.row * bucket_areas[layout.bucket]
-    texels = jnp.concatenate([bucket.reshape(-1, 4) for bucket in textures.buckets])
+    texels = [bucket.reshape(-1, 4) for bucket in textures.buckets if bucket.size]
+    none = jnp.asarray([NEUTRAL_TEXEL], textures.buckets[0].dtype)
     return TexturedRule(
-        texels=texels,
+        texels=jnp.concatenate(texels or [none]),
         regions=TextureRegion(offsets, sizes[:, 0], sizes[:, 1]),
         peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
         options=options,
@@ -123,17 +126,6 @@ def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOpti
     return jax.tree.map(shown, textures)
 
 
-def _without_empty(textures: Textures) -> Textures:
-    """The textures with a neutral texel in place of each empty one."""
-
-    def filled(bucket: Array) -> Array:
-        if bucket.size or not bucket.shape[0]:
-            return bucket
-        return jnp.broadcast_to(jnp.asarray(NEUTRAL_TEXEL, bucket.dtype), (bucket.shape[0], 1, 1, 4))
-
-    return Textures(tuple(map(filled, textures.buckets)))
-
-
 def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
     """The largest alpha of all texels, buckets' padding left out; where several are, they share its gradient. 1 where
     all textures are empty."""
@@ -146,7 +138,9 @@ def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
 
 
 def _padded_peaks(bucket: Array, length: int) -> Array:
-    """[length] largest alpha of each texture of a bucket, zeros past its capacity."""
+    """[length] largest alpha of each texture of a bucket, 1 of empty ones, zeros past its capacity."""
+    if not bucket.size:
+        return jnp.ones(length, bucket.dtype)
     peaks = jnp.max(bucket[..., 3], axis=(1, 2))
     return jnp.pad(peaks, (0, length - peaks.shape[0]))
 

@@ -96,6 +96,14 @@ class PointCloud:
     """[P, 3] uint8."""
 
 
+def counted_pixels(views: Sequence[View]) -> np.ndarray:
+    """[V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] where all of them do."""
+    if all(view.mask is None for view in views):
+        return np.ones((len(views), 1, 1, 1), bool)
+    masks = [np.ones(view.picture.size, bool) if view.mask is None else view.mask.read() for view in views]
+    return np.stack(masks)[..., None]
+
+
 def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
     """The view's image as floats, over a background where it is transparent.
 

@@ -80,6 +80,7 @@ class _Compositing(TexelWriter):
     def __init__(self, spec: KernelSpec, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
         super().__init__(module, name, buffers, INTEGERS, spec.dtype)
         self.spec, self.functions, self.num_columns = spec, functions, spec.num_columns
+        self.empty = spec.rule.rule.empty
         self.lanes, self.scalars = Lanes(self.b, spec.lanes), Lanes(self.b, 1)
         self.reals = self.lanes.vector(self.real)
         self.integers = self.lanes.vector(INT)

@@ -80,7 +80,8 @@ def _look_up(
     region = TextureRegion(*(regions[id_, k] for k in range(len(TextureRegion._fields))))
     corners = bilinear.corners_of(region, *rule.texel_position(region, hit.u, hit.v))
     at_corners = tuple(tuple(texels[corner.texel, column] for column in range(texels.shape[1])) for corner in corners)
-    return Lookup(region, bilinear.interpolate(corners, at_corners), corners)
+    sample = bilinear.or_empty(bilinear.interpolate(corners, at_corners), region, rule.empty)
+    return Lookup(region, sample, corners)
 
 
 def _is_unfinished(tile: _Tile, carry) -> Array:
@@ -179,8 +180,9 @@ def _add_texels(d_texels, lookup: Lookup, d_values: list[Array]) -> None:
             for column, d_value in enumerate(d_values):
                 _add_all(d_texels, corner.texel, column, corner.weight * d_value)
 
-    # All pixels would add to one and the same texel, one after the other.
-    jax.lax.cond(lookup.region.height * lookup.region.width == 1, add_sums, add_each)
+    area = lookup.region.height * lookup.region.width
+    # All pixels would add to one and the same texel, one after the other; where there is none, to a stranger's.
+    jax.lax.cond(area == 1, add_sums, lambda: jax.lax.cond(area == 0, lambda: None, add_each))
 
 
 def _add_all(total, rows: Array, column: int, numbers: Array) -> None:

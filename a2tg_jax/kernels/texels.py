@@ -15,6 +15,8 @@ from llvmlite import ir
 from a2tg_jax.kernels.lanes import INT, Lanes
 from a2tg_jax.kernels.writer import LONG, Writer
 
+EMPTY = 0
+"""The width of a texture without texels."""
 SMALL_WIDTHS = (1, 2, 4)
 """Textures of these widths, and up to the largest of them high, are small."""
 SMALL_HEIGHT = max(SMALL_WIDTHS)
@@ -56,6 +58,8 @@ class TexelWriter(Writer):
     lanes: Lanes
     reals: ir.Type
     num_columns: int
+    empty: Sequence[float]
+    """The C values of a splat without a texture; none where all splats have one."""
     sums: ir.Value
     """Cotangents of the texels of a small texture per lane, `num_sums` vectors; zero before a splat."""
 
@@ -74,6 +78,10 @@ class TexelWriter(Writer):
         num_slopes = count if has_slopes else 0
         values, along_x, along_y = (self.zeros(num) for num in (count, num_slopes, num_slopes))
         for width in self.cases(texture):
+            if width == EMPTY:
+                for none, value in zip(self.empty, values, strict=True):
+                    self.b.store(self.lanes.constant(none, self.real), value)
+                continue
             with self.rows(texture, width, place, has_slopes) as row:
                 in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
 
@@ -93,6 +101,8 @@ class TexelWriter(Writer):
     def add_to_texels(self, texture: NativeTexture, place: Place, d_values: Sequence[ir.Value]) -> None:
         """Adds the cotangents of C values, which are zero in lanes that do not count; `finish_texels` completes it."""
         for width in self.cases(texture):
+            if width == EMPTY:
+                continue
             with self.rows(texture, width, place, False) as row:
                 in_row = [self.product(row.weight, d_value) for d_value in d_values]
 
@@ -122,18 +132,23 @@ class TexelWriter(Writer):
             self.add_sums(self.entry(texture, place), addends)
 
     def small_width(self, texture: NativeTexture) -> ir.Value:
-        """The width of a small texture; 0 for a large one."""
+        """The width of a small texture; −1 for a large one."""
         b = self.b
-        is_width = [b.icmp_signed("==", texture.width, LONG(width)) for width in SMALL_WIDTHS]
+        is_width = [b.icmp_signed("==", texture.width, LONG(width)) for width in self.small_widths]
         is_low = b.icmp_signed("<=", texture.height, LONG(SMALL_HEIGHT))
-        return b.select(b.and_(is_low, functools.reduce(b.or_, is_width)), texture.width, LONG(0))
+        return b.select(b.and_(is_low, functools.reduce(b.or_, is_width)), texture.width, LONG(-1))
+
+    @property
+    def small_widths(self) -> tuple[int, ...]:
+        return (EMPTY, *SMALL_WIDTHS) if self.empty else SMALL_WIDTHS
 
     def cases(self, texture: NativeTexture) -> Iterator[int | None]:
-        """Branches, which the caller fills: one per width of a small texture, and one (None) for all that are large."""
+        """Branches, which the caller fills: one per width of a small texture, which may be none, and one (None) for all
+        that are large."""
         b = self.b
         large, end = b.append_basic_block("large"), b.append_basic_block("end")
         switch = b.switch(self.small_width(texture), large)
-        for width in (*SMALL_WIDTHS, None):
+        for width in (*self.small_widths, None):
             block = large if width is None else b.append_basic_block(f"width{width}")
             if width is not None:
                 switch.add_case(LONG(width), block)

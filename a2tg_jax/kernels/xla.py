@@ -203,7 +203,7 @@ def _look_up(rule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit)
     corners = bilinear.corners_of(region, *rule.texel_position(region, hit.u, hit.v))
     read = texels[jnp.stack([corner.texel for corner in corners])]
     sample = bilinear.interpolate(corners, tuple(tuple(jnp.moveaxis(texel, -1, 0)) for texel in read))
-    return Lookup(region, sample, corners)
+    return Lookup(region, bilinear.or_empty(sample, region, rule.empty), corners)
 
 
 def _show(settings: CompositingSettings, rule, splats: Splats, hit: pixel.Hit, values, at, tile: _Tile, rho_probe=None):

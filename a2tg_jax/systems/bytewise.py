@@ -8,8 +8,7 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured, TextureOptions
 from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.events import Event, iterations_at
-from a2tg_jax.gaussians import floats_per_gaussian
-from a2tg_jax.mcmc import GROWTH_ENDS, Noise, densify_times
+from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.pruning import Prune
 from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
@@ -19,6 +18,8 @@ from a2tg_jax.training.stage import Stage
 from a2tg_jax.view_dependence import AdaptDegrees
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
+LAST_PRUNING = 0.8
+"""Of the first stage, in which growth ends at 5/6."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +35,9 @@ class PruneConfig:
     """Gaussians that show least, which go while others grow in their place."""
 
     share: float = 0.1
-    """Of the Gaussians, each time; 0: none."""
+    """Of the Gaussians, each time; 0: none before the end of the stage."""
     at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-    """Fractions of the first stage, before growth ends at 5/6 of it."""
+    """Fractions of the first stage, up to 0.8. In short stages, those after the last growth are left out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,12 +98,11 @@ class Bytewise(System):
 
     def _growth(self) -> tuple[Event, ...]:
         """Gaussians that fill all bytes. Those that show least go while others grow, and in the end for the details."""
-        grow = SplitByGradient(self._num_gaussians(0.0))
-        # In a short stage the last growth may come too early for the last of them.
+        grow = SplitByGradient(self._num_gaussians())
         num, last_growth = self.stage1_iterations, densify_times(self.stage1_iterations).last_time
         at = tuple(fraction for fraction in self.prune.at if round(fraction * num) < last_growth)
         prune = (Prune(self.prune.share, at=at),) if self.prune.share and at else ()
-        last = (Prune(keep=self._num_gaussians(self._share)),) if self._share else ()
+        last = (Prune(keep=self._num_kept()),) if self._share else ()
         return Noise(), grow, *prune, *last
 
     @property
@@ -110,10 +110,14 @@ class Bytewise(System):
         """Of the bytes, for degrees and texels."""
         return self.view_dependence.share + self.texture.share
 
-    def _num_gaussians(self, share: float) -> int:
-        """As many as there is room for beside such a share of the bytes."""
-        num = self.budget_cap(floats_per_gaussian(self.base_degree) * share / (1 - share))
-        return math.floor(self.densify.cap * (1 - share)) if num is None else num
+    def _num_gaussians(self) -> int:
+        """As many as fill all bytes."""
+        num = self.budget_cap()
+        return self.densify.cap if num is None else num
+
+    def _num_kept(self) -> int:
+        """As many as there is room for beside degrees and texels."""
+        return math.floor(self._num_bytes() * (1 - self._share) / bytes_per_gaussian(self.base_degree))
 
     def _num_bytes(self) -> int:
         """Of all that there is in the end."""
@@ -152,7 +156,7 @@ class Bytewise(System):
         view, texture = self.view_dependence, self.texture
         ranges = {
             "base_degree": (self.base_degree, 0, self.sh_degree),
-            "prune.share": (self.prune.share, 0, 0.5),
+            "prune.share": (self.prune.share, 0, 0.9),
             "view_dependence.share": (view.share, 0, 1),
             "view_dependence.rate": (view.rate, 0, math.inf),
             "view_dependence.idle": (view.idle, 0, math.inf),
@@ -174,23 +178,28 @@ class Bytewise(System):
                 f"already: set it so, or lower base_degree; got {view.share}"
             )
         self._check_times()
-        if self._num_gaussians(self._share) < 2:
-            raise ValueError(f"densify.cap must leave room for 2 Gaussians; got {self.densify.cap}")
+        if self._num_gaussians() < 2 or self._num_kept() < 2:
+            raise ValueError(
+                "densify.cap, or memory_budget, must leave room for 2 Gaussians beside degrees and textures; got "
+                f"{self.densify.cap:,} and {self.memory_budget}"
+            )
         super().check()
 
     def _check_times(self) -> None:
         """Refuses times that do not exist, after which nothing grows, or at which textures have taken the bytes."""
         view, texture = self.view_dependence, self.texture
-        iterations_at(self.prune.at, self.stage1_iterations, "prune.at")
-        if self.prune.share and max(self.prune.at, default=0) > GROWTH_ENDS:
-            raise ValueError(
-                f"prune.at must be over when growth ends, at {GROWTH_ENDS:.3f} of the first stage; got {self.prune.at}"
-            )
         asked = {"view_dependence.at": (view.share, view.at), "texture.at": (texture.share, texture.at)}
         times = {name: iterations_at(at, self.stage2_iterations, name) for name, (share, at) in asked.items() if share}
         for name, found in times.items():
             if not found:
                 raise ValueError(f"{name} must say when its share of the bytes is spent; it is empty")
+        if self.prune.share:
+            iterations_at(self.prune.at, self.stage1_iterations, "prune.at")
+            if not self.prune.at or self.prune.at[-1] > LAST_PRUNING:
+                raise ValueError(
+                    f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
+                    f"what is pruned; got {self.prune.at}: lower the last, or set prune.share to 0"
+                )
         if len(times) == 2 and times["view_dependence.at"][-1] > times["texture.at"][0]:
             raise ValueError(
                 "view_dependence.at must be over when textures begin to take the rest of the bytes, at "

@@ -73,7 +73,7 @@ class StageForecast:
     bytes: Bytes
     """At its peak."""
     model_bytes: float
-    """Of the model that it leaves."""
+    """Of the model at its largest."""
     num_rows: int
     """Gaussians that it can reach."""
     num_programs: int
@@ -98,7 +98,7 @@ def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
         seconds = stage.iterations * system.batch_size * _seconds(scene.train, num)
         yield StageForecast(stage_bytes(scene, system, stage, num, model_bytes), model_bytes, num, programs, seconds)
         for event in stage.events:
-            num = event.num_left(num, stage.iterations)
+            num = event.num_after(num, stage.iterations)
 
 
 def floats_shown(stage: Stage, system: System) -> float:

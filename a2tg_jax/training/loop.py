@@ -274,7 +274,7 @@ class StageRun:
                 due = event.iterations(self.stage.iterations)
                 if iteration not in due:
                     continue
-                told = Due(due.index(iteration) + 1, len(due), [view.camera for view in self.views])
+                told = Due(due.index(iteration) + 1, len(due), self.views)
                 change = event.apply(told, self.state.model, self.state.moments, state)
                 self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
                 if change.rows is not None:

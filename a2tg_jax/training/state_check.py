@@ -26,7 +26,10 @@ def find_stage(system: System, index: Any) -> Stage:
 def check_is_ahead(is_ahead: Any, stage: Stage) -> Sequence[bool]:
     """A header's list of the events that are still ahead. ValueError: it is none of this stage."""
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
-        raise ValueError(f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}")
+        raise ValueError(
+            f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}. Where an older "
+            "version made the checkpoint, whose stages had other events, train anew"
+        )
     return is_ahead
 
 
