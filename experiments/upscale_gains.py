@@ -32,7 +32,8 @@ from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.losses import photometric_loss
 from a2tg_jax.model import Model
 from a2tg_jax.render import plan_render, render_traced
-from a2tg_jax.systems.stage1 import QUICK_TEXELS, later_stage
+from a2tg_jax.systems.bytewise import DetailTextureConfig
+from a2tg_jax.systems.stage1 import later_stage
 from a2tg_jax.training import Stage, fit_stage
 
 ITERATIONS = 300
@@ -79,7 +80,7 @@ class Trial(a2tg.System):
     def stages(self) -> tuple[Stage, ...]:
         if self.rows is None:
             return (later_stage(self, "trial", Plain(), (), ITERATIONS),)
-        rates = TexelRates(QUICK_TEXELS, 0.0)
+        rates = TexelRates(DetailTextureConfig().rate, 0.0)
         return (later_stage(self, "trial", Textured((0, 0)), (GrowRows(self.rows),), ITERATIONS, rates),)
 
 
