@@ -85,6 +85,7 @@ def test_beside_another_system_it_stays_what_it_is():
         ({"view_dependence": {"at": [0.5]}}, "view_dependence.at must be over when textures begin"),
         ({"memory_budget": None, "densify": {"cap": 2}}, "densify.cap must leave room for 2 Gaussians"),
         ({"memory_budget": "0.05kB"}, "has room for 0 Gaussians"),
+        ({"memory_budget": "0.11kB"}, "memory_budget must leave room for 2 Gaussians beside degrees and textures"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_by_name(changes, message):

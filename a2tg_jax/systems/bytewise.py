@@ -179,10 +179,9 @@ class Bytewise(System):
             )
         self._check_times()
         if self._num_gaussians() < 2 or self._num_kept() < 2:
-            raise ValueError(
-                "densify.cap, or memory_budget, must leave room for 2 Gaussians beside degrees and textures; got "
-                f"{self.densify.cap:,} and {self.memory_budget}"
-            )
+            name = "densify.cap" if self.memory_budget is None else "memory_budget"
+            size = self.densify.cap if self.memory_budget is None else self.memory_budget
+            raise ValueError(f"{name} must leave room for 2 Gaussians beside degrees and textures; got {size}")
         super().check()
 
     def _check_times(self) -> None:
