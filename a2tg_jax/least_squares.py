@@ -19,7 +19,7 @@ from jax import Array
 from a2tg_jax.appearance import Banded, GivenColors, Plain, Textured
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
-from a2tg_jax.data import View, counted_pixels, view_image
+from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
 from a2tg_jax.model import Model
 from a2tg_jax.optim import solve_cg
 from a2tg_jax.render import RenderSettings, plan_render, render_traced
@@ -164,9 +164,6 @@ def _check(model: Model, views: Sequence[View]) -> None:
 def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
     """The views, one stack for each image size, in the dtype of the background."""
     color, dtype = np.asarray(background), background.dtype
-    by_size: dict[tuple[int, ...], list[View]] = {}
-    for view in views:
-        by_size.setdefault(view.picture.size, []).append(view)
     return [
         Photographs(
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
@@ -174,5 +171,5 @@ def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
             jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),
             jnp.asarray(counted_pixels(own), dtype),
         )
-        for own in by_size.values()
+        for own in views_by_size(views)
     ]

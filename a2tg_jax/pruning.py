@@ -18,7 +18,7 @@ from jax import Array
 from a2tg_jax.appearance import Banded, GivenColors
 from a2tg_jax.cameras import Camera
 from a2tg_jax.classes import jit
-from a2tg_jax.data import View, counted_pixels
+from a2tg_jax.data import View, counted_pixels, views_by_size
 from a2tg_jax.events import Change, Due, HostEvent, event, gather_moments, gather_rows, static
 from a2tg_jax.model import Model
 from a2tg_jax.optim import AdamState
@@ -89,11 +89,8 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
     settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
     # Programs are compiled for a capacity: for few of them.
     settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
-    by_size: dict[tuple[int, ...], list[View]] = {}
-    for view in views:
-        by_size.setdefault(view.picture.size, []).append(view)
     dtype = model.gaussians.means.dtype
-    for own in by_size.values():
+    for own in views_by_size(views):
         cameras = [jax.tree.map(lambda leaf: np.asarray(leaf, dtype), view.camera) for view in own]
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *cameras)
         total += np.asarray(_jitted()(model, stacked, jnp.asarray(counted_pixels(own), dtype), settings), np.float64)

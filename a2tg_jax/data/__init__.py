@@ -7,6 +7,7 @@ from a2tg_jax.data.scene import Scene as Scene
 from a2tg_jax.data.scene import View as View
 from a2tg_jax.data.scene import counted_pixels as counted_pixels
 from a2tg_jax.data.scene import view_image as view_image
+from a2tg_jax.data.scene import views_by_size as views_by_size
 from a2tg_jax.data.sfm import SfmSummary as SfmSummary
 from a2tg_jax.data.sfm import run_sfm as run_sfm
 from a2tg_jax.data.synthetic import synthetic_scene as synthetic_scene

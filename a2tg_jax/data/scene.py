@@ -96,6 +96,14 @@ class PointCloud:
     """[P, 3] uint8."""
 
 
+def views_by_size(views: Sequence[View]) -> list[list[View]]:
+    """The views of each image size, sizes and views in the order in which they come."""
+    groups: dict[tuple[int, int], list[View]] = {}
+    for view in views:
+        groups.setdefault(view.picture.size, []).append(view)
+    return list(groups.values())
+
+
 def counted_pixels(views: Sequence[View]) -> np.ndarray:
     """[V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] where all of them do."""
     if all(view.mask is None for view in views):
