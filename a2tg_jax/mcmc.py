@@ -8,6 +8,7 @@ the image stays nearly the same.
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -116,26 +117,39 @@ class Moves(NamedTuple):
     info: MoveInfo
 
 
-def plan_relocation(key: Array, opacities: Array, num_live: Array, *, hosts: Array | None = None) -> Moves:
-    """What `relocate` does to rows of these opacities [N], of which the first `num_live` exist.
+DrawHosts = Callable[[Array, Array, Array], Array]
+"""(key, is_host [N], is_target [N]) → [N] int32: the host of each target; the other entries are not used."""
 
-    Hosts are drawn with probability ∝ opacity, or `hosts` [N].
+
+def plan_relocation(key: Array, opacities: Array, num_live: Array, draw: DrawHosts | None = None) -> Moves:
+    """Plan what `relocate` does to rows of these opacities [N], of which the first `num_live` exist.
+
+    Args:
+      draw: chooses the hosts; None draws them with probability ∝ opacity.
     """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     is_dead = is_live & ~is_host
     has_hosts = jnp.any(is_host)
-    weights = opacities if hosts is None else hosts
-    rows, num_draws = _copied_rows(draw_hosts(key, weights, is_host), is_dead & has_hosts)
+    is_moved = is_dead & has_hosts
+    hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_moved)
+    rows, num_draws = _copied_rows(hosts, is_moved)
     info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), num_draws > 0, info)
 
 
 def plan_growth(
-    key: Array, opacities: Array, num_live: Array, cap: Array | int, least: Array | int = 0, hosts: Array | None = None
+    key: Array,
+    opacities: Array,
+    num_live: Array,
+    cap: Array | int,
+    least: Array | int = 0,
+    draw: DrawHosts | None = None,
 ) -> Moves:
-    """What `grow` does to rows of these opacities [N], of which the first `num_live` exist; or more, up to `least`.
+    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist.
 
-    Hosts are drawn with probability ∝ opacity, or `hosts` [N].
+    Args:
+      least: grow to at least this number, as far as the cap allows.
+      draw: chooses the hosts; None draws them with probability ∝ opacity.
     """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     has_hosts = jnp.any(is_host)
@@ -144,8 +158,8 @@ def plan_growth(
     wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), wanted)
     grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
     is_added = ~is_live & (jnp.arange(opacities.shape[0], dtype=jnp.int32) < grown)
-    weights = opacities if hosts is None else hosts
-    rows, num_draws = _copied_rows(draw_hosts(key, weights, is_host), is_added)
+    hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_added)
+    rows, num_draws = _copied_rows(hosts, is_added)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), (num_draws > 0) | is_added, info)
 
