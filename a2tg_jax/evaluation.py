@@ -15,7 +15,7 @@ from a2tg_jax.cameras import Camera
 from a2tg_jax.corrections import exposed
 from a2tg_jax.data import View, view_image
 from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.metrics import load_lpips, lpips, psnr, ssim
+from a2tg_jax.metrics import flat_psnr, has_learned, load_lpips, lpips, psnr, ssim
 from a2tg_jax.model import Model
 from a2tg_jax.origin import Color
 from a2tg_jax.render import RenderSettings, appearance_of
@@ -34,6 +34,8 @@ class ViewMetrics:
     """At most 1, higher is better."""
     lpips: float | None
     """Lower is better; None where no weights were given."""
+    flat_psnr: float
+    """PSNR of the best flat colour in place of the render, in dB (`metrics.flat_psnr`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +58,16 @@ class Evaluation:
     def psnr(self) -> float:
         """Mean over the views."""
         return float(np.mean([view.psnr for view in self.per_view]))
+
+    @property
+    def flat_psnr(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.flat_psnr for view in self.per_view]))
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether the model shows more than one flat colour per view."""
+        return has_learned(self.psnr, self.flat_psnr)
 
     @property
     def ssim(self) -> float:
@@ -103,7 +115,7 @@ def evaluate(
     background = model.background if background is None else background
     cameras = [view.camera for view in views]
     renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
-    psnr_and_ssim = jax.jit(lambda *compared: (psnr(*compared), ssim(*compared)))
+    measure = jax.jit(lambda *compared: (psnr(*compared), ssim(*compared), flat_psnr(*compared[1:])))
     per_view: list[ViewMetrics] = []
     seconds: list[float] = []
     renders: list[np.ndarray] = []
@@ -113,9 +125,9 @@ def evaluate(
         mask = None if view.mask is None else jnp.asarray(view.mask.read())
         if fit_colors:
             image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
-        decibels, similarity = psnr_and_ssim(image, target, mask)
+        decibels, similarity, flat = (float(figure) for figure in measure(image, target, mask))
         distance = None if weights is None else float(lpips(image, target, weights, mask))
-        per_view.append(ViewMetrics(view.name, float(decibels), float(similarity), distance))
+        per_view.append(ViewMetrics(view.name, decibels, similarity, distance, flat))
         if len(renders) < num_renders:
             renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))
     network = None if weights is None else weights.network

@@ -23,6 +23,8 @@ from a2tg_jax.npz import read_npz
 from a2tg_jax.numerics import safe_norm
 from a2tg_jax.texture import BYTES_PER_TEXEL, AtlasLayout
 
+NEARLY_FLAT = 40.0
+"""Photographs that one colour shows to so many dB tell nothing of whether a model has learned."""
 LPIPS_MIN_SIDE = 32
 LPIPS_LINEAR_LAYERS = {"alex": 5, "squeeze": 7}
 
@@ -41,6 +43,25 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
     image, target = _clip_pair(image, target, mask)
     error = jnp.mean((image - target) ** 2)
     return -10 * jnp.log10(error if mask is None else error / jnp.mean(jnp.asarray(mask, error.dtype)))
+
+
+def has_learned(psnr: float, flat: float) -> bool:
+    """Whether a PSNR is above that of flat colours (`flat_psnr`); always, if the photographs are nearly flat."""
+    return psnr > flat or flat > NEARLY_FLAT
+
+
+def flat_psnr(target: Array, mask: Array | None = None) -> Array:
+    """PSNR in dB of the best image of one flat colour: what a model reaches that has learned nothing else.
+
+    Args:
+      target: [H, W, 3], clipped to [0, 1] first.
+      mask: [H, W] bool, the pixels that count; None: all of them.
+    """
+    target = jnp.clip(target, 0, 1)
+    weight = jnp.ones(target.shape[:2], target.dtype) if mask is None else jnp.asarray(mask, target.dtype)
+    weight = (weight / jnp.sum(weight))[:, :, None]
+    mean = jnp.sum(weight * target, axis=(0, 1), keepdims=True)
+    return -10 * jnp.log10(jnp.mean(jnp.sum(weight * (target - mean) ** 2, axis=(0, 1))))
 
 
 def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:

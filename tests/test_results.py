@@ -47,7 +47,7 @@ NAMES = ["a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"]
 
 def some_result(record: RunRecord = RECORD) -> RunResult:
     def measured(psnr: float, texels: int) -> ModelResult:
-        views = (ViewMetrics("a<b.png", psnr, 0.5, 0.25), ViewMetrics("c.png", psnr + 2, 0.7, 0.75))
+        views = (ViewMetrics("a<b.png", psnr, 0.5, 0.25, 9.0), ViewMetrics("c.png", psnr + 2, 0.7, 0.75, 7.0))
         found = Evaluation(views, "alex", 20.0, ())
         num_bytes = 23_200 + 16 * texels
         return ModelResult(found, found, 100, texels, num_bytes, num_bytes, 0, 62.0)

@@ -16,7 +16,7 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.markup import image, layers, page, slider, table
 from a2tg_jax.results.pictures import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.record import repeating_command
-from a2tg_jax.results.summary import ModelResult, RunResult, minutes, summary_table, versions
+from a2tg_jax.results.summary import ModelResult, RunResult, learning_lines, minutes, summary_table, versions
 
 SECTIONS = (
     ("summary", "Summary"),
@@ -110,7 +110,8 @@ def _summary(result: RunResult) -> str:
         f"it. Training is the time of each stage alone.{network}{_corrected_told(last)}"
     )
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
-    return f'<div class="cards">{tiles}</div>{table(titles, rows, best)}<p class="soft">{escape(note)}</p>'
+    warned = "".join(f'<p class="warning">{escape(line)}.</p>' for line in learning_lines(result))
+    return f'{warned}<div class="cards">{tiles}</div>{table(titles, rows, best)}<p class="soft">{escape(note)}</p>'
 
 
 def _corrected_told(measured: ModelResult) -> str:

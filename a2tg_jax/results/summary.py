@@ -171,6 +171,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
         kept = ", kept from an earlier measurement of the same models" if result.is_lpips_kept else ""
         lines.append(f"LPIPS with {result.lpips_network}{kept}")
     lines += budget_lines(result)
+    lines += learning_lines(result)
     lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
     return "\n".join(lines)
 
@@ -184,6 +185,17 @@ def budget_lines(result: RunResult) -> list[str]:
             used = result.models[name].num_bytes
             lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
     return lines
+
+
+def learning_lines(result: RunResult) -> list[str]:
+    """A warning for each finished model that is no better on its training views than one flat colour per view."""
+    trained = {name: measured.train for name, measured in result.models.items()}
+    return [
+        f"{name} did not learn: {found.psnr:.1f} dB on its training views, where one flat colour per view reaches "
+        f"{found.flat_psnr:.1f} dB"
+        for name, found in trained.items()
+        if not found.has_learned
+    ]
 
 
 def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: int) -> list[list[tuple[str, ...]]]:
@@ -216,9 +228,12 @@ def minutes(seconds: float) -> str:
 
 def _model_json(measured: ModelResult) -> dict[str, Any]:
     quality = {
-        split: {"psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "views": len(found.per_view)}
+        split: {
+            "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "flat_psnr": found.flat_psnr,
+            "views": len(found.per_view),
+        }
         for split, found in measured.splits.items()
-    }
+    }  # fmt: skip
     names = (
         "num_gaussians", "num_texels", "num_bytes", "num_published_bytes", "num_padding_bytes", "seconds", "sha256"
     )  # fmt: skip

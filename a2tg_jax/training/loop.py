@@ -22,6 +22,7 @@ from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
+from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
 from a2tg_jax.training.start import padded
@@ -109,6 +110,9 @@ class StageRun:
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations)
+        self.learning = LearningCheck(
+            self.views, self.order, self.stage.iterations, system.background, is_first=index == 0
+        )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}
         self.started = time.perf_counter()
@@ -163,6 +167,7 @@ class StageRun:
                 for info in self.steps(iteration + 1, stop, is_stopped):
                     iteration += 1
                     self._log(iteration, info)
+                    self.learning.observe(iteration, float(info.psnr))
                     bar.update(info, self.history)
                 bar.tell_pace(iteration)
                 if iteration == stop:

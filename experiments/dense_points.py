@@ -1,0 +1,111 @@
+"""Train every system from few and from many initial points, in budgets that they nearly fill and in ample ones.
+
+    python experiments/dense_points.py --out OUT
+
+The points lie on the surfaces of the built-in scene at 80×60 pixels, but for one in 500, which lies anywhere before the
+cameras, as outliers of a dense reconstruction do. Budgets are multiples of the bytes of the points' Gaussians. Training
+takes 200 + 100 iterations of `quick`. Figures are PSNR on views that are not trained on. Each training is kept in
+OUT/dense_points.json as soon as it is measured, so that a second call goes on; the table is OUT/dense_points.md.
+"""
+
+import argparse
+import dataclasses
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from lab import tables
+
+import a2tg_jax as a2tg
+from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.training import SYSTEMS, find_system
+
+NUM_POINTS = (20_000, 100_000, 300_000)
+BUDGETS = (1.05, 1.5, 4.0)
+"""Times the bytes of as many Gaussians as there are points."""
+ITERATIONS = {"stage1_iterations": 200, "stage2_iterations": 100}
+POINTS_PER_OUTLIER = 500
+LARGEST_LOSS = 1.0
+"""dB by which more points may be worse than fewer at the same multiple of their bytes."""
+
+
+def dense_scene(num_points: int) -> a2tg.Scene:
+    """The built-in scene with so many points, some of them outliers."""
+    scene = a2tg.synthetic_scene(num_points=num_points, downscale=4)
+    rng = np.random.default_rng(0)
+    points, num = scene.points.copy(), len(scene.points) // POINTS_PER_OUTLIER
+    points[rng.choice(len(points), num, replace=False)] = rng.uniform(-1, 1, (num, 3))
+    return dataclasses.replace(scene, points=points)
+
+
+def measured(scene: a2tg.Scene, name: str, ratio: float) -> dict[str, float | str]:
+    """One training, or the reason for which it is refused."""
+    preset = find_system(name).preset("quick")
+    own = bytes_per_gaussian(preset.initial_sh_degree)
+    budget = ratio * own * len(scene.points) / MEGABYTE
+    system = dataclasses.replace(preset, memory_budget=budget, **ITERATIONS)
+    start = time.perf_counter()
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            model = a2tg.fit(scene, system, progress=False).model
+    except ValueError as error:
+        return {"refused": str(error)}
+    return {
+        "psnr": a2tg.evaluate(scene.test, model).psnr,
+        "num_gaussians": model.num,
+        "megabytes": model.num_bytes / MEGABYTE,
+        "seconds": time.perf_counter() - start,
+        "warnings": " ".join(str(warning.message) for warning in told),
+    }
+
+
+def table(found: Mapping[str, Mapping[str, float | str]]) -> str:
+    """A row for each system and budget, a column for each number of points."""
+    rows = []
+    for name in SYSTEMS:
+        for ratio in BUDGETS:
+            cells = [found.get(key_of(name, num, ratio), {}) for num in NUM_POINTS]
+            psnrs = [float(cell["psnr"]) for cell in cells if "psnr" in cell]
+            lost = max((max(psnrs[:at]) - psnr for at, psnr in enumerate(psnrs) if at), default=0.0)
+            shown = [_told(cell) for cell in cells]
+            rows.append([name, f"{ratio:g}", *shown, f"{lost:.2f}" if lost > LARGEST_LOSS else "–"])
+    return tables.markdown(["system", "budget ×", *(f"{num:,} points" for num in NUM_POINTS), "lost, dB"], rows)
+
+
+def _told(cell: Mapping[str, float | str]) -> str:
+    if "psnr" not in cell:
+        return "refused" if "refused" in cell else tables.MISSING
+    return f"{cell['psnr']:.2f} ({cell['num_gaussians']:,})"
+
+
+def key_of(name: str, num_points: int, ratio: float) -> str:
+    return f"{name} | {num_points} | {ratio:g}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of table and figures")
+    arguments = parser.parse_args()
+    a2tg.configure_cpu()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "dense_points.json"
+    found = read_json(path) if path.is_file() else {}
+    for num in NUM_POINTS:
+        scene = dense_scene(num)
+        for ratio in BUDGETS:
+            for name in SYSTEMS:
+                key = key_of(name, num, ratio)
+                if key not in found:
+                    found[key] = measured(scene, name, ratio)
+                    print(key, found[key], flush=True)
+                    write_json(path, found)
+                    (arguments.out / "dense_points.md").write_text(table(found), encoding="utf-8")
+    print(table(found))
+
+
+if __name__ == "__main__":
+    main()
