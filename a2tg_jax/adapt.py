@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.budget import bytes_of, event_budget, within_budget
-from a2tg_jax.checks import check_shape
+from a2tg_jax.core.budget import bytes_of, event_budget, within_budget
+from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.gradient_statistics import GradientStatistics
+from a2tg_jax.core.optim import AdamState
 from a2tg_jax.events import Change, Due, HostEvent, Seen, Statistic, event, iterations_at, static
-from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
-from a2tg_jax.optim import AdamState
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
 
 PAPER_ITERATIONS = 30_000

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.cameras import Camera
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View
 from a2tg_jax.model import Model
-from a2tg_jax.optim import AdamState
-from a2tg_jax.pixel import Statistic
+from a2tg_jax.rasterize.pixel import Statistic
 
 
 class Times(NamedTuple):

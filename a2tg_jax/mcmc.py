@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.budget import number_to_reach
-from a2tg_jax.checks import check_shape
+from a2tg_jax.appearance.copies import DEAD_OPACITY, MAX_SHARES, share
+from a2tg_jax.core.budget import number_to_reach
+from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
+from a2tg_jax.core.optim import AdamState
 from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, event, gather_rows, static
-from a2tg_jax.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.model import Model
-from a2tg_jax.optim import AdamState
-from a2tg_jax.sharing import DEAD_OPACITY, MAX_SHARES, share
 from a2tg_jax.texture import bucket_capacity
 
 NOISE_SCALE = 5e5

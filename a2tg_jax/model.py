@@ -9,15 +9,15 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
-from a2tg_jax.budget import BYTES_PER_FLOAT
-from a2tg_jax.cameras import Camera
-from a2tg_jax.checks import short_repr
-from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.origin import BLACK, Origin
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import short_repr
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import BLACK, Origin
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
 from a2tg_jax.texture import AtlasLayout, Textures
-from a2tg_jax.transform import transform_gaussians
 
 
 @jax.tree_util.register_dataclass

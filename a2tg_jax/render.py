@@ -15,18 +15,18 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
-from a2tg_jax.cameras import Camera, check_camera
-from a2tg_jax.checks import check_shape
-from a2tg_jax.classes import jit
-from a2tg_jax.compositor import composite
-from a2tg_jax.gaussians import Gaussians, check_gaussians
-from a2tg_jax.geometry import homographies, screen_bounds
-from a2tg_jax.kernels import native
-from a2tg_jax.kernels.choice import choose, instead_of_native
-from a2tg_jax.pixel import Statistic
-from a2tg_jax.splats import CompositingSettings, Compositor, project_gaussians
+from a2tg_jax.core.cameras import Camera, check_camera
+from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.core.jit import jit
+from a2tg_jax.rasterize.compositor import composite
+from a2tg_jax.rasterize.kernels.choice import choose, instead_of_native
+from a2tg_jax.rasterize.kernels.native import composite as native
+from a2tg_jax.rasterize.pixel import Statistic
+from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, project_gaussians
+from a2tg_jax.rasterize.tiles import TileGrid, count_pairs, tile_lists
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
-from a2tg_jax.tiles import TileGrid, count_pairs, tile_lists
 
 HEAD_ROOM = 1.25
 BATCH_ON_ACCELERATOR = 4096
@@ -168,7 +168,7 @@ def render_traced(
       sh_degree: overrides the settings' by a value that may be traced.
       num_live: only the first so many rows show; may be traced.
       probe: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
-      statistic: which (`pixel.positional_gradient`); not used without a probe.
+      statistic: which (`rasterize.pixel.positional_gradient`); not used without a probe.
     """
     compositor = choose(settings.compositor, settings.tile_size)
     compositing = _compositing_settings(

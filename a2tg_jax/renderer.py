@@ -8,18 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 
 from a2tg_jax.appearance import AppearanceRule, Plain
-from a2tg_jax.cameras import Camera, check_camera, resize_camera
-from a2tg_jax.classes import jit
-from a2tg_jax.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.jit import jit
 from a2tg_jax.model import Model
-from a2tg_jax.render import (
-    RenderOutput,
-    RenderSettings,
-    capacity_for,
-    check_background,
-    pairs_of_view,
-    render_traced,
-)
+from a2tg_jax.render import RenderOutput, RenderSettings, capacity_for, check_background, pairs_of_view, render_traced
 
 FIRST_ROOM = 1.5
 """Head room over the views that room is first made for."""

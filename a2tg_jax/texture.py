@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.checks import check_floats, check_shape, short_repr
+from a2tg_jax.core.checks import check_floats, check_shape, short_repr
 
 MAX_SIDE = 16
 BYTES_PER_TEXEL = 16

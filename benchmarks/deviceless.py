@@ -42,10 +42,10 @@ def programs():
     import jax.numpy as jnp
 
     from a2tg_jax.appearance import PlainRule, TexturedRule, TextureOptions
-    from a2tg_jax.compositor import composite
-    from a2tg_jax.kernels import pallas
-    from a2tg_jax.splats import CompositingSettings, Splats
-    from a2tg_jax.tiles import TileGrid, TileLists
+    from a2tg_jax.rasterize.compositor import composite
+    from a2tg_jax.rasterize.kernels import pallas
+    from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+    from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
     pallas.IS_COMPILED_AHEAD = True
     num, grid = NUM_GAUSSIANS, TileGrid(WIDTH, HEIGHT, TILE_SIZE)

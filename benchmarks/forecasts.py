@@ -14,8 +14,8 @@ import subprocess
 import sys
 import tempfile
 
-from a2tg_jax import cli
-from a2tg_jax.memory import memory_peak
+from a2tg_jax.cli import main as cli
+from a2tg_jax.host.memory import memory_peak
 from a2tg_jax.results.forecast import forecast_run
 from benchmarks.large_scene import write_scene
 

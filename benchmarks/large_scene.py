@@ -20,8 +20,8 @@ import numpy as np
 from PIL import Image
 
 import a2tg_jax
-from a2tg_jax.data.pictures import SHARE_OF_MEMORY
-from a2tg_jax.memory import memory_peak
+from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
+from a2tg_jax.host.memory import memory_peak
 
 NUM_PICTURES = 8
 """Different photographs; the others are links to them, and are decoded like any."""

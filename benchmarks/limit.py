@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax.kernels import jit, lanes
-from a2tg_jax.kernels.writer import LONG, Writer
+from a2tg_jax.rasterize.kernels.native import lanes, llvm_modules
+from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
 from benchmarks.timing import timed
 
 
 def measure_limit(case: dict) -> dict:
     """How long the processor takes for a number of multiply-adds and one exp per pixel and splat, and nothing else."""
-    module, width = ir.Module("limit"), jit.vector_bytes() // 4
+    module, width = ir.Module("limit"), llvm_modules.vector_bytes() // 4
     writer = Writer(module, "limit", ("data",), ("num",), "float32")
     at = lanes.Lanes(writer.b, width)
     reals = at.vector(writer.real)
@@ -27,7 +28,7 @@ def measure_limit(case: dict) -> dict:
             sums[k % 8] = sums[k % 8] * y + x
         return sum(sums) * 1e-3 + jnp.exp(x)
 
-    traced, _ = lanes.trace(work, number, number)
+    traced, _ = trace(work, number, number)
     total = writer.variable(reals)
     writer.b.store(at.constant(0.0, writer.real), total)
     x, y = (writer.load(writer.arguments["data"], k, reals) for k in range(2))
@@ -37,7 +38,7 @@ def measure_limit(case: dict) -> dict:
         writer.b.store(writer.b.fadd(result, writer.b.load(total, typ=reals)), total)
     writer.store(writer.b.load(total, typ=reals), writer.arguments["data"], 0)
     writer.b.ret_void()
-    run = jit.as_function(jit.compile_module(module)["limit"], 1, 1)
+    run = llvm_modules.as_function(llvm_modules.compile_module(module)["limit"], 1, 1)
     threads = len(os.sched_getaffinity(0))
     pool = concurrent.futures.ThreadPoolExecutor(threads)
     vectors = int(case["pairs"] / width / threads)

@@ -70,7 +70,7 @@ class Passes(NamedTuple):
     both: Callable
     """The gradient of L1 against a fixed random image."""
     counts: Callable
-    """Of the statistic's probe, too: its gradient (`compositor.composite`)."""
+    """Of the statistic's probe, too: its gradient (`rasterize.compositor.composite`)."""
 
 
 def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSettings) -> Passes:

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 
 import a2tg_jax
-from a2tg_jax.compositor import composite
-from a2tg_jax.kernels import native
-from a2tg_jax.optim import adam_init, adam_update
+from a2tg_jax.core.optim import adam_init, adam_update
+from a2tg_jax.rasterize.compositor import composite
+from a2tg_jax.rasterize.kernels.native import composite as native
+from a2tg_jax.rasterize.splats import CompositingSettings, project_gaussians
+from a2tg_jax.rasterize.tiles import TileGrid
 from a2tg_jax.render import appearance_of
-from a2tg_jax.splats import CompositingSettings, project_gaussians
-from a2tg_jax.tiles import TileGrid
 from benchmarks import timing
 from benchmarks.workload import random_scene, random_textures
 

@@ -7,7 +7,7 @@ import numpy as np
 
 import a2tg_jax
 from a2tg_jax import A2tg
-from a2tg_jax.cameras import resize_camera
+from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import fit_stage, like

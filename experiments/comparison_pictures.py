@@ -12,7 +12,7 @@ from lab.grid import Grid
 
 import a2tg_jax as a2tg
 from a2tg_jax.data import view_image
-from a2tg_jax.results.pictures import largest_gain, save_picture, to_uint8
+from a2tg_jax.results.images import largest_gain, save_picture, to_uint8
 
 ZOOM = 4
 

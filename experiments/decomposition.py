@@ -13,7 +13,7 @@ from lab.jobs import background_of
 from PIL import Image
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.pictures import save_picture, to_uint8
+from a2tg_jax.results.images import save_picture, to_uint8
 
 NUM_TEXTURES, ZOOM = 16, 12
 

@@ -19,7 +19,7 @@ import numpy as np
 from lab import tables
 
 import a2tg_jax as a2tg
-from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import SYSTEMS, find_system
 

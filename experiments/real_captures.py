@@ -20,11 +20,11 @@ from lab import tables
 from scipy.spatial.transform import Rotation
 
 import a2tg_jax as a2tg
-from a2tg_jax.corrections import exposed
-from a2tg_jax.data.world import camera_centers
+from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.folder import read_json, write_json
-from a2tg_jax.rigid import moved_viewmat
+from a2tg_jax.training.corrections import exposed
 
 DEGREES, SHARE = 0.5, 0.01
 """By which each camera is turned and moved, the latter in units of its distance from what it looks at (the median)."""

@@ -11,7 +11,7 @@ from lab.grid import Grid
 
 import a2tg_jax as a2tg
 from a2tg_jax.results.figures import save_figure
-from a2tg_jax.results.pictures import save_picture, to_uint8
+from a2tg_jax.results.images import save_picture, to_uint8
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:

@@ -26,15 +26,15 @@ from lab.measured import measured_once
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import reallocate
 from a2tg_jax.appearance import Plain, TexelRates, Textured
+from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.data import view_image
 from a2tg_jax.events import Change, Due, HostEvent, event
-from a2tg_jax.gradient_statistics import read_probe
-from a2tg_jax.losses import photometric_loss
 from a2tg_jax.model import Model
 from a2tg_jax.render import plan_render, render_traced
 from a2tg_jax.systems.bytewise import DetailTextureConfig
 from a2tg_jax.systems.stage1 import later_stage
 from a2tg_jax.training import Stage, fit_stage
+from a2tg_jax.training.losses import photometric_loss
 
 ITERATIONS = 300
 NUM_PARTS = 4

@@ -172,7 +172,7 @@ def _gaussians(folder: Path, file: Path):
 def _lpips(folder: Path, file: Path) -> None:
     import numpy as np
 
-    from a2tg_jax import metrics
+    from a2tg_jax.measure import metrics
 
     metrics._load_lpips.cache_clear()
     assert all(np.isfinite(array).all() for array in metrics.load_lpips(file).arrays.values())

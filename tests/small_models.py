@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.training import Checkpoint, History
 from a2tg_jax.training.step import initial_state
 

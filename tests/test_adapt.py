@@ -9,12 +9,12 @@ import pytest
 
 from a2tg_jax.adapt import Upscale, next_sizes, reallocate, select
 from a2tg_jax.appearance import Textured
-from a2tg_jax.budget import event_budget
+from a2tg_jax.core.budget import event_budget
+from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.core.gradient_statistics import GradientStatistics
+from a2tg_jax.core.optim import adam_init
 from a2tg_jax.events import Due
-from a2tg_jax.gaussians import init_from_points
-from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.model import Model
-from a2tg_jax.optim import adam_init
 from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from a2tg_jax import Gaussians2dMcmc, align_poses, color_fit, evaluate, fit, synthetic_scene
-from a2tg_jax.cli import main
-from a2tg_jax.corrections import exposed
-from a2tg_jax.rigid import moved_viewmat
+from a2tg_jax.cli.main import main
+from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training.corrections import exposed
 from a2tg_jax.training.options import CorrectionConfig
 
 TWIST = np.array([0.018, -0.012, 0.009, 0.012, -0.009, 0.015])
@@ -101,7 +101,8 @@ def test_a_disturbed_test_camera_comes_back(scene, model):
 
 
 def test_alignment_finds_room_for_what_it_sees(scene, model):
-    from a2tg_jax import RenderSettings, alignment
+    from a2tg_jax import RenderSettings
+    from a2tg_jax.measure import alignment
 
     views = align_poses(scene.test[:1], model, num_steps=3)
     settings, background = RenderSettings(capacity=64), jnp.zeros(3)

@@ -9,9 +9,9 @@ from test_oracle import FACING, FOCAL, hand_scene
 
 from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appearance, save_model
 from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Plain, Textured
+from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.textured import shown_textures
-from a2tg_jax.gaussians import logit
-from a2tg_jax.sharing import share
+from a2tg_jax.core.gaussians import logit
 from a2tg_jax.texture import allocate_textures
 
 KEY = jax.random.key(0)

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax import cli
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Textured
-from a2tg_jax.budget import bytes_per_gaussian, megabytes_of, number_to_reach
-from a2tg_jax.densify import FillingDensity
+from a2tg_jax.cli import main as cli
+from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
+from a2tg_jax.core.gaussians import init_from_points, logit
+from a2tg_jax.core.gradient_statistics import GradientStatistics
+from a2tg_jax.core.optim import adam_init
+from a2tg_jax.densify.clone_split import FillingDensity
 from a2tg_jax.events import Due, Now, Times
-from a2tg_jax.gaussians import init_from_points, logit
-from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
-from a2tg_jax.optim import adam_init
 from a2tg_jax.results.plan import fingerprint, plan_run
 from a2tg_jax.results.summary import budget_lines
 from a2tg_jax.training.fit import warn_of_budget

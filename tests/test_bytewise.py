@@ -7,10 +7,10 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
+from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training.registry import with_changes
-from a2tg_jax.view_dependence import AdaptDegrees
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 import a2tg_jax as a2tg
-from a2tg_jax.classes import classes_of, jit
+from a2tg_jax.core.jit import classes_of, jit
 from a2tg_jax.events import Change
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.results.plan import fingerprint, plan_run

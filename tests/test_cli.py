@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax import cli, startup
-from a2tg_jax.compaction import measure_choices
+from a2tg_jax.cli import main as cli
+from a2tg_jax.finish.compaction import measure_choices
+from a2tg_jax.host import startup
 from a2tg_jax.io.compact import load_compact
-from a2tg_jax.io.model import load_model
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import compress as compress_module
@@ -262,7 +263,7 @@ def test_flags_fit_the_processor_and_the_version():
 
 def test_xla_accepts_the_flags():
     """A flag that this jaxlib does not have would end the process."""
-    script = "from a2tg_jax.startup import configure_cpu; configure_cpu(); import jax; jax.numpy.ones(3).sum()"
+    script = "from a2tg_jax.host.startup import configure_cpu; configure_cpu(); import jax; jax.numpy.ones(3).sum()"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax import cli
+from a2tg_jax.cli import main as cli
 from a2tg_jax.results import train_run as train_run_module
 from a2tg_jax.results.folder import RunFolder
 

@@ -17,15 +17,15 @@ from small_values import some_gaussians
 
 from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Textured, TextureOptions
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.io import coders, compact, quantise
 from a2tg_jax.io.compact import GROUPS, HEAD, CompactChoices, decode_model, encode_model, load_compact, save_compact
 from a2tg_jax.io.ply import load_ply, save_ply
 from a2tg_jax.io.streams import Reader, Writer
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderSettings
-from a2tg_jax.sh_bands import split_sh
 from a2tg_jax.texture import textures_from_arrays
 
 EXACT = CompactChoices().keeping(dict.fromkeys(GROUPS, "float32"))

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from small_values import some_gaussians
 
-from a2tg_jax import cli, compaction
-from a2tg_jax.compaction import Trial, loss_beside_renders, loss_on_views, measure_choices, smallest_within
+from a2tg_jax.cli import main as cli
+from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.data import synthetic_scene
-from a2tg_jax.evaluation import evaluate
-from a2tg_jax.gaussians import init_from_points
+from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.finish import compaction
+from a2tg_jax.finish.compaction import Trial, loss_beside_renders, loss_on_views, measure_choices, smallest_within
 from a2tg_jax.io.compact import CompactChoices, encode_model, load_compact
-from a2tg_jax.io.model import save_model
+from a2tg_jax.io.model_file import save_model
+from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.results import compress as compress_module
 
 SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
@@ -31,7 +32,7 @@ def a_model() -> Model:
     gaussians = init_from_points(SCENE.points, SCENE.colors, opacity=0.8, sh_degree=0)
     rng = np.random.default_rng(0)
     logits = jnp.asarray(rng.normal(size=gaussians.num) + 1, jnp.float32)
-    return Model(dataclasses.replace(gaussians, logit_opacities=logits), origin=Origin.of_scene(SCENE))
+    return Model(dataclasses.replace(gaussians, logit_opacities=logits), origin=origin_of_scene(SCENE))
 
 
 def test_a_loss_is_the_difference_of_what_evaluate_tells():

@@ -7,8 +7,10 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax
-from a2tg_jax import cores, render_image
-from a2tg_jax.kernels import native, threads
+from a2tg_jax import render_image
+from a2tg_jax.host import cores
+from a2tg_jax.rasterize.kernels.native import composite as native
+from a2tg_jax.rasterize.kernels.native import threads
 
 CGROUPS = {
     "version 2, in a container": ("0::/", {"cpu.max": "150000 100000"}, 1.5),

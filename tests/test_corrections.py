@@ -22,12 +22,12 @@ from a2tg_jax import (
     save_model,
     synthetic_scene,
 )
-from a2tg_jax.corrections import Exposure, PoseRefinement, exposed, initial_corrections, updated
+from a2tg_jax.core.optim import adam_init, adam_update
+from a2tg_jax.core.rigid import moved_viewmat, rotation_exp
 from a2tg_jax.io.compact import load_compact
-from a2tg_jax.optim import adam_init, adam_update
-from a2tg_jax.rigid import moved_viewmat, rotation_exp
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import SYSTEMS
+from a2tg_jax.training.corrections import Exposure, PoseRefinement, exposed, initial_corrections, updated
 
 SYSTEM = A2tg(
     stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=McmcConfig(cap=90), exposure=True,

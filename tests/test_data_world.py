@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data import Similarity
-from a2tg_jax.data.world import camera_centers, normalizing_similarity, scene_scale
+from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
 
 def look_at(center, target, up=(0.0, 0.0, 1.0)):

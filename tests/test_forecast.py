@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax import cli, memory
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.cameras import resize_camera
-from a2tg_jax.classes import classes_of
+from a2tg_jax.cli import main as cli
+from a2tg_jax.core.cameras import resize_camera
+from a2tg_jax.core.jit import classes_of
 from a2tg_jax.data import Picture
+from a2tg_jax.host import memory
 from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
     RunForecast,
@@ -24,7 +25,7 @@ from a2tg_jax.results.forecast import (
 )
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.training import SYSTEMS, progress
-from a2tg_jax.training.forecast import Bytes, forecast_stages, stage_bytes
+from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.progress import Pace
 from a2tg_jax.training.start import initial_model

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.kernels import ffi
+from a2tg_jax.rasterize.kernels.native import ffi
 
 SCRIPT = """
 import os, signal, sys, threading, time

@@ -13,8 +13,8 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 
 import a2tg_jax as a2tg
 from a2tg_jax import Model, RenderSettings, Textured, view_gradients
+from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.events import Seen
-from a2tg_jax.gradient_statistics import read_probe
 from a2tg_jax.render import render_traced
 
 

@@ -12,17 +12,17 @@ import pytest
 from small_models import NUM, some_checkpoint, some_gaussians, some_model
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.npz import read_npz
 from a2tg_jax.io.archive import FORMAT as CHECKPOINT
 from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.model import FORMAT as MODEL
-from a2tg_jax.io.model import load_model, save_model
+from a2tg_jax.io.model_file import FORMAT as MODEL
+from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply, save_ply
-from a2tg_jax.io.structure import check_model, check_places
-from a2tg_jax.json_text import parse_json
-from a2tg_jax.metrics import load_lpips
+from a2tg_jax.io.validate import check_model, check_places
+from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
-from a2tg_jax.npz import read_npz
-from a2tg_jax.origin import Origin
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.texture import AtlasLayout, Textures
 from a2tg_jax.training import load_checkpoint, save_checkpoint

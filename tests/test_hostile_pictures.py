@@ -13,7 +13,7 @@ from PIL import Image
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.decoding import MAX_PIXELS, check_picture, read_pixels
 from a2tg_jax.data.images import check_inside, locate_image
-from a2tg_jax.results.pictures import picture_names
+from a2tg_jax.results.images import picture_names
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
 """Of the colour types of PNG."""

@@ -11,33 +11,20 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"control_groups"},
-    {"classes", "cores", "memory", "json_text"},
-    {"numerics", "startup", "bilinear", "checks", "signals", "arguments"},
-    {"machine"},
-    {"sh", "cameras", "npz", "rigid"},
-    {"gaussians"},
-    {"geometry", "sharing", "gradient_statistics", "budget"},
-    {"texture", "tiles", "data"},
-    {"sh_bands"},
-    {"appearance", "transform", "paths", "origin"},
-    {"pixel"},
-    {"splats"},
-    {"kernels"},
-    {"compositor", "losses"},
-    {"render", "optim", "metrics"},
+    {"host"},
+    {"core"},
+    {"texture", "data"},
+    {"appearance"},
+    {"rasterize"},
+    {"render"},
     {"model"},
-    {"io", "renderer", "gradients"},
-    {"events"},
-    {"adapt", "mcmc", "densify", "view_dependence", "corrections"},
-    {"splitting", "pruning"},
-    {"least_squares", "alignment"},
+    {"events", "renderer", "io"},
+    {"adapt", "mcmc"},
+    {"densify"},
     {"training"},
-    {"systems", "evaluation", "compaction", "web"},
-    {"shrinking"},
+    {"measure", "systems", "web"},
+    {"finish"},
     {"results"},
-    {"cli_view"},
-    {"cli_train"},
     {"cli"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""
@@ -79,10 +66,59 @@ def test_imports_run_downward(path):
         )
 
 
+def modules_imported(path: Path) -> set[str]:
+    """The modules of the package that a file imports when it is run, as dotted paths below the package."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("a2tg_jax"):
+            module = (node.module or "").removeprefix("a2tg_jax").removeprefix(".")
+            for alias in node.names:
+                full = f"{module}.{alias.name}" if module else alias.name
+                found.add(full if full in NAMES else module)
+    return found & NAMES
+
+
+def dotted(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
+
+
+NAMES = {dotted(path) for path in MODULES}
+
+
+def test_no_modules_import_each_other():
+    """Not even for types, and not within a room."""
+    own = [path for path in MODULES if path.name != "__init__.py"]
+    gathering = NAMES - {dotted(path) for path in own}
+    graph = {dotted(path): sorted(modules_imported(path) - gathering - {dotted(path)}) for path in own}
+    done: set[str] = set()
+
+    def visit(name: str, above: tuple[str, ...]) -> None:
+        assert name not in above, " → ".join([*above[above.index(name) :], name])
+        if name not in done:
+            for imported in graph.get(name, ()):
+                visit(imported, (*above, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+def test_mathematics_knows_nothing_of_the_host():
+    """Threads of native loops are the exception."""
+    rooms = {"core", "texture", "appearance", "rasterize", "render", "model", "events", "adapt", "mcmc", "densify"}
+    found = {
+        str(path.relative_to(PACKAGE))
+        for path in MODULES
+        if component(path) in rooms and "host" in imported_components(path)
+    }
+    assert found == {"rasterize/kernels/native/threads.py"}
+
+
 def test_adaptation_and_mcmc_know_neither_render_nor_each_other():
-    names = {"adapt", "mcmc", "densify"}
-    for name in names:
-        assert not imported_components(PACKAGE / f"{name}.py") & ({"render", *names} - {name})
+    paths = {"adapt": "adapt.py", "mcmc": "mcmc.py", "densify": "densify/clone_split.py"}
+    for name, path in paths.items():
+        assert not imported_components(PACKAGE / path) & ({"render", *paths} - {name})
 
 
 def test_jaxopt_has_one_importer():
@@ -95,7 +131,7 @@ def test_import_leaves_jax_alone():
     script = """
 import os, jax
 before = dict(jax.config.values), dict(os.environ)
-import a2tg_jax, a2tg_jax.startup, a2tg_jax.training, a2tg_jax.render
+import a2tg_jax, a2tg_jax.host.startup, a2tg_jax.training, a2tg_jax.render
 now = {name: jax.config.values[name] for name in before[0]}  # JAX's own modules may bring options of their own.
 assert now == before[0], "configuration changed"
 assert dict(os.environ) == before[1], "environment changed"

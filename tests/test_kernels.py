@@ -14,12 +14,13 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, gaussian_cutoff, textured_rule
-from a2tg_jax.bilinear import TextureRegion
-from a2tg_jax.geometry import homographies
-from a2tg_jax.kernels import native, threads
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.geometry import homographies
+from a2tg_jax.rasterize.kernels.native import composite as native
+from a2tg_jax.rasterize.kernels.native import threads
+from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.render import appearance_of, render_traced
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
-from a2tg_jax.tiles import TileGrid, tile_lists, total_pairs
 
 
 @pytest.mark.usefixtures("x64")

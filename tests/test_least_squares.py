@@ -12,7 +12,7 @@ from test_view_dependence import banded
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Billboards, Plain, Textured
 from a2tg_jax.data import View
-from a2tg_jax.least_squares import colors_of, draw_change, polish, with_colors
+from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
 from a2tg_jax.render import plan_render
 
 

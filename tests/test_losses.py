@@ -7,12 +7,12 @@ import pytest
 from jax.test_util import check_grads
 from skimage.metrics import structural_similarity
 
-from a2tg_jax import losses
-from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import init_from_points
-from a2tg_jax.kernels import ssim as kernel
-from a2tg_jax.kernels import threads
-from a2tg_jax.losses import (
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.rasterize.kernels.native import ssim as kernel
+from a2tg_jax.rasterize.kernels.native import threads
+from a2tg_jax.training import losses
+from a2tg_jax.training.losses import (
     depth_normals,
     mean_opacity,
     mean_scale,

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.gaussians import Gaussians, logit, rotation_matrices
+from a2tg_jax.appearance.copies import DEAD_OPACITY, share, stacked_integral
+from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.mcmc import draw_hosts, grow, perturb, relocate
-from a2tg_jax.sharing import DEAD_OPACITY, share, stacked_integral
 
 KEY = jax.random.key(0)
 NUM = 64

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from a2tg_jax.memory import keep_room_for_programs, memory_limit, memory_peak, return_free_memory
+from a2tg_jax.host.memory import keep_room_for_programs, memory_limit, memory_peak, return_free_memory
 
 
 def told(folder, count: int, limit: str):

@@ -8,8 +8,8 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from a2tg_jax.appearance import Textured
-from a2tg_jax.gaussians import init_from_points
-from a2tg_jax.metrics import load_lpips, lpips, parameter_bytes, psnr, ssim
+from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.measure.metrics import load_lpips, lpips, parameter_bytes, psnr, ssim
 from a2tg_jax.model import Model
 from a2tg_jax.texture import allocate_textures
 

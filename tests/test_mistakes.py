@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax import cli, save_model, synthetic_scene
-from a2tg_jax.origin import BLACK, Origin
+from a2tg_jax import save_model, synthetic_scene
+from a2tg_jax.cli import main as cli
+from a2tg_jax.core.origin import BLACK
+from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.results import whole_run
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
@@ -114,7 +116,7 @@ def place(tmp_path_factory):
         write_record(run, record)
         run.own(run.checkpoint("a2tg-gaussians", 1)).parent.mkdir()
         run.checkpoint("a2tg-gaussians", 1).write_bytes(b"")
-    model = dataclasses.replace(initial_model(scene, system), origin=Origin.of_scene(scene, BLACK))
+    model = dataclasses.replace(initial_model(scene, system), origin=origin_of_scene(scene, BLACK))
     save_model(run.own(run.model("a2tg-textures")), model)
     for name in ("photos/a", "scene/a", "photo", "many/a", "many/b", "many/c"):
         (place / name).parent.mkdir(exist_ok=True)

@@ -11,11 +11,11 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from small_values import assert_same, some_gaussians, some_world
 
 from a2tg_jax.appearance import Appearance, PlainRule, Textured, TextureOptions
-from a2tg_jax.cameras import Camera
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.io.model import FORMAT, load_model, save_model
+from a2tg_jax.io.model_file import FORMAT, load_model, save_model
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderSettings, render_appearance, render_image
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
 

@@ -15,16 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import Change, StepEvent, cli, event, signals
-from a2tg_jax.io.atomic import replacing
-from a2tg_jax.io.model import load_model
-from a2tg_jax.machine import this_machine
-from a2tg_jax.results import checks, evaluate_run, whole_run
+from a2tg_jax import Change, StepEvent, event
+from a2tg_jax.cli import main as cli
+from a2tg_jax.host import signals
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.machine import this_machine
+from a2tg_jax.io.model_file import load_model
+from a2tg_jax.results import evaluate_run, whole_run
+from a2tg_jax.results import preflight as checks
 from a2tg_jax.results import train_run as train_run_module
-from a2tg_jax.results.checks import check_apart
-from a2tg_jax.results.claim import claimed, opened
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.kept_lpips import sha256_of
+from a2tg_jax.results.lock import claimed, opened
+from a2tg_jax.results.preflight import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.replacement import OLD, old_run, set_aside, undo_unfinished
 from a2tg_jax.results.train_run import MOST_RESTORED, train_run
@@ -460,7 +463,7 @@ def test_a_second_signal_is_obeyed_at_once():
 def test_a_closed_pipe_is_quiet(tmp_path):
     run = filled(tmp_path / "run")
     run.model(NAME).unlink()
-    command = f"{sys.executable} -m a2tg_jax.cli info {run.path}; echo $? >&2"
+    command = f"{sys.executable} -m a2tg_jax.cli.main info {run.path}; echo $? >&2"
     done = subprocess.run(
         ["bash", "-c", f"({command}) | true"], capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},

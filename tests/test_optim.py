@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.optim import OptStep, adam_init, adam_update, exponential_decay
+from a2tg_jax.core.optim import OptStep, adam_init, adam_update, exponential_decay
 
 
 def oracle_adam(param, grads, rate, b1=0.9, b2=0.999, eps=1e-15):
@@ -98,4 +98,4 @@ def test_decay_is_log_linear_and_then_constant(iteration, factor):
 
 
 def test_importing_is_silent():
-    subprocess.run([sys.executable, "-W", "error", "-c", "import a2tg_jax.optim"], check=True)
+    subprocess.run([sys.executable, "-W", "error", "-c", "import a2tg_jax.core.optim"], check=True)

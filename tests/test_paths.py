@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.cameras import Camera
-from a2tg_jax.data.world import camera_centers
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.paths import path_through
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
-from a2tg_jax.paths import path_through
 
 
 def some_views(num: int = 4, size=(64, 48)) -> list[Camera]:

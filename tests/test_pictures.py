@@ -12,8 +12,8 @@ from PIL import Image
 from small_values import assert_same
 
 from a2tg_jax import Gaussians2dMcmc, McmcConfig, fit, load_scene, synthetic_scene
-from a2tg_jax.data import pictures
-from a2tg_jax.data.pictures import Picture, Shelf
+from a2tg_jax.data import photo_store as pictures
+from a2tg_jax.data.photo_store import Picture, Shelf
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore, stack_views
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from a2tg_jax.gaussians import SH_C0
+from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.ply_packed import read_packed
 

@@ -14,12 +14,12 @@ from test_splitting import some_state
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.optim import adam_init
 from a2tg_jax.data import View
+from a2tg_jax.densify.pruning import Prune, blending_weights
+from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
-from a2tg_jax.optim import adam_init
-from a2tg_jax.pruning import Prune, blending_weights
-from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.bytewise import PruneConfig
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model

@@ -19,9 +19,9 @@ from a2tg_jax import (
     render_image,
     textures_from_arrays,
 )
-from a2tg_jax.cameras import Camera, resize_camera
+from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.data import View
-from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.renderer import _jitted_draw
 
 

@@ -14,12 +14,13 @@ from PIL import Image
 from test_results import NAMES, circle, some_history, some_result
 
 from a2tg_jax.appearance import Plain, Textured
-from a2tg_jax.gaussians import SH_C0, init_from_points
+from a2tg_jax.core.gaussians import SH_C0, init_from_points
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.results.figures import curves_figure, save_figure
 from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.images import largest_gain
 from a2tg_jax.results.markup import image, page, slider, table
 from a2tg_jax.results.model_pictures import (
     FLIGHT_FRAMES,
@@ -30,7 +31,6 @@ from a2tg_jax.results.model_pictures import (
     learned_textures,
     normal_picture,
 )
-from a2tg_jax.results.pictures import largest_gain
 from a2tg_jax.results.report import SECTIONS, Comparison, comparison_html, write_report
 from a2tg_jax.texture import textures_from_arrays
 

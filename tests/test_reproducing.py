@@ -8,8 +8,8 @@ import pytest
 from bits import bits_of
 
 from a2tg_jax import A2tg, fit, synthetic_scene
-from a2tg_jax.kernels import choice
-from a2tg_jax.machine import Machine, this_machine
+from a2tg_jax.host.machine import Machine, this_machine
+from a2tg_jax.rasterize.kernels import choice
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
 from a2tg_jax.systems.stage1 import DensityConfig, McmcConfig

@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import cli
-from a2tg_jax.cameras import Camera
+from a2tg_jax.cli import main as cli
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.data import View, view_image
-from a2tg_jax.evaluation import Evaluation, ViewMetrics, evaluate
-from a2tg_jax.gaussians import init_from_points
-from a2tg_jax.metrics import psnr
-from a2tg_jax.paths import smooth_path
+from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics, evaluate
+from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.render import render_image
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
 from a2tg_jax.results.history import read_history, write_history
-from a2tg_jax.results.pictures import error_picture, largest_gain, resolution_colors, side_by_side, to_uint8
+from a2tg_jax.results.images import error_picture, largest_gain, resolution_colors, side_by_side, to_uint8
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import (
     RunRecord,

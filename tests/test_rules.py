@@ -19,7 +19,7 @@ from test_render_gradients import CLEARANCE, assert_gradients_close, differences
 
 from a2tg_jax import Camera, RenderSettings, Textures, render_appearance
 from a2tg_jax.appearance import AppearanceRule, Billboards, MovableKernelParams, MovableKernels, PlainRule
-from a2tg_jax.numerics import normalize
+from a2tg_jax.core.numerics import normalize
 from a2tg_jax.render import render_traced
 from a2tg_jax.texture import plan_layout
 

@@ -9,11 +9,11 @@ from test_results import circle
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Banded, MovableKernels, Plain, Textured, TextureOptions
+from a2tg_jax.core.gaussians import SH_C0, init_from_points
 from a2tg_jax.data import View
-from a2tg_jax.gaussians import SH_C0, init_from_points
+from a2tg_jax.finish.shrinking import halved, shrink_textures, taken, texel_weights
 from a2tg_jax.model import Model
-from a2tg_jax.results.pictures import to_uint8
-from a2tg_jax.shrinking import halved, shrink_textures, taken, texel_weights
+from a2tg_jax.results.images import to_uint8
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
 
 NUM = 12

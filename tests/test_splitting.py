@@ -10,13 +10,13 @@ import pytest
 from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.gaussians import rotation_matrices
+from a2tg_jax.core.gradient_statistics import GradientStatistics
+from a2tg_jax.core.optim import AdamState, adam_init
+from a2tg_jax.densify.splitting import SplitByGradient, draw_distinct_hosts, draw_weights, split_rows
 from a2tg_jax.events import Now, Times
-from a2tg_jax.gaussians import rotation_matrices
-from a2tg_jax.gradient_statistics import GradientStatistics
 from a2tg_jax.mcmc import plan_growth, plan_relocation
 from a2tg_jax.model import Model
-from a2tg_jax.optim import AdamState, adam_init
-from a2tg_jax.splitting import SplitByGradient, draw_distinct_hosts, draw_weights, split_rows
 
 NUM, LIVE = 400, 300
 KEY = jax.random.key(0)

@@ -13,9 +13,9 @@ from jax import lax
 from lane_loop import run_native, run_xla
 from scipy import special
 
-from a2tg_jax.kernels.lanes import Untranslatable
-from a2tg_jax.kernels.primitives import PRIMITIVES
-from a2tg_jax.kernels.structure import STRUCTURE
+from a2tg_jax.rasterize.kernels.native.control_flow import STRUCTURE
+from a2tg_jax.rasterize.kernels.native.lanes import Untranslatable
+from a2tg_jax.rasterize.kernels.native.primitives import PRIMITIVES
 
 AWAY, EVEN = lax.RoundingMethod.AWAY_FROM_ZERO, lax.RoundingMethod.TO_NEAREST_EVEN
 

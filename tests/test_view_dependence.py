@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Model, load_model, load_ply, plan_render, save_model, save_ply
 from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels, Plain, Textured
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.budget import within_budget
-from a2tg_jax.data.world import Similarity
+from a2tg_jax.appearance.sh_bands import allocate_bands, dense_sh, gather_bands, reallocate_bands, split_sh
+from a2tg_jax.core.budget import within_budget
+from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.densify.view_dependence import AdaptDegrees, ViewDependence, raised, without_idle
 from a2tg_jax.events import Due, Seen
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.optim import adam_init
-from a2tg_jax.sh_bands import allocate_bands, dense_sh, gather_bands, reallocate_bands, split_sh
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import LearningRates, Stage
 from a2tg_jax.training.start import padded
-from a2tg_jax.view_dependence import AdaptDegrees, ViewDependence, raised, without_idle
 
 NUM = 40
 NUM_FLOATS = (13, 22, 37, 58)
@@ -230,7 +230,7 @@ def test_a_file_whose_parts_disagree_is_refused(tmp_path, monkeypatch, damage):
     with pytest.raises(ValueError, match=r"(Banded|Textured) is of"):
         save_model(tmp_path / "m.npz", model)
     with monkeypatch.context() as patch:
-        patch.setattr("a2tg_jax.io.model.check_model", lambda model: None)
+        patch.setattr("a2tg_jax.io.model_file.check_model", lambda model: None)
         save_model(tmp_path / "m.npz", model)
     with pytest.raises(ValueError, match=r"m\.npz: .*(Banded|Textured) is of"):
         load_model(tmp_path / "m.npz")

@@ -14,7 +14,7 @@ from small_values import some_gaussians
 from test_compact import MODELS, banded, every_model, order_of, plain, tables, textured
 
 from a2tg_jax.appearance import Banded, Billboards, MovableKernels, TextureOptions
-from a2tg_jax.compaction import loss_beside_renders
+from a2tg_jax.finish.compaction import loss_beside_renders
 from a2tg_jax.io import web_scene
 from a2tg_jax.io.rows import rows_of
 from a2tg_jax.io.web_codes import BITS, signed_root, signed_square

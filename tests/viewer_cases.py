@@ -15,15 +15,15 @@ import numpy as np
 
 from a2tg_jax.appearance import Banded, Plain, Textured, TextureOptions
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.viewing import Source
-from a2tg_jax.sh_bands import split_sh
 from a2tg_jax.texture import textures_from_arrays
 
 NUM = 300

@@ -11,9 +11,7 @@ from jax import Array
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.plain import Plain
 from a2tg_jax.appearance.rule import RuleAround
-from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.sh_bands import (
+from a2tg_jax.appearance.sh_bands import (
     BandLayout,
     Bands,
     allocate_bands,
@@ -24,6 +22,8 @@ from a2tg_jax.sh_bands import (
     gather_bands,
     split_sh,
 )
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.texture import AtlasLayout, Textures
 
 

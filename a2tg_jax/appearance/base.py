@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.rule import AppearanceRule
-from a2tg_jax.gaussians import Gaussians, logit
-from a2tg_jax.sharing import share
+from a2tg_jax.core.gaussians import Gaussians, logit
 from a2tg_jax.texture import AtlasLayout, Textures
 
 

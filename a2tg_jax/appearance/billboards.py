@@ -19,9 +19,9 @@ from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule
-from a2tg_jax.bilinear import TextureRegion
-from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.numerics import safe_divide
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures
 
 INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3

@@ -17,10 +17,10 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.copies import LARGEST_OPACITY, share
 from a2tg_jax.appearance.rule import PlainRule, gaussian_cutoff
-from a2tg_jax.cameras import Camera
-from a2tg_jax.gaussians import Gaussians, logit
-from a2tg_jax.sharing import LARGEST_OPACITY, share
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians, logit
 
 NUM_KERNELS = 4
 LEAST_WEIGHT = 1e-4

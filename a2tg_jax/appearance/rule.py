@@ -19,11 +19,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.bilinear import TextureRegion
-from a2tg_jax.cameras import Camera
-from a2tg_jax.classes import classes_of
-from a2tg_jax.gaussians import Gaussians
-from a2tg_jax.sh import sh_sum
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.jit import classes_of
+from a2tg_jax.core.sh import sh_sum
 
 Residual = tuple[Array, Array, Array] | None
 """Added to red, green and blue; None stands for 0."""

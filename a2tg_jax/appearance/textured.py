@@ -15,8 +15,8 @@ from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
-from a2tg_jax.bilinear import TextureRegion
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
 
 EXTENT = 3.0

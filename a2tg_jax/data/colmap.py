@@ -16,7 +16,7 @@ from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
-from a2tg_jax.data.pictures import Shelf
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")

@@ -9,8 +9,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from a2tg_jax.checks import shortened
 from a2tg_jax.data.colmap_binary import num_params_by_model
+from a2tg_jax.host.text import shortened
 
 Words = list[bytes]
 ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")

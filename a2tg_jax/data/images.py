@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
-from a2tg_jax.checks import shortened
+from a2tg_jax.host.text import shortened
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 """Tried in this order on image paths written without a suffix."""

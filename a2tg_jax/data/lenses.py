@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from a2tg_jax.cameras import check_intrinsics
+from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsics
 

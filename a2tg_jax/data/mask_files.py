@@ -12,7 +12,7 @@ from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import resize_pixels
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.pictures import Picture
+from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, Shot, View
 
 FOLDER = "masks"

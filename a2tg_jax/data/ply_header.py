@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from a2tg_jax.checks import shortened
+from a2tg_jax.host.text import shortened
 
 OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")

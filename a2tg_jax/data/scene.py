@@ -8,10 +8,12 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.pictures import Picture
-from a2tg_jax.data.world import Similarity, camera_centers, normalizing_similarity, scene_scale
+from a2tg_jax.data.photo_store import Picture
+from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
 FARTHEST = 1e5
@@ -94,6 +96,18 @@ class PointCloud:
     """[P, 3]."""
     colors: np.ndarray
     """[P, 3] uint8."""
+
+
+def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
+    """The cameras and the world of a scene, training views first."""
+    views = [*scene.train, *scene.test]
+    return Origin.of_cameras(
+        [view.camera for view in views],
+        [view.name for view in views],
+        is_test=[False] * len(scene.train) + [True] * len(scene.test),
+        transform=scene.transform,
+        background=background,
+    )
 
 
 def views_by_size(views: Sequence[View]) -> list[list[View]]:

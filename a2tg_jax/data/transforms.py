@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.cameras import LONGEST_SIDE
-from a2tg_jax.checks import shortened
+from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
-from a2tg_jax.data.pictures import Shelf
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
-from a2tg_jax.json_text import parse_json
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")

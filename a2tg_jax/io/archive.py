@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.checks import shortened
-from a2tg_jax.io.atomic import replacing
-from a2tg_jax.json_text import parse_json
-from a2tg_jax.npz import read_npz
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.npz import read_npz
+from a2tg_jax.host.text import shortened
 
 FORMAT = "a2tg-jax checkpoint"
 VERSION = 1

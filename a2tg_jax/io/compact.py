@@ -16,12 +16,15 @@ from typing import Any, Self
 import numpy as np
 
 from a2tg_jax.appearance import Banded
-from a2tg_jax.checks import shortened
-from a2tg_jax.gaussians import check_gaussians
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.appearance.sh_bands import MAX_DEGREE
+from a2tg_jax.core.gaussians import check_gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.coders import Choice, decode, encode
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.model import (
+from a2tg_jax.io.model_file import (
     LONGEST_REASON,
     appearance_from_dict,
     appearance_to_dict,
@@ -32,10 +35,7 @@ from a2tg_jax.io.model import (
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
 from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
-from a2tg_jax.json_text import parse_json
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
-from a2tg_jax.sh_bands import MAX_DEGREE
 from a2tg_jax.texture import MAX_SIDE
 
 MAGIC = b"a2tgz\r\n\x1a"

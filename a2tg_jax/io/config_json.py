@@ -7,7 +7,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from a2tg_jax.checks import shortened
+from a2tg_jax.host.text import shortened
 
 ConfigT = TypeVar("ConfigT")
 LARGEST_INTEGER = 2**64

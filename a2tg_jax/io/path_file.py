@@ -7,9 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.cameras import Camera
-from a2tg_jax.checks import shortened
-from a2tg_jax.json_text import parse_json
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.text import shortened
 
 FORMAT, VERSION = "a2tg-jax path", 1
 LARGEST_SIDE = 16384

@@ -18,15 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, Banded
+from a2tg_jax.appearance.copies import LARGEST_OPACITY
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.ply_header import read_vertex_header
-from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.ply_packed import is_packed, read_packed
-from a2tg_jax.io.structure import check_model
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
-from a2tg_jax.sharing import LARGEST_OPACITY
-from a2tg_jax.transform import transform_gaussians
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" for i in range(45))

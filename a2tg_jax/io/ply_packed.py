@@ -11,8 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.ply_header import VertexHeader, header_lines, read_headers
-from a2tg_jax.gaussians import SH_C0
 
 CHUNK = 256
 AXES, CHANNELS = "xyz", "rgb"

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, Banded, Plain, Textured
-from a2tg_jax.gaussians import Gaussians
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.io.quantise import nearest_half_turn
-from a2tg_jax.io.structure import check_model
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
-from a2tg_jax.sh import NUM_BASES
 
 U_MIRRORED, V_MIRRORED = (2, 3), (1, 3)
 """The axes of half-turns that mirror a texture's columns, and its rows."""

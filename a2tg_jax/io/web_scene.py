@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Textured, TextureOptions
+from a2tg_jax.appearance.sh_bands import MAX_DEGREE
 from a2tg_jax.appearance.textured import shown_textures
-from a2tg_jax.data.world import Similarity
-from a2tg_jax.gaussians import check_gaussians
+from a2tg_jax.core.gaussians import check_gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.rows import Rows, model_of, ordered, rows_of
 from a2tg_jax.io.web_codes import codes_of, rows_of_body
-from a2tg_jax.json_text import parse_json
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
-from a2tg_jax.sh_bands import MAX_DEGREE
 
 MAGIC = b"a2tgw\r\n\x1a"
 VERSION = 1

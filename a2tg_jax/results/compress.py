@@ -5,7 +5,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from a2tg_jax.compaction import (
+from a2tg_jax.data import Scene
+from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
     Loss,
     Trial,
@@ -14,10 +15,9 @@ from a2tg_jax.compaction import (
     measure_choices,
     smallest_within,
 )
-from a2tg_jax.data import Scene
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.compact import GROUPS, encode_model
-from a2tg_jax.io.model import load_model
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.rows import check_kind
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings

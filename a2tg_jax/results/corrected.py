@@ -3,7 +3,7 @@
 A photograph's exposure and the exact pose of its camera are not the model's to know. Runs that learn those of the
 training views are therefore scored twice: as they are, and up to them. `color_fit`: each render's colours are mapped to
 the photograph's by the affine map of least squares. `aligned`: test cameras are moved to where the model looks most
-like the photograph (`alignment.align_poses`), training cameras to where training moved them.
+like the photograph (`measure.alignment.align_poses`), training cameras to where training moved them.
 """
 
 import dataclasses
@@ -13,14 +13,14 @@ import os
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.alignment import align_poses
-from a2tg_jax.corrections import learned
 from a2tg_jax.data import Scene, View
-from a2tg_jax.evaluation import Evaluation, evaluate
+from a2tg_jax.measure.alignment import align_poses
+from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.training.corrections import learned
 
 TITLES = {
     "color_fit": "colours fitted",

@@ -6,23 +6,21 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from a2tg_jax.appearance import Billboards
+from a2tg_jax.core.origin import Color
 from a2tg_jax.data import Scene, View, view_image
-from a2tg_jax.evaluation import evaluate
-from a2tg_jax.io.atomic import replacing
-from a2tg_jax.io.model import load_model
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
+from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Color
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.corrected import measure_corrected, write_corrections
 from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.history import read_history
-from a2tg_jax.results.kept_lpips import sha256_of, with_kept_lpips
-from a2tg_jax.results.model_pictures import depth_picture, flight, learned_textures, normal_picture
-from a2tg_jax.results.pictures import (
+from a2tg_jax.results.images import (
     ERROR_GAIN,
     colored_by_resolution,
     error_picture,
@@ -33,6 +31,8 @@ from a2tg_jax.results.pictures import (
     texel_levels,
     to_uint8,
 )
+from a2tg_jax.results.kept_lpips import sha256_of, with_kept_lpips
+from a2tg_jax.results.model_pictures import depth_picture, flight, learned_textures, normal_picture
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, comparison_html, write_report

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from a2tg_jax.io.atomic import replacing
-from a2tg_jax.results.pictures import resolution_colors
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.results.images import resolution_colors
 from a2tg_jax.training import History
 
 COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66ccee")

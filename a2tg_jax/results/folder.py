@@ -28,8 +28,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.io.atomic import replacing
-from a2tg_jax.json_text import parse_json
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import parse_json
 
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"

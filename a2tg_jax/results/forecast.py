@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import jax
 
-from a2tg_jax.budget import bytes_of, megabytes_of
-from a2tg_jax.cores import num_threads
+from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
-from a2tg_jax.data.pictures import SHARE_OF_MEMORY
-from a2tg_jax.memory import memory_limit
+from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
+from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.training import System
-from a2tg_jax.training.forecast import (
+from a2tg_jax.training.cost import (
     COMPILER,
     FIRST_PROGRAM,
     FURTHER_PROGRAM,

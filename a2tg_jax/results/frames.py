@@ -8,15 +8,15 @@ from typing import Literal
 
 from tqdm import tqdm
 
-from a2tg_jax.cameras import Camera
-from a2tg_jax.io.model import load_model
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.paths import path_through, smooth_path
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
-from a2tg_jax.paths import path_through, smooth_path
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.pictures import picture_names, save_picture, to_uint8
+from a2tg_jax.results.images import picture_names, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
 
 Route = Literal["test", "smooth"]

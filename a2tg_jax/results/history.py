@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax.checks import shortened
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import shortened
 from a2tg_jax.training import History
 
 NAMES = tuple(field.name for field in dataclasses.fields(History))

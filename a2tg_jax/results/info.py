@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.appearance import Banded
-from a2tg_jax.checks import shortened
-from a2tg_jax.io.model import load_model
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, read_json
 from a2tg_jax.results.record import read_record, repeating_command
 from a2tg_jax.results.replacement import old_run

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.evaluation import Evaluation
+from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.results.summary import ModelResult
 

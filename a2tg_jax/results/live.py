@@ -16,9 +16,9 @@ import jax
 import numpy as np
 
 from a2tg_jax.data import Scene
+from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.results.viewing import Photographs
 from a2tg_jax.training.fit import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
@@ -64,7 +64,7 @@ class LiveView:
     @property
     def routes(self) -> dict[str, Route]:
         """What the viewer's server answers."""
-        photographs = Photographs(Origin.of_scene(self._scene), lambda: self._scene)
+        photographs = Photographs(origin_of_scene(self._scene), lambda: self._scene)
         return {
             "/": Route("text/html; charset=utf-8", page().encode()),
             f"/{SCENE_NAME}": Route("application/octet-stream", lambda: self._scene_bytes),
@@ -95,7 +95,7 @@ class LiveView:
     def _take(self, run: StageRun) -> None:
         """Copies the state, and lets a thread make a scene of it."""
         began = self._now()
-        origin = Origin.of_scene(self._scene, BACKGROUNDS[run.system.background])
+        origin = origin_of_scene(self._scene, BACKGROUNDS[run.system.background])
         model = dataclasses.replace(jax.device_get(run.state.model), origin=origin)
         self._due = np.inf
         self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)

@@ -11,13 +11,13 @@ from PIL import Image
 
 from a2tg_jax.appearance import Banded, Billboards, Textured
 from a2tg_jax.appearance.textured import shown_textures
-from a2tg_jax.cameras import Camera, resize_camera
-from a2tg_jax.gaussians import SH_C0
+from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.model import Model
-from a2tg_jax.paths import smooth_path
 from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.pictures import to_uint8
+from a2tg_jax.results.images import to_uint8
 from a2tg_jax.texture import texture_arrays
 
 NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8

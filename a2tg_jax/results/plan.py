@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.classes import classes_of
+from a2tg_jax.core.jit import classes_of
 from a2tg_jax.training import Stage, System
 
 STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")

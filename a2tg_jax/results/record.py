@@ -21,12 +21,12 @@ from typing import Any, Literal
 
 import tomli_w
 
-from a2tg_jax.checks import shortened
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.mask_files import AlphaMeaning
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import check_depth
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
-from a2tg_jax.json_text import check_depth
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like

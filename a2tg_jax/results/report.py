@@ -10,11 +10,11 @@ from urllib.parse import quote
 
 import numpy as np
 
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.markup import image, layers, page, slider, table
-from a2tg_jax.results.pictures import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.record import repeating_command
 from a2tg_jax.results.summary import ModelResult, RunResult, learning_lines, minutes, summary_table, versions
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from a2tg_jax.evaluation import Evaluation
+from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.corrected import corrected_title
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import RunRecord

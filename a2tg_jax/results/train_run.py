@@ -5,10 +5,10 @@ import warnings
 from pathlib import Path
 
 from a2tg_jax.data import Scene
+from a2tg_jax.host.machine import this_machine
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.io.model import FORMAT, load_model, save_model
-from a2tg_jax.machine import this_machine
+from a2tg_jax.io.model_file import FORMAT, load_model, save_model
 from a2tg_jax.results.folder import RunFolder, iteration_of
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far

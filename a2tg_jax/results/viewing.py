@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.io.compact import load_compact
-from a2tg_jax.io.model import load_model
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.origin import Origin
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
-from a2tg_jax.results.pictures import to_uint8
+from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.record import read_record
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, photograph_name
 from a2tg_jax.web.server import Route

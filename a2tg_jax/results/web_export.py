@@ -8,9 +8,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.cameras import Camera
-from a2tg_jax.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.viewing import Photographs, Source, middle_of

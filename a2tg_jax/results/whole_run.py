@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from a2tg_jax import signals
 from a2tg_jax.data import Scene
-from a2tg_jax.results.checks import check_new_run
-from a2tg_jax.results.claim import claimed
+from a2tg_jax.host import signals
 from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import RunFolder, check_free, create_run
+from a2tg_jax.results.lock import claimed
+from a2tg_jax.results.preflight import check_new_run
 from a2tg_jax.results.record import RunRecord, read_record, write_record
 from a2tg_jax.results.replacement import drop_old
 from a2tg_jax.results.summary import RunResult

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Plain, TexelRates, Textured, TextureOptions
-from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
+from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
 from a2tg_jax.events import Statistic
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.systems.stage1 import (

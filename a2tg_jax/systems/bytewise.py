@@ -6,16 +6,16 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured, TextureOptions
-from a2tg_jax.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.densify.pruning import Prune
+from a2tg_jax.densify.splitting import SplitByGradient
+from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.mcmc import Noise, densify_times
-from a2tg_jax.pruning import Prune
-from a2tg_jax.splitting import SplitByGradient
 from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.view_dependence import AdaptDegrees
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 LAST_PRUNING = 0.8

@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 from a2tg_jax.appearance import Appearance, Plain
-from a2tg_jax.densify import CloneSplitPrune, FillingDensity, OpacityReset
+from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity, OpacityReset
 from a2tg_jax.events import Event
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.training.options import Ranges, System

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jax import Array
 
-from a2tg_jax.cores import num_threads
 from a2tg_jax.data.scene import View
+from a2tg_jax.host.cores import num_threads
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25

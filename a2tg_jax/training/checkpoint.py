@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.checks import shortened
-from a2tg_jax.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.host.machine import Machine, this_machine
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.model import LONGEST_REASON
-from a2tg_jax.io.structure import check_count, check_rows
-from a2tg_jax.machine import Machine, this_machine
+from a2tg_jax.io.model_file import LONGEST_REASON
+from a2tg_jax.io.validate import check_count, check_rows
 from a2tg_jax.model import Model
-from a2tg_jax.optim import AdamState
 from a2tg_jax.training.options import System
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.stage import Stage

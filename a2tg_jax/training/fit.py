@@ -3,13 +3,13 @@
 import dataclasses
 import warnings
 
-from a2tg_jax.budget import LARGEST_SHORTFALL
-from a2tg_jax.corrections import corrected_origin
-from a2tg_jax.data.scene import Scene
+from a2tg_jax.core.budget import LARGEST_SHORTFALL
+from a2tg_jax.core.origin import BLACK, WHITE, Color
+from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.model import Model
-from a2tg_jax.origin import BLACK, WHITE, Color, Origin
 from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, Watch, check_resume, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background
@@ -148,7 +148,7 @@ def fit_stage(
         start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume, num_restored)
     run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
-    origin = Origin.of_scene(scene, BACKGROUNDS[system.background])
+    origin = origin_of_scene(scene, BACKGROUNDS[system.background])
     origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
     model = dataclasses.replace(run.model, origin=origin)
     if index == len(system.stages()) - 1:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.data.scene import View, view_image
-from a2tg_jax.metrics import flat_psnr, has_learned
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.stage import Background
 
@@ -18,6 +18,8 @@ LEAST_ITERATIONS = 50
 """Training is not judged earlier than this."""
 NUM_COMPARED = 16
 """Iterations before the check whose PSNR is averaged."""
+NEARLY_FLAT = 40.0
+"""Photographs that one colour shows to so many dB tell nothing of whether a model has learned."""
 FLAT_BACKGROUNDS: dict[Background, float] = {"black": 0.0, "white": 1.0, "random": 0.5}
 
 
@@ -72,3 +74,22 @@ def _flat_psnr(view: View, level: float) -> float:
     if view.mask is not None:
         mask = jnp.asarray(view.mask.read())
     return float(flat_psnr(image, mask))
+
+
+def has_learned(psnr: float, flat: float) -> bool:
+    """Whether a PSNR is above that of flat colours (`flat_psnr`); always, if the photographs are nearly flat."""
+    return psnr > flat or flat > NEARLY_FLAT
+
+
+def flat_psnr(target: Array, mask: Array | None = None) -> Array:
+    """PSNR in dB of the best image of one flat colour: what a model reaches that has learned nothing else.
+
+    Args:
+      target: [H, W, 3], clipped to [0, 1] first.
+      mask: [H, W] bool, the pixels that count; None: all of them.
+    """
+    target = jnp.clip(target, 0, 1)
+    weight = jnp.ones(target.shape[:2], target.dtype) if mask is None else jnp.asarray(mask, target.dtype)
+    weight = (weight / jnp.sum(weight))[:, :, None]
+    mean = jnp.sum(weight * target, axis=(0, 1), keepdims=True)
+    return -10 * jnp.log10(jnp.mean(jnp.sum(weight * (target - mean) ** 2, axis=(0, 1))))

@@ -5,10 +5,10 @@ import math
 import typing
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.budget import bytes_of, bytes_per_gaussian, megabytes_of
-from a2tg_jax.corrections import Correction, Exposure, PoseRefinement
+from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.kernels.choice import MAX_TILE_SIZE
+from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
+from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
 from a2tg_jax.training.stage import LearningRates, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 

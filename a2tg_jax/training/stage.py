@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
-from a2tg_jax.corrections import Correction
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
-from a2tg_jax.gaussians import Gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput
-from a2tg_jax.sh import NUM_BASES
+from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.terms import Target
 
 Background = Literal["black", "white", "random"]

@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from a2tg_jax.core.gaussians import Gaussians, init_from_points
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.gaussians import Gaussians, init_from_points
 from a2tg_jax.model import Model
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage

@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.checks import shortened
-from a2tg_jax.corrections import initial_corrections
-from a2tg_jax.io.structure import check_count, check_finite, check_like, check_model
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.validate import check_count, check_finite, check_like, check_model
+from a2tg_jax.training.corrections import initial_corrections
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.step import EXPLODED, TrainState

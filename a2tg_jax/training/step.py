@@ -13,9 +13,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.cameras import Camera
-from a2tg_jax.classes import jit
-from a2tg_jax.corrections import (
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.gradient_statistics import read_probe
+from a2tg_jax.core.jit import jit
+from a2tg_jax.core.optim import AdamState, adam_init, adam_update
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.training.batches import Photographs
+from a2tg_jax.training.corrections import (
     CorrectionState,
     corrected_camera,
     corrected_color,
@@ -23,14 +31,6 @@ from a2tg_jax.corrections import (
     rows_of,
     updated,
 )
-from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
-from a2tg_jax.gaussians import SH_C0, Gaussians
-from a2tg_jax.gradient_statistics import read_probe
-from a2tg_jax.model import Model
-from a2tg_jax.optim import AdamState, adam_init, adam_update
-from a2tg_jax.origin import Origin
-from a2tg_jax.render import RenderSettings, render_traced
-from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.cameras import Camera
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.events import event, static
-from a2tg_jax.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput
+from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 
 
 class Target(NamedTuple):

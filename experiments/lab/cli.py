@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
-from a2tg_jax.io.atomic import replacing
-from a2tg_jax.metrics import load_lpips
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.record import SYNTHETIC
 from lab import machine

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
-from a2tg_jax.budget import BYTES_PER_FLOAT
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.training.registry import merged, with_changes
 from lab.jobs import Job, Record
 

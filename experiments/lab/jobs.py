@@ -14,7 +14,7 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Billboards
-from a2tg_jax.origin import WHITE
+from a2tg_jax.core.origin import WHITE
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.plan import fingerprint, is_same_so_far
 from a2tg_jax.results.record import SceneSource

@@ -8,7 +8,7 @@
 import re
 from pathlib import Path
 
-from a2tg_jax.io.atomic import replacing
+from a2tg_jax.host.atomic import replacing
 
 BLOCK = re.compile(r"(<!-- (results/\S+\.md) -->\n).*?(<!-- end -->)", re.DOTALL)
 

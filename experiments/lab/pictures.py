@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 
 import a2tg_jax as a2tg
-from a2tg_jax.gaussians import SH_C0
-from a2tg_jax.results.pictures import side_by_side, with_colors
+from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.results.images import side_by_side, with_colors
 
 LEAST_WIDTH = 300
 """Of an image in a sheet, in pixels."""

@@ -1,0 +1,216 @@
+"""Spherical harmonics of a degree per Gaussian, as they are stored and trained: one padded table for each band.
+
+Band l holds the 2l + 1 coefficients of degree l. All Gaussians have those of `Gaussians.sh`; one of a higher degree
+owns a row in the table of every band between. `Bands` holds parameters only and is differentiable; `BandLayout` says
+whose a row is. A Gaussian without a row in a table pays nothing for it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.checks import check_shape, short_repr
+from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.texture import bucket_capacity
+
+MAX_DEGREE = 3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Bands:
+    """The coefficients beyond those that all Gaussians have."""
+
+    tables: tuple[Array, ...]
+    """Of the bands above the Gaussians' own degree up to 3: [capacity, 2l + 1, 3]; rows that nobody owns are 0."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class BandLayout:
+    """Whose the rows of the tables are. Integers only: not differentiable, kept apart from `Bands`."""
+
+    owners: tuple[Array, ...]
+    """[capacity] int32 of each table, ascending: the Gaussian that owns a row; N where nobody does."""
+    num: int = dataclasses.field(metadata={"static": True})
+    """Number of Gaussians N."""
+
+    @property
+    def base_degree(self) -> int:
+        """Degree that all Gaussians have."""
+        return MAX_DEGREE - len(self.owners)
+
+    @property
+    def degrees(self) -> np.ndarray:
+        """[N] degree of each Gaussian (host)."""
+        degrees = np.full(self.num, self.base_degree)
+        for owners in self.owners:
+            degrees[_owned(owners, self.num)] += 1
+        return degrees
+
+    def count_floats(self, num: int) -> int:
+        """Floats of the first `num` Gaussians beyond those that all have (host)."""
+        rows = [int(np.count_nonzero(np.asarray(owners) < num)) for owners in self.owners]
+        return sum(count * floats_of_band(degree) for count, degree in zip(rows, self.bands, strict=True))
+
+    @property
+    def bands(self) -> range:
+        """The degree of each table."""
+        return range(self.base_degree + 1, MAX_DEGREE + 1)
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def floats_of_band(degree: int) -> int:
+    """Of one Gaussian: 9, 15 and 21 for the bands of degree 1, 2 and 3."""
+    return 3 * (2 * degree + 1)
+
+
+def allocate_bands(degrees, base_degree: int, dtype=jnp.float32) -> tuple[Bands, BandLayout]:
+    """Tables of zeros for Gaussians of the given degrees (host).
+
+    Args:
+      degrees: [N] integers, `base_degree` to 3.
+      base_degree: that of `Gaussians.sh`.
+      dtype: of the coefficients.
+
+    Raises:
+      ValueError: if a degree is out of range.
+    """
+    degrees = np.asarray(degrees)
+    if degrees.size and not base_degree <= degrees.min() <= degrees.max() <= MAX_DEGREE:
+        raise ValueError(f"degrees must lie in {base_degree}..3; got {degrees.min()}..{degrees.max()}")
+    tables, all_owners = [], []
+    for degree in range(base_degree + 1, MAX_DEGREE + 1):
+        rows = np.flatnonzero(degrees >= degree)
+        owners = np.full(bucket_capacity(len(rows)), len(degrees), np.int32)
+        owners[: len(rows)] = rows
+        all_owners.append(jnp.asarray(owners))
+        tables.append(jnp.zeros((len(owners), 2 * degree + 1, 3), dtype))
+    return Bands(tuple(tables)), BandLayout(tuple(all_owners), len(degrees))
+
+
+def reallocate_bands(bands: Bands, layout: BandLayout, degrees, moments: Any = None) -> tuple[Bands, BandLayout, Any]:
+    """Tables for other degrees (host): what a Gaussian keeps stays as it is, what is new begins at 0.
+
+    Args:
+      bands: the present coefficients.
+      layout: whose they are.
+      degrees: [N] integers, the layout's base degree to 3.
+      moments: any pytree: all `Bands` in it are rebuilt as well, other leaves stay as they are.
+    """
+    check_shape("degrees", degrees, (layout.num,))
+
+    def rebuilt(old: Bands) -> tuple[Bands, BandLayout]:
+        return _packed(_dense_tables(old, layout), degrees, layout.base_degree)
+
+    is_bands = lambda x: isinstance(x, Bands)  # noqa: E731
+    moments = jax.tree.map(lambda leaf: rebuilt(leaf)[0] if is_bands(leaf) else leaf, moments, is_leaf=is_bands)
+    return *rebuilt(bands), moments
+
+
+def gather_bands(bands: Bands, layout: BandLayout, rows: Array) -> Bands:
+    """Coefficients whose Gaussian i shows those of the former Gaussian rows[i]; traceable.
+
+    The degrees stay where they are: what a Gaussian lacks room for is left out, what it has room for and the other
+    lacked is 0.
+    """
+    tables = []
+    for table, owners in zip(bands.tables, layout.owners, strict=True):
+        places = jnp.full(layout.num + 1, table.shape[0], jnp.int32)
+        places = places.at[owners].set(jnp.arange(table.shape[0], dtype=jnp.int32)).at[layout.num].set(table.shape[0])
+        padded_rows = jnp.concatenate([rows, jnp.full((1,), layout.num, rows.dtype)])
+        padded = jnp.concatenate([table, jnp.zeros_like(table, shape=(1, *table.shape[1:]))])
+        tables.append(padded[places[padded_rows[owners]]])
+    return Bands(tuple(tables))
+
+
+def clear_bands(bands: Bands, layout: BandLayout, is_cleared: Array) -> Bands:
+    """Moments of coefficients with those of the marked Gaussians [N] at zero; traceable."""
+    marks = jnp.concatenate([is_cleared, jnp.zeros((1,), bool)])
+    cleared = [
+        jnp.where(marks[owners].reshape(-1, 1, 1), jnp.zeros_like(table), table)
+        for table, owners in zip(bands.tables, layout.owners, strict=True)
+    ]
+    return Bands(tuple(cleared))
+
+
+def first_bands(bands: Bands, layout: BandLayout, num: int) -> tuple[Bands, BandLayout]:
+    """The coefficients of the first `num` Gaussians, in tables of their own (host)."""
+    dense = [table[:num] for table in _dense_tables(bands, layout)]
+    return _packed(dense, layout.degrees[:num], layout.base_degree)
+
+
+def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, degree: Any) -> Array:
+    """[N, 3] what the bands add to Σ Y_l·sh_l of each Gaussian, before 0.5 is added and negatives are cut off.
+
+    Args:
+      bands: coefficients.
+      layout: whose they are.
+      means: [N, 3] positions in the world.
+      center: [3] camera centre in the world.
+      degree: highest degree used; may be traced.
+    """
+    total = jnp.zeros(means.shape, jnp.result_type(means, center, *bands.tables))
+    for table, owners, band in zip(bands.tables, layout.owners, layout.bands, strict=True):
+        if not table.shape[0]:
+            continue
+        directions = normalize(means[jnp.minimum(owners, layout.num - 1)] - center[None, :])
+        basis = sh_basis(directions)[:, NUM_BASES[band - 1] : NUM_BASES[band]]
+        basis = jnp.where(jnp.asarray(degree) >= band, basis, 0.0)
+        total = total.at[owners].add(jnp.sum(basis[:, :, None] * table, axis=1), mode="drop")
+    return total
+
+
+def dense_sh(sh: np.ndarray, bands: Bands, layout: BandLayout) -> np.ndarray:
+    """[N, K, 3] all coefficients, with zeros for what a Gaussian lacks; K is that of the highest degree (host)."""
+    highest = int(layout.degrees.max(initial=layout.base_degree))
+    own = np.asarray(sh)
+    return np.concatenate([own, *_dense_tables(bands, layout)], axis=1, dtype=own.dtype)[:, : NUM_BASES[highest]]
+
+
+def split_sh(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> tuple[Bands, BandLayout]:
+    """The inverse of `dense_sh`, given the degrees: what lies above a Gaussian's degree is left out (host)."""
+    bands = range(base_degree + 1, MAX_DEGREE + 1)
+    dense = np.asarray(dense)
+    return _packed([dense[:, NUM_BASES[band - 1] : NUM_BASES[band]] for band in bands], degrees, base_degree)
+
+
+def _dense_tables(bands: Bands, layout: BandLayout) -> list[np.ndarray]:
+    """[N, 2l + 1, 3] of each band, zeros where a Gaussian lacks it (host)."""
+    tables = []
+    for table, owners in zip(bands.tables, layout.owners, strict=True):
+        rows = _owned(owners, layout.num)
+        dense = np.zeros((layout.num, *table.shape[1:]), table.dtype)
+        dense[rows] = np.asarray(table)[: len(rows)]
+        tables.append(dense)
+    return tables
+
+
+def _packed(dense: Sequence[np.ndarray], degrees, base_degree: int) -> tuple[Bands, BandLayout]:
+    """Tables of what Gaussians of these degrees have of dense ones; those of bands that nobody has may lack columns."""
+    empty, layout = allocate_bands(degrees, base_degree)
+    tables = []
+    for values, fresh, owners in zip(dense, empty.tables, layout.owners, strict=True):
+        rows = _owned(owners, layout.num)
+        filled = np.zeros(fresh.shape, values.dtype)
+        if len(rows):
+            filled[: len(rows)] = values[rows]
+        tables.append(jnp.asarray(filled))
+    return Bands(tuple(tables)), layout
+
+
+def _owned(owners: Array, num: int) -> np.ndarray:
+    """The Gaussians that own the rows in use, in the rows' order."""
+    found = np.asarray(owners)
+    return found[found < num]

@@ -1,0 +1,230 @@
+"""The command line `a2tg`: demo, train, eval, render, view, export, compress, info, sfm."""
+
+import dataclasses
+import inspect
+import os
+import shlex
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from a2tg_jax.cli.arguments import parse
+from a2tg_jax.cli.train import Demo, Train, tell_result, train_defaults
+from a2tg_jax.cli.view import Export, View
+from a2tg_jax.data import run_sfm
+from a2tg_jax.host import signals
+from a2tg_jax.host.startup import configure_cpu
+from a2tg_jax.results.compress import compress, compression_text
+from a2tg_jax.results.folder import open_run
+from a2tg_jax.results.frames import Route, render_frames, write_video
+from a2tg_jax.results.info import describe_run
+from a2tg_jax.results.lock import opened
+from a2tg_jax.results.preflight import check_apart, check_weights
+from a2tg_jax.results.whole_run import measure
+from a2tg_jax.training import SYSTEMS
+
+BROKEN_PIPE = 128 + 13
+OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
+
+Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
+
+  a2tg demo                            a whole run on a built-in scene, about a minute on two cores
+  a2tg sfm photos/ scene/              camera poses for plain photographs, by COLMAP
+  a2tg train scene/ --out runs/scene   train a scene, evaluate, write a report
+  a2tg eval runs/scene                 measure a run again
+  a2tg render runs/scene               frames and a video of a flight, or the test views
+  a2tg view runs/scene                 look at it in a browser; also *.npz, *.a2tgz and *.ply
+  a2tg export runs/scene --web out/    the same for a web server, or as one HTML file
+  a2tg compress runs/scene             a small file of the model that it left
+  a2tg info runs/scene                 what a run folder holds
+
+a2tg COMMAND --help explains a command, a2tg train --system NAME --help the options of a system; a2tg --version tells
+the version. The systems: {", ".join(SYSTEMS)}.
+With A2TG_DEBUG=1 in the environment an error shows its traceback."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Measure the finished stages of a run again and rewrite metrics, pictures and report.
+
+    Example:
+      a2tg eval runs/fox --lpips-weights lpips_alex.npz
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+    lpips_weights: Path | None = None
+    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it, what stands in metrics.json of the same models is
+    kept."""
+
+    def run(self) -> None:
+        check_weights(self.lpips_weights)
+        with opened(self.folder) as run:
+            tell_result(measure(run, lpips_weights=self.lpips_weights), self.folder)
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render frames of a finished run: PNG files and, of a flight and where ffmpeg is installed, a video.
+
+    The photographs are not needed.
+
+    Examples:
+      a2tg render runs/fox --frames 240
+      a2tg render runs/fox --path test --out fox-test
+      a2tg render runs/fox --path path.json --out fox-flight
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+    path: Route | Path = "smooth"
+    """A smooth flight past the cameras, the test views, or a flight through the views that a2tg view saved (*.json)."""
+    frames: int = 120
+    """Length of the flight in frames, 30 a second."""
+    out: Path | None = None
+    """Folder for the frames (default: RUN/frames)."""
+    model: str | None = None
+    """Which model is drawn, by the name that a2tg info tells (default: the last of the run's main system)."""
+
+    def run(self) -> None:
+        run = open_run(self.folder)
+        out = self.out or run.path / "frames"
+        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model)
+        print(f"{len(paths)} frames in {out}")
+        if self.path != "test":
+            video = out / "flight.mp4"
+            made = write_video(out, video)
+            print(f"video: {video}" if made else "no video: ffmpeg is not installed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Compress:
+    """Write the smallest file of a model whose PSNR on the training views is about that of the model.
+
+    A table tells what each choice of bits costs. Where the photographs are not there, losses are those of a model of
+    30 dB, as its renders tell them.
+
+    Examples:
+      a2tg compress runs/fox
+      a2tg compress scene.npz --out scene.a2tgz --max-loss 0.02
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    """Run folder, whose last model is taken, or a model, *.npz."""
+    out: Path | None = None
+    """The file (default: beside the model, NAME.a2tgz)."""
+    max_loss: float = 0.05
+    """How many dB of PSNR may be lost."""
+
+    def run(self) -> None:
+        result = compress(self.source, self.out, max_loss=self.max_loss)
+        print(compression_text(result))
+        print(f"file: {result.path}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Print what a run folder holds: scene, progress of each stage, models, metrics."""
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+
+    def run(self) -> None:
+        print(describe_run(open_run(self.folder)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sfm:
+    """Find camera poses and points for plain photographs with COLMAP's features, matching and mapping.
+
+    Example:
+      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox
+    """
+
+    photos: Positional[Path]
+    """Folder of photographs of one scene."""
+    out: Positional[Path]
+    """Scene folder to make: images and sparse model, ready for a2tg train."""
+
+    def run(self) -> None:
+        check_apart(self.out, self.photos)
+        found = run_sfm(self.photos, self.out)
+        print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
+        print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
+
+
+Command = Demo | Train | Eval | Render | View | Export | Compress | Info | Sfm
+COMMANDS: dict[str, type] = {
+    "demo": Demo, "train": Train, "eval": Eval, "render": Render, "view": View, "export": Export,
+    "compress": Compress, "info": Info, "sfm": Sfm,
+}  # fmt: skip
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+      argv: arguments without the program's name; None: those of the process.
+
+    Returns:
+      The exit code: 0, 2 after a user's error (one line on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after
+      SIGHUP, 141 where nobody reads what is printed.
+    """
+    name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
+    if name in ("-h", "--help", "--version"):
+        print(version("a2tg-jax") if name == "--version" else OVERVIEW)
+        return 0
+    if name not in COMMANDS:
+        return _fail(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
+    try:
+        configure_cpu()
+    except ValueError as error:
+        return _fail(str(error))
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # Where the modules of one's own systems are.
+    try:
+        with warnings.catch_warnings(), signals.raised():
+            warnings.showwarning = _show_warning
+            _parse(name, arguments).run()
+            sys.stdout.flush()
+    except KeyboardInterrupt as stop:
+        stopped = stop if isinstance(stop, signals.Stopped) else signals.Stopped(signals.CTRL_C)
+        print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
+        return stopped.exit_code
+    except BrokenPipeError:
+        # What is left in the buffer is not to be tried again when the process ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except (ValueError, OSError) as error:
+        if os.environ.get("A2TG_DEBUG"):
+            raise
+        return _fail(str(error))
+    return 0
+
+
+def _fail(message: str) -> int:
+    """Prints an error as one line and returns its exit code."""
+    print(f"a2tg: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _parse(name: str, arguments: list[str]) -> Command:
+    """The command that the arguments ask for. System, preset and file are looked at first: they decide the defaults.
+
+    Raises:
+      ValueError, FileNotFoundError: if there is no such system, preset or file, or the file or an argument is wrong.
+    """
+    kind = COMMANDS[name]
+    options: dict[str, Any] = {"description": inspect.getdoc(kind)}
+    if kind is Train:
+        options["default"] = train_defaults(arguments)
+    return parse(kind, f"a2tg {name}", arguments, **options)
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"a2tg: warning: {' '.join(str(message).split())}", file=sys.stderr)

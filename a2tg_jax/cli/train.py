@@ -1,0 +1,196 @@
+"""The commands that train: `a2tg demo` and `a2tg train`."""
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, UseAppendAction, arg
+
+from a2tg_jax.cli.view import in_browser
+from a2tg_jax.data.mask_files import AlphaMeaning
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
+from a2tg_jax.results.lock import opened
+from a2tg_jax.results.preflight import check_weights
+from a2tg_jax.results.record import (
+    DEFAULT_SYSTEM,
+    SYNTHETIC,
+    OnNan,
+    RunFile,
+    RunRecord,
+    SceneSource,
+    changed_numbers,
+    read_record,
+    read_run_file,
+    write_record,
+)
+from a2tg_jax.results.summary import RunResult, summary_text
+from a2tg_jax.results.whole_run import begin_run, go_on, unseen
+from a2tg_jax.systems.a2tg import A2tg, TextureConfig
+from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import System
+
+BASELINE = "gaussians-2d-mcmc"
+DEMO_SYSTEM = A2tg(
+    stage1_iterations=400,
+    stage2_iterations=250,
+    densify=McmcConfig(cap=1_500),
+    texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), rate=1e-2),
+)
+"""Few iterations, so textures grow early and learn fast."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Train the built-in synthetic scene with textures and, for comparison, without.
+
+    Takes about a minute on two cores and writes a report with pictures: open runs/demo/report.html.
+    """
+
+    out: Path = Path("runs/demo")
+    """Run folder."""
+    overwrite: bool = False
+    """Replace an earlier run in that folder; it is kept until the new one has its report."""
+
+    def run(self) -> None:
+        record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
+        tell_result(begin_run(record, self.out, overwrite=self.overwrite), self.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a scene with a system, evaluate it and write a report.
+
+    Examples:
+      a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
+      a2tg train scenes/fox --out runs/fox --resume
+      a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
+      a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
+      a2tg train --config runs/fox/run.toml --out runs/again
+
+    A checkpoint is written every tenth of a stage, at least every 500 iterations, and when the program is stopped by
+    Ctrl-C or SIGTERM; the newest two are kept until the stage is finished.
+    """
+
+    scene: Annotated[Positional[str], arg(metavar="SCENE")]
+    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; --config and --resume know it already."""
+    out: Path
+    """Run folder: models, checkpoints, metrics, pictures and report.html go there."""
+    config: Path | None = None
+    """A TOML file that says any of this, such as the run.toml of a run; flags have precedence."""
+    system: str = DEFAULT_SYSTEM
+    """One of those that a2tg --help lists, or your own as package.module:NAME; its options stand below."""
+    preset: str | None = None
+    """Where the numbers below start from: paper (the defaults), quick (minutes on two cores), smoke (half a minute)."""
+    downscale: int = 1
+    """Use the images at 1/k of their size."""
+    test_every: int = 8
+    """Every k-th image is kept for testing."""
+    alpha: AlphaMeaning = "transparency"
+    """What the alpha channel of images is: the transparency of what they show, or a mask, which leaves pixels out."""
+    compare: UseAppendAction[tuple[str, ...]] = ()
+    """Also train this system, to compare with: with the options above and below, where it has any of that name."""
+    baseline: bool = False
+    """Short for --compare gaussians-2d-mcmc: the same iterations without textures."""
+    on_nan: OnNan = "stop"
+    """Where a loss or gradient is not finite, or a loss explodes: stop, or restore the newest checkpoint and go on with
+    the views in another order."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the run folder."""
+    overwrite: bool = False
+    """Replace an earlier run in that folder; it is kept until the new one has its report."""
+    lpips_weights: Path | None = None
+    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+    view: bool = False
+    """Show the training in a browser as it runs, where it can be paused."""
+    max_memory: str | None = None
+    """Refuse what would take more memory, of the process or of the GPU, than 8GB, 800MB, … (default: all that there
+    is); of the photographs, those beyond a quarter of it stay on disk. --memory-budget bounds the model instead."""
+    options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
+
+    def run(self) -> None:
+        weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
+        watched = in_browser if self.view else unseen
+        if not self.resume:
+            result = begin_run(
+                self.record, self.out, overwrite=self.overwrite, lpips_weights=weights, max_memory=most, watched=watched
+            )
+            tell_result(result, self.out)
+            return
+        if self.overwrite:
+            raise ValueError("--resume goes on with a run and --overwrite replaces it: give one of them")
+        check_weights(weights)
+        with opened(self.out) as run:
+            record = self._resumed(run)
+            scene = record.scene.load(room_for_photographs(most))
+            tell_forecast(scene, record.plan, most)
+            tell_result(go_on(run, scene, lpips_weights=weights, watched=watched), self.out)
+
+    @property
+    def record(self) -> RunRecord:
+        """The run that the flags ask for."""
+        path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
+        compare = (*self.compare, BASELINE) if self.baseline else self.compare
+        source = SceneSource(path, self.downscale, self.test_every, self.alpha)
+        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset, self.on_nan)
+
+    def _resumed(self, run: RunFolder) -> RunRecord:
+        """The record of an existing run, after a check that no flag contradicts it; with what is compared besides."""
+        kept, asked = read_record(run), self.record
+        if asked.scene.path != kept.scene.path:
+            raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
+        changed = changed_numbers(asked, kept)
+        if changed:
+            flags = ", ".join("--" + name.replace("_", "-") for name in changed)
+            advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
+            raise ValueError(f"--resume takes every number from {run.record}; {advice}")
+        compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
+        record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
+        record.check()
+        if record != kept:
+            write_record(run, record)
+        return record
+
+
+def train_defaults(arguments: list[str]) -> Train:
+    """What is not said on the command line: from the file; when a run is resumed, from its own."""
+    path = _value_of("--config", arguments)
+    system, preset = _value_of("--system", arguments), _value_of("--preset", arguments)
+    out = _value_of("--out", arguments)
+    if out and "--resume" in arguments and "--overwrite" not in arguments:
+        with opened(out) as run:
+            path = path if path or preset else str(run.record)
+    file = read_run_file(Path(path)) if path else RunFile()
+    if preset or (system and system != file.system):
+        # The numbers of the file are those of another preset or system.
+        file = dataclasses.replace(file, system=system or file.system, preset=preset or None, options={})
+    return Train(
+        scene=tyro.MISSING if file.scene is None else file.scene,
+        out=tyro.MISSING,
+        system=file.system,
+        preset=file.preset,
+        downscale=file.downscale,
+        test_every=file.test_every,
+        alpha=file.alpha,
+        compare=file.compare,
+        on_nan=file.on_nan,
+        options=file.chosen(path),
+    )
+
+
+def _value_of(flag: str, arguments: list[str]) -> str:
+    """The value after `flag`, as "--flag value" or "--flag=value"; empty without it."""
+    for word, following in itertools.pairwise([*arguments, ""]):
+        if word == flag:
+            return following
+        if word.startswith(flag + "="):
+            return word.split("=", 1)[1]
+    return ""
+
+
+def tell_result(result: RunResult, folder: Path) -> None:
+    """The figures, and where the report is."""
+    print(summary_text(result))
+    print(f"report: {RunFolder(folder).report}")

@@ -1,0 +1,104 @@
+"""Pinhole cameras in OpenCV's frame: x right, y down, z forward; pixel centres at +0.5."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.checks import check_floats, short_repr
+
+LONGEST_SIDE = 100_000
+"""Pixels of the longer side of an image."""
+SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
+"""Focal lengths, in units of the longer side: an angle of view of 180° but for 0.1°, and one of 2 arc seconds."""
+LARGEST_OFFSET = 100.0
+"""The principal point is at most so many longer sides away from the image's corner."""
+MAX_SKEW = 1e-2
+"""Largest deviation of a rotation from an orthonormal matrix that still passes as rounding."""
+LARGEST_COORDINATE = 1e12
+"""Of a camera's position, in any world."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """One view. `viewmat` and `K` are differentiable; the image size is static."""
+
+    viewmat: Array
+    """[4, 4] world to camera, a rigid motion."""
+    K: Array
+    """[3, 3] intrinsics in pixels, last row (0, 0, 1)."""
+    width: int = dataclasses.field(metadata={"static": True})
+    """Image width in pixels."""
+    height: int = dataclasses.field(metadata={"static": True})
+    """Image height in pixels."""
+
+    @property
+    def center(self) -> Array:
+        """[3] position of the camera in the world, −Rcᵀt."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def check_camera(camera: Camera, name: str = "camera") -> None:
+    """Raises ValueError, naming the field, unless the matrices have their shapes and the image a size."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{name} must be a Camera; got {type(camera).__name__}")
+    check_floats(f"{name}.viewmat", camera.viewmat, (4, 4))
+    check_floats(f"{name}.K", camera.K, (3, 3))
+    for side in ("width", "height"):
+        value = getattr(camera, side)
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name}.{side} must be a positive number of pixels; got {value!r}")
+
+
+def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, what: str) -> None:
+    """Refuses numbers of a camera, read from a file, that no camera has (host).
+
+    Args:
+      viewmat: [4, 4].
+      K: [3, 3] in pixels.
+      width, height: of the image.
+      what: the camera, as the error names it.
+
+    Raises:
+      ValueError: if a number is NaN, infinite, or outside the bounds that this module opens with.
+    """
+    check_intrinsics(K, width, height, what)
+    rotation = viewmat[:3, :3]
+    if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
+        raise ValueError(f"{what}: its pose must be finite, within ±{LARGEST_COORDINATE:g}; got {_numbers(viewmat)}")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_SKEW or not np.array_equal(viewmat[3], [0, 0, 0, 1]):
+        raise ValueError(f"{what}: its pose must be a rigid motion; got {_numbers(viewmat)}")
+
+
+def check_intrinsics(K: np.ndarray, width: int, height: int, what: str) -> None:
+    """The part of `check_calibration` that is about the image and K. Raises as it does."""
+    side = max(width, height)
+    if not 1 <= min(width, height) <= side <= LONGEST_SIDE:
+        raise ValueError(f"{what}: its image must have sides of 1..{LONGEST_SIDE} pixels; got {width}x{height}")
+    K = np.asarray(K, np.float64)
+    focal, offset = K[[0, 1], [0, 1]], K[[0, 1], [2, 2]]
+    if not ((focal >= SHORTEST_FOCAL * side) & (focal <= LONGEST_FOCAL * side)).all():  # False for NaN.
+        wanted = f"{SHORTEST_FOCAL * side:g}..{LONGEST_FOCAL * side:g} pixels, for its image is {width}x{height}"
+        raise ValueError(f"{what}: its focal lengths must lie in {wanted}; got {_numbers(focal)}")
+    if not (np.abs(offset) <= LARGEST_OFFSET * side).all():
+        wanted = f"within {LARGEST_OFFSET:g} sides of its image of {width}x{height}"
+        raise ValueError(f"{what}: its principal point must lie {wanted}; got {_numbers(offset)}")
+    if not np.array_equal(K[2], [0, 0, 1]) or K[1, 0] != 0 or not np.abs(K[0, 1]) <= focal[0]:
+        raise ValueError(f"{what}: its K must be upper triangular, with a last row of (0, 0, 1); got {_numbers(K)}")
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:g}" for value in np.asarray(values).ravel())
+
+
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same view sampled at another image size: K scales with each side (pixel edges stay edges)."""
+    dtype = camera.K.dtype
+    factors = jnp.asarray([[width / camera.width], [height / camera.height], [1.0]], dtype)
+    return Camera(camera.viewmat, camera.K * factors, width, height)

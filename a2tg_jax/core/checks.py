@@ -1,0 +1,62 @@
+"""Shapes and dtypes of arguments: checked with an error that names the argument, and written short.
+
+Only `shape` and `dtype` are looked at, so that tracers pass and nothing is computed.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+Wanted = tuple[int | str, ...]
+"""Sides of an array: numbers, or letters for any size, such as ("N", 16, 3)."""
+
+
+def check_shape(name: str, x: Any, wanted: Wanted) -> None:
+    """Raises ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
+
+    Args:
+      name: of the argument, as the caller knows it.
+      x: an array, a tracer, or nested sequences of numbers.
+      wanted: its sides.
+    """
+    shape = np.shape(x)
+    if len(shape) != len(wanted) or not _fits(shape, wanted):
+        raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape)}")
+
+
+def check_floats(name: str, x: Any, wanted: Wanted) -> None:
+    """As `check_shape`; x must also hold floats."""
+    check_shape(name, x, wanted)
+    if not jnp.issubdtype(dtype_of(x), jnp.floating):
+        raise ValueError(f"{name} must be floats; got {dtype_of(x)}")
+
+
+def dtype_of(x: Any) -> Any:
+    """The dtype of an array, a tracer, or nested sequences of numbers."""
+    return x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
+
+
+def described(value: Any) -> str:
+    """A value in a few characters: arrays by dtype and shape, as in float32[7, 3]."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{value.dtype}{_written(value.shape)}"
+    if type(value) is tuple:
+        return f"({', '.join(described(item) for item in value)}{',' if len(value) == 1 else ''})"
+    return repr(value)
+
+
+def short_repr(value: Any) -> str:
+    """The `repr` of a dataclass that holds arrays."""
+    fields = (f"{field.name}={described(getattr(value, field.name))}" for field in dataclasses.fields(value))
+    return f"{type(value).__name__}({', '.join(fields)})"
+
+
+def _fits(shape: tuple[int, ...], wanted: Wanted) -> bool:
+    sizes: dict[int | str, int] = {}
+    return all(sizes.setdefault(side, side if isinstance(side, int) else n) == n for n, side in zip(shape, wanted))  # noqa: B905
+
+
+def _written(shape: tuple) -> str:
+    return f"[{', '.join(str(side) for side in shape)}]"

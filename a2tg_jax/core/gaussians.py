@@ -1,0 +1,164 @@
+"""Flat 2D Gaussians: raw, differentiable parameters, their activations, and initial values from points.
+
+N is the number of Gaussians; quaternions are wxyz and need not be unit.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial import cKDTree
+
+from a2tg_jax.core.checks import check_floats, dtype_of, short_repr
+from a2tg_jax.core.numerics import safe_divide, safe_sqrt
+from a2tg_jax.core.sh import NUM_BASES
+
+INITIAL_OPACITY = 0.1
+SH_C0 = 0.28209479177387814
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Gaussians:
+    """N flat Gaussians as unconstrained arrays, all of one float dtype."""
+
+    means: Array
+    """[N, 3] centres in the world."""
+    quats: Array
+    """[N, 4] rotations, wxyz, not necessarily unit."""
+    log_scales: Array
+    """[N, 2] logarithms of the standard deviations (s_x, s_y) along the first two axes."""
+    logit_opacities: Array
+    """[N] logits of the peak opacities."""
+    sh: Array
+    """[N, K, 3] spherical-harmonic coefficients of the colour, degree 0 first; K is 1, 4, 9 or 16."""
+
+    @property
+    def num(self) -> int:
+        """Number of rows N."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of their spherical harmonics, 0 to 3."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    @property
+    def floats_per_row(self) -> int:
+        """Floats of one Gaussian: 58 at degree 3, 13 at degree 0."""
+        return floats_per_gaussian(self.sh_degree)
+
+    @property
+    def scales(self) -> Array:
+        """[N, 2] standard deviations, positive."""
+        return jnp.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Array:
+        """[N] peak opacities in (0, 1)."""
+        return jax.nn.sigmoid(self.logit_opacities)
+
+    def __getitem__(self, rows) -> "Gaussians":
+        """The Gaussians of the given rows (slice, mask or index array)."""
+        return jax.tree.map(lambda x: x[rows], self)
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def floats_per_gaussian(sh_degree: int = 3) -> int:
+    """Mean, rotation, scales, opacity, and the coefficients up to a degree."""
+    return 10 + 3 * NUM_BASES[sh_degree]
+
+
+def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
+    """Raises ValueError, naming the field, unless all fields have their shapes and one float dtype."""
+    if not isinstance(gaussians, Gaussians):
+        raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
+    check_floats(f"{name}.means", gaussians.means, ("N", 3))
+    num, dtype = gaussians.num, dtype_of(gaussians.means)
+    bases = gaussians.sh.shape[1] if np.ndim(gaussians.sh) == 3 and gaussians.sh.shape[1] in NUM_BASES else 16
+    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, bases, 3)}
+    for field, shape in shapes.items():
+        value = getattr(gaussians, field)
+        check_floats(f"{name}.{field}", value, shape)
+        if dtype_of(value) != dtype:
+            raise ValueError(f"{name}.{field} must be {dtype} as the means are; got {dtype_of(value)}")
+
+
+def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
+    """The columns of the rotation of a quaternion (w, x, y, z), which is normalised first; element-wise."""
+    w, x, y, z = quat
+    norm = safe_sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = (safe_divide(number, norm) for number in quat)
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def rotation_matrices(quats: Array) -> Array:
+    """Rotation matrices [..., 3, 3] of the quaternions [..., 4] (wxyz), which are normalised first."""
+    columns = rotation_columns(tuple(jnp.moveaxis(quats, -1, 0)))
+    return jnp.stack([jnp.stack(column, -1) for column in columns], -1)
+
+
+def logit(p: Array) -> Array:
+    """log(p / (1 - p)) for p in (0, 1)."""
+    return jnp.log(p) - jnp.log1p(-p)
+
+
+def init_from_points(
+    points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY, sh_degree: int = 3
+) -> Gaussians:
+    """Initial Gaussians from points of a sparse reconstruction.
+
+    log-scale = log of the root mean square distance to the 3 nearest neighbours (both axes), uniformly random
+    rotations, one opacity, SH degree 0 from the point's colour, higher degrees 0.
+
+    Args:
+      points: [P, 3] positions, P >= 2.
+      colors: [P, 3] colours in [0, 1].
+      num: how many Gaussians; None or anything >= P takes all the points, less draws that many without replacement.
+      seed: of the drawing and of the rotations.
+      opacity: of every Gaussian, between 0 and 1.
+      sh_degree: highest degree of spherical harmonics that they have coefficients of, 0 to 3.
+
+    Returns:
+      float32 Gaussians, min(num, P) of them.
+
+    Raises:
+      ValueError: if the shapes disagree, there are fewer than two points, or a number is not finite.
+    """
+    points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
+        raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
+    if not (np.isfinite(points).all() and np.isfinite(colors).all()):
+        raise ValueError("points and colors must be finite; some are NaN or infinite")
+    if num is not None and num < 2:
+        raise ValueError(f"num must be at least 2; got {num}")
+    rng = np.random.default_rng(seed)
+    if num is not None and num < len(points):
+        keep = np.sort(rng.choice(len(points), num, replace=False))
+        points, colors = points[keep], colors[keep]
+    if len(points) < 2:
+        raise ValueError(f"at least two points are needed to choose scales; got {len(points)}")
+    neighbours = min(3, len(points) - 1)
+    distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
+    scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
+    count = len(points)
+    sh = np.zeros((count, NUM_BASES[sh_degree], 3))
+    sh[:, 0] = (colors - 0.5) / SH_C0
+    quats = rng.normal(size=(count, 4))
+    as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return Gaussians(
+        means=as_float(points),
+        quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
+        log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
+        logit_opacities=as_float(np.full(count, np.log(opacity / (1 - opacity)))),
+        sh=as_float(sh),
+    )

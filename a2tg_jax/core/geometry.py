@@ -1,0 +1,151 @@
+"""From splats to pixels: homographies, the ray-splat intersection, and tight bounds on the screen.
+
+M [3, 3] takes (u, v, 1), in standard deviations of the splat, to homogeneous pixels: equation (1) of 2DGS as a 3×3
+matrix, M = K·[Rc·R₀·s_x | Rc·R₁·s_y | Rc·μ + t]. Its last row gives the depth. N splats, rows M₀, M₁, M₂.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians, rotation_columns
+
+POLYGON_SIDES = 8
+BOUND_SLACK = 1e-2
+"""Squared pixels added to every bound, for rounding."""
+
+
+def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
+    """M [N, 3, 3] of each splat, and its normals [N, 3] in the world, turned to face the camera."""
+    # Number by number: CPUs vectorise over N, and hardly over axes of 2 and 3.
+    x_axis, y_axis, normal = rotation_columns(tuple(gaussians.quats[:, k] for k in range(4)))
+    mean = tuple(gaussians.means[:, k] for k in range(3))
+    scale_x, scale_y = gaussians.scales[:, 0], gaussians.scales[:, 1]
+    to_pixels = camera.K @ camera.viewmat[:3]
+
+    def row(i: int) -> list[Array]:
+        u, v, w = (sum(to_pixels[i, k] * axis[k] for k in range(3)) for axis in (x_axis, y_axis, mean))
+        return [scale_x * u, scale_y * v, w + to_pixels[i, 3]]
+
+    M = jnp.stack([number for i in range(3) for number in row(i)], axis=1).reshape(-1, 3, 3)
+    towards_camera = sum(normal[k] * (camera.center[k] - mean[k]) for k in range(3))
+    return M, jnp.stack([jnp.where(towards_camera < 0, -number, number) for number in normal], axis=1)
+
+
+class Outline(NamedTuple):
+    """What a splat can show lies in an ellipse, or in a circle around its mean: the low-pass filter's reach."""
+
+    ellipse_x: Array
+    """Centre of the ellipse, in pixels."""
+    ellipse_y: Array
+    xx: Array
+    """The matrix S = [[xx, xy], [xy, yy]] with (x − e)ᵀS⁻¹(x − e) <= 1 inside the ellipse."""
+    xy: Array
+    yy: Array
+    mean_x: Array
+    """Centre of the circle: the projected mean."""
+    mean_y: Array
+    radius: Array
+    """Radius of the circle, in pixels."""
+    is_clipped: Array
+    """The disc reaches behind the near plane: this is no outline, only the box holds."""
+
+
+class ScreenBounds(NamedTuple):
+    """Where splats can reach 1/255, in pixels, conservatively; [N] each."""
+
+    left: Array
+    top: Array
+    right: Array
+    """Less than `left` where the splat is invisible, as `bottom` is then less than `top`."""
+    bottom: Array
+    outline: Outline
+
+
+def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
+    """Bounds of the discs u² + v² <= cutoff seen on the screen, joined with the low-pass filter's reach.
+
+    Args:
+      M: [N, 3, 3] homographies.
+      cutoff: [N] r² = 2·ln(255·o·max T_A); a splat with r² <= 0 shows nowhere.
+      near_plane: depths below it are not hit.
+    """
+    rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
+    bounds = unclipped_bounds(rows, cutoff, near_plane)
+    clipped = clipped_box(rows, bounds.outline, cutoff, near_plane)
+    is_clipped = bounds.outline.is_clipped
+    left, top, right, bottom = (jnp.where(is_clipped, a, b) for a, b in zip(clipped, bounds[:4], strict=True))
+    return ScreenBounds(left, top, right, bottom, bounds.outline)
+
+
+def unclipped_bounds(M, cutoff: Array, near_plane: float) -> ScreenBounds:
+    """As `screen_bounds`, of rows M[i][k]; element-wise. Where the outline is clipped the box means nothing.
+
+    M is shifted to the projected mean, which keeps float32 exact to a fraction of a pixel.
+    """
+    last_u, last_v, depth = M[2]
+    is_visible = (depth >= near_plane) & (cutoff > 0)
+    depth = jnp.where(is_visible, depth, 1.0)
+    r2 = jnp.where(is_visible, cutoff, 0.0)
+    mean_x, mean_y = M[0][2] / depth, M[1][2] / depth
+    x_u, x_v = M[0][0] - mean_x * last_u, M[0][1] - mean_x * last_v
+    y_u, y_v = M[1][0] - mean_y * last_u, M[1][1] - mean_y * last_v
+    spread2 = r2 * (last_u * last_u + last_v * last_v)
+    is_clipped = is_visible & (depth - jnp.sqrt(spread2) < near_plane)
+
+    scale = jnp.where(is_clipped, 0.0, r2 / jnp.where(is_clipped, 1.0, depth * depth - spread2))
+    shift_x, shift_y = -scale * (x_u * last_u + x_v * last_v), -scale * (y_u * last_u + y_v * last_v)
+    ellipse_x, ellipse_y = mean_x + shift_x, mean_y + shift_y
+    xx = (shift_x * shift_x + scale * (x_u * x_u + x_v * x_v)) * (1 + 1e-4) + BOUND_SLACK
+    xy = (shift_x * shift_y + scale * (x_u * y_u + x_v * y_v)) * (1 + 1e-4)
+    yy = (shift_y * shift_y + scale * (y_u * y_u + y_v * y_v)) * (1 + 1e-4) + BOUND_SLACK
+    half_x, half_y, radius = jnp.sqrt(xx), jnp.sqrt(yy), jnp.sqrt(r2 / 2 + BOUND_SLACK)
+    return ScreenBounds(
+        left=jnp.where(is_visible, jnp.minimum(ellipse_x - half_x, mean_x - radius), 1.0),
+        top=jnp.where(is_visible, jnp.minimum(ellipse_y - half_y, mean_y - radius), 1.0),
+        right=jnp.where(is_visible, jnp.maximum(ellipse_x + half_x, mean_x + radius), -1.0),
+        bottom=jnp.where(is_visible, jnp.maximum(ellipse_y + half_y, mean_y + radius), -1.0),
+        outline=Outline(ellipse_x, ellipse_y, xx, xy, yy, mean_x, mean_y, radius, is_clipped),
+    )
+
+
+def clipped_box(M, outline: Outline, cutoff: Array, near_plane: float) -> tuple[Array, Array, Array, Array]:
+    """Left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise.
+
+    It means something where the outline is clipped.
+    """
+    angles = np.arange(POLYGON_SIDES) * (2 * np.pi / POLYGON_SIDES)
+    reach = jnp.sqrt(jnp.maximum(cutoff, 0.0)) / math.cos(math.pi / POLYGON_SIDES)
+    points = []
+    for cosine, sine in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True):
+        u, v = reach * cosine, reach * sine
+        points.append(tuple(row[0] * u + row[1] * v + row[2] for row in M))
+
+    mean_x, mean_y, radius = outline.mean_x, outline.mean_y, outline.radius
+    box = mean_x, mean_y, mean_x, mean_y
+
+    def joined(box, is_valid, point):
+        x, y, depth = point
+        depth = jnp.where(is_valid, jnp.maximum(depth, near_plane), 1.0)
+        x, y = jnp.where(is_valid, x / depth, mean_x), jnp.where(is_valid, y / depth, mean_y)
+        return jnp.minimum(box[0], x), jnp.minimum(box[1], y), jnp.maximum(box[2], x), jnp.maximum(box[3], y)
+
+    for point, following in zip(points, points[1:] + points[:1], strict=True):
+        is_before = point[2] >= near_plane
+        box = joined(box, is_before, point)
+        crosses = is_before != (following[2] >= near_plane)
+        fraction = jnp.where(crosses, (near_plane - point[2]) / jnp.where(crosses, following[2] - point[2], 1.0), 0.0)
+        cut = tuple(a + fraction * (b - a) for a, b in zip(point, following, strict=True))
+        box = joined(box, crosses, cut)
+    left, top, right, bottom = box
+    margin_x, margin_y = 1e-3 * (right - left) + BOUND_SLACK, 1e-3 * (bottom - top) + BOUND_SLACK
+    return (
+        jnp.minimum(left - margin_x, mean_x - radius),
+        jnp.minimum(top - margin_y, mean_y - radius),
+        jnp.maximum(right + margin_x, mean_x + radius),
+        jnp.maximum(bottom + margin_y, mean_y + radius),
+    )

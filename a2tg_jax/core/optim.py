@@ -1,0 +1,113 @@
+"""Adam and its schedules, in jaxopt's style: pure functions that take and return (params, state).
+
+jaxopt has no Adam of its own. The only module that imports jaxopt.
+"""
+
+import dataclasses
+import math
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.core.checks import check_shape
+
+with warnings.catch_warnings():
+    # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
+    warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+    from jaxopt import OptStep  # type: ignore[import-untyped]
+    from jaxopt.linear_solve import solve_cg as solve_cg  # type: ignore[import-untyped]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class AdamState:
+    """Adam's memory; `mu` and `nu` have the structure, shapes and dtypes of the parameters."""
+
+    mu: Any
+    """Decayed mean of the gradients."""
+    nu: Any
+    """Decayed mean of the squared gradients."""
+    count: Array
+    """int32, updates made so far."""
+
+
+def adam_init(params) -> AdamState:
+    """The state before the first update: zero moments.
+
+    Args:
+      params: any pytree of float arrays.
+    """
+    zeros = jax.tree.map(jnp.zeros_like, params)
+    return AdamState(mu=zeros, nu=jax.tree.map(jnp.zeros_like, params), count=jnp.zeros((), jnp.int32))
+
+
+def adam_update(
+    params, grads, state: AdamState, rates, *, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
+) -> OptStep:
+    """One update of Adam (Kingma & Ba, 2015), bias-corrected; ε is added after the correction, as in PyTorch.
+
+    Args:
+      params: pytree of float arrays.
+      grads: the same pytree of gradients.
+      state: from `adam_init` or the update before.
+      rates: learning rates, a pytree prefix of `params`: one for all, or one per field. A rate is a scalar or an
+        array that broadcasts against its leaf at equal rank ([1, K, 1] sets one per spherical harmonic).
+      b1: decay of the first moment, in [0, 1).
+      b2: decay of the second moment, in [0, 1).
+      eps: ε > 0.
+
+    Returns:
+      jaxopt's `OptStep(params, state)`, the updated parameters and the `AdamState`.
+
+    Raises:
+      ValueError: if gradients, moments or rates do not fit the parameters, naming the leaf.
+    """
+    for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
+        _check_like(name, tree, params)
+    count = state.count + 1
+    mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
+    nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
+
+    def step(rate, param, m, v):
+        rate = jnp.asarray(rate, param.dtype)
+        if rate.ndim and (rate.ndim != param.ndim or jnp.broadcast_shapes(rate.shape, param.shape) != param.shape):
+            raise ValueError(f"rates must broadcast to {[*param.shape]} at equal rank; got {[*rate.shape]}")
+        root = jnp.sqrt(v) / jnp.sqrt(_bias_correction(b2, count, param.dtype))
+        return param - rate / _bias_correction(b1, count, param.dtype) * (m / (root + eps))
+
+    params = jax.tree.map(step, jax.tree.broadcast(rates, params), params, mu, nu)
+    return OptStep(params=params, state=AdamState(mu, nu, count))
+
+
+def exponential_decay(start: float, final_factor: float, iteration: Array | int, total: int) -> Array:
+    """start · final_factor^(iteration / total): from `start` at iteration 0, log-linear, then constant.
+
+    Args:
+      start: the rate at the beginning, in units of the parameter per step.
+      final_factor: the rate at `total` over that at 0, positive.
+      iteration: may be traced.
+      total: iterations of the stage, at least 1.
+
+    Returns:
+      A scalar of the default float dtype.
+    """
+    progress = jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) / total, 0.0, 1.0)
+    return start * jnp.exp(math.log(final_factor) * progress)
+
+
+def _check_like(name: str, tree, params) -> None:
+    """Raises ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
+    found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
+    if found != wanted:
+        raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    for (path, leaf), param in zip(leaves, jax.tree.leaves(params), strict=True):
+        check_shape(f"{name}{jax.tree_util.keystr(path)}", leaf, jnp.shape(param))
+
+
+def _bias_correction(decay: float, count: Array, dtype) -> Array:
+    """1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
+    return -jnp.expm1(count.astype(dtype) * math.log(decay))

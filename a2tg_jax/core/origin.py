@@ -1,0 +1,98 @@
+"""Where a model was trained: its cameras, the way to the original world, and what was behind the splats.
+
+With it a model is rendered, flown past and moved without the photographs.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.similarity import Similarity
+
+Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
+WHITE: Color = (1.0, 1.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Origin:
+    """V cameras and the world they stand in. On the host; equal, and of one hash, where all numbers are."""
+
+    viewmats: np.ndarray
+    """[V, 4, 4] float64, world to camera."""
+    Ks: np.ndarray
+    """[V, 3, 3] float64, in pixels."""
+    sizes: np.ndarray
+    """[V, 2] integers (width, height)."""
+    names: tuple[str, ...]
+    """Of the photographs."""
+    is_test: np.ndarray
+    """[V] bool: the photograph was kept for testing."""
+    transform: Similarity
+    """Leads from the original world to the one of the cameras."""
+    background: Color = BLACK
+    """RGB behind everything when the model is looked at."""
+    corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """[V, ...] what was learned of each photograph besides (`corrections`), by the correction's name, in the world of
+    the training; `viewmats` are corrected by it already."""
+
+    @staticmethod
+    def of_cameras(
+        cameras: Sequence[Camera],
+        names: Sequence[str] | None = None,
+        *,
+        is_test: Sequence[bool] | None = None,
+        transform: Similarity | None = None,
+        background: Color = BLACK,
+    ) -> "Origin":
+        """Any cameras; where nothing else is said named by number, none for testing, in their original world."""
+        num = len(cameras)
+        return Origin(
+            viewmats=np.array([camera.viewmat for camera in cameras], np.float64).reshape(num, 4, 4),
+            Ks=np.array([camera.K for camera in cameras], np.float64).reshape(num, 3, 3),
+            sizes=np.array([(camera.width, camera.height) for camera in cameras], np.int64).reshape(num, 2),
+            names=tuple(str(index) for index in range(num)) if names is None else tuple(names),
+            is_test=np.zeros(num, bool) if is_test is None else np.array(is_test, bool),
+            transform=transform or Similarity(1.0, np.eye(3), np.zeros(3)),
+            background=background,
+        )
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras, float32."""
+        return [
+            Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), int(width), int(height))
+            for viewmat, K, (width, height) in zip(self.viewmats, self.Ks, self.sizes, strict=True)
+        ]
+
+    def moved(self, similarity: Similarity) -> "Origin":
+        """The same cameras in the world that `similarity` leads to; corrections, which are in them, are forgotten."""
+        viewmats = [similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]
+        return dataclasses.replace(
+            self,
+            viewmats=np.array(viewmats).reshape(-1, 4, 4),
+            transform=self.transform.then(similarity),
+            corrections={},
+        )
+
+    # Arrays have no hash of their own, and jit asks for one of everything that is static.
+
+    @functools.cached_property
+    def _content(self) -> tuple:
+        arrays = (self.viewmats, self.Ks, self.sizes, self.is_test, self.transform.rotation, self.transform.translation)
+        texts = tuple(np.ascontiguousarray(array).tobytes() for array in arrays)
+        learned = tuple((name, rows.shape, rows.tobytes()) for name, rows in sorted(self.corrections.items()))
+        return texts, self.names, float(self.transform.scale), self.background, learned
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Origin) and self._content == other._content)
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    def __repr__(self) -> str:
+        return f"Origin({len(self.names)} cameras, {int(np.sum(self.is_test))} of them for testing)"

@@ -1,0 +1,124 @@
+"""Smooth camera paths: past the cameras of a scene, or through views that someone chose."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.similarity import camera_centers
+
+SMOOTHING = 0.06
+"""Standard deviation of the smoothing, as a share of the path."""
+TURN_WEIGHT = 0.5
+"""How much a change of viewing direction counts against a change of place when the cameras are put in order."""
+
+
+def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
+    """Cameras that fly past the given ones, of constant speed, smooth in position and direction.
+
+    The cameras are visited in a short tour; positions, viewing directions and down vectors are then smoothed along it,
+    so the path stays where photographs were taken and the scene is well known.
+
+    Args:
+      cameras: at least two; the first one's intrinsics and image size are used throughout.
+      num_frames: number of cameras on the path, at least one.
+
+    Raises:
+      ValueError: if there are fewer than two cameras or no frames.
+    """
+    if len(cameras) < 2 or num_frames < 1:
+        raise ValueError(f"a path needs two cameras and a frame; got {len(cameras)} cameras, {num_frames} frames")
+    viewmats = np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
+    centers = camera_centers(viewmats)
+    forwards, downs = viewmats[:, 2, :3], viewmats[:, 1, :3]
+    tour = _short_tour(centers, forwards)
+    knots = np.concatenate([centers, forwards, downs], axis=1)[tour]
+    curve = _smoothed(knots, num_frames)
+    first = cameras[0]
+    return [
+        Camera(jnp.asarray(_look(*np.split(row, 3)), first.viewmat.dtype), first.K, first.width, first.height)
+        for row in curve
+    ]
+
+
+def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
+    """Cameras of a smooth flight through some views, in their order, of constant speed between two of them.
+
+    Positions follow a cubic spline; directions turn evenly, and intrinsics change evenly, from view to view.
+
+    Args:
+      views: at least one; the first one's image size is used throughout.
+      num_frames: number of cameras on the path, at least one.
+
+    Raises:
+      ValueError: if there are no views or no frames.
+    """
+    if not views or num_frames < 1:
+        raise ValueError(f"a path needs a view and a frame; got {len(views)} views, {num_frames} frames")
+    first = views[0]
+    views = [resize_camera(view, first.width, first.height) for view in views]
+    if len(views) == 1:
+        return [first] * num_frames
+    viewmats = np.stack([np.asarray(view.viewmat, np.float64) for view in views])
+    rotations = Rotation.from_matrix(viewmats[:, :3, :3])
+    centers = camera_centers(viewmats)
+    # As much time as the way and the turn take, so that one does not run through a view.
+    ways = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
+    steps = ways / max(ways.mean(), 1e-12) + turns / max(turns.mean(), 1e-12)
+    knots = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-3))])
+    times = np.linspace(0.0, knots[-1], num_frames)
+    places, turned = CubicSpline(knots, centers, bc_type="natural")(times), Slerp(knots, rotations)(times).as_matrix()
+    Ks = np.stack([np.asarray(view.K, np.float64).ravel() for view in views])
+    lenses = np.stack([np.interp(times, knots, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
+    dtype, size = first.viewmat.dtype, (first.width, first.height)
+    return [
+        Camera(jnp.asarray(_viewmat(R, c), dtype), jnp.asarray(K, dtype), *size)
+        for R, c, K in zip(turned, places, lenses, strict=True)
+    ]
+
+
+def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:
+    """An order of the cameras that goes to the nearest unvisited one, starting at an end of the set."""
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
+    features = np.concatenate([centers / spread, TURN_WEIGHT * forwards], axis=1)
+    start = int(np.linalg.norm(features - features.mean(axis=0), axis=1).argmax())
+    tour, left = [start], set(range(len(centers))) - {start}
+    while left:
+        candidates = sorted(left)
+        distances = np.linalg.norm(features[candidates] - features[tour[-1]], axis=1)
+        tour.append(candidates[int(distances.argmin())])
+        left.remove(tour[-1])
+    return tour
+
+
+def _smoothed(knots: np.ndarray, num_frames: int) -> np.ndarray:
+    """[num_frames, C] points at constant speed on a smoothed polyline through [n, C] knots (positions first)."""
+    steps = np.linalg.norm(np.diff(knots[:, :3], axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])
+    fine = max(20 * num_frames, 1000)
+    places = np.linspace(0.0, along[-1], fine)
+    dense = np.stack([np.interp(places, along, column) for column in knots.T], axis=1)
+    dense = gaussian_filter1d(dense, SMOOTHING * fine, axis=0, mode="nearest")
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(dense[:, :3], axis=0), axis=1) + 1e-12)])
+    wanted = np.linspace(0.0, travelled[-1], num_frames)
+    return np.stack([np.interp(wanted, travelled, column) for column in dense.T], axis=1)
+
+
+def _look(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """World-to-camera matrix [4, 4] at `center`, z along `forward`, y as near to `down` as it can be."""
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(down, z)
+    x /= np.linalg.norm(x)
+    return _viewmat(np.stack([x, np.cross(z, x), z]), center)
+
+
+def _viewmat(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """World-to-camera matrix [4, 4] of a camera's axes, as rows, and its place."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
+    return viewmat

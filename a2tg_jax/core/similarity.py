@@ -1,0 +1,57 @@
+"""Similarities: maps between worlds that differ in position, orientation and size; float64 on the host."""
+
+import dataclasses
+
+import numpy as np
+
+from a2tg_jax.core.cameras import MAX_SKEW
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Similarity:
+    """x' = scale·rotation·x + translation, from the original world to the normalised one (or back, `inverse`)."""
+
+    scale: float
+    """Positive factor of lengths."""
+    rotation: np.ndarray
+    """[3, 3] rotation matrix."""
+    translation: np.ndarray
+    """[3], in units of the new world."""
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Positions [..., 3] of the old world in the new one; `scale` multiplies lengths, `rotation` directions."""
+        return self.scale * np.asarray(points) @ self.rotation.T + self.translation
+
+    def apply_to_viewmat(self, viewmat: np.ndarray) -> np.ndarray:
+        """World-to-camera matrix [4, 4] of the new world for one of the old; again a rigid motion.
+
+        The camera frame is scaled along with the world, which no pinhole camera notices:
+        s·(Rc·x + t) = (Rc·Rᵀ)·x' + (s·t - Rc·Rᵀ·translation).
+        """
+        moved = np.eye(4)
+        moved[:3, :3] = viewmat[:3, :3] @ self.rotation.T
+        moved[:3, 3] = self.scale * viewmat[:3, 3] - moved[:3, :3] @ self.translation
+        return moved
+
+    def then(self, other: "Similarity") -> "Similarity":
+        """This similarity, and after it another."""
+        return Similarity(self.scale * other.scale, other.rotation @ self.rotation, other.apply(self.translation))
+
+    def inverse(self) -> "Similarity":
+        """The way back: brings results (points, lengths, directions, cameras) to the original world."""
+        return Similarity(1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
+
+
+def check_similarity(similarity: Similarity, what: str) -> None:
+    """Raises ValueError, calling it `what`, unless its scale is positive, its rotation is one, and all is finite."""
+    scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
+    if not (0 < scale < np.inf and np.isfinite(translation).all()):
+        raise ValueError(f"{what} must have a positive scale and a finite translation; got {scale:g}, {translation}")
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW) and np.linalg.det(rotation) > 0
+    if not is_rotation:  # Also of NaN.
+        raise ValueError(f"{what} must have a rotation; got {np.asarray(rotation).tolist()}")
+
+
+def camera_centers(viewmats: np.ndarray) -> np.ndarray:
+    """Positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
+    return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])

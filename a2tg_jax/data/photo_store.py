@@ -1,0 +1,122 @@
+"""Where photographs are kept: in memory while there is room, then on disk, from where they are read when needed."""
+
+import dataclasses
+import tempfile
+import threading
+import weakref
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host.startup import cache_folder
+
+SHARE_OF_MEMORY = 0.25
+"""Of what the process may have; photographs beyond it stay on disk."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Picture:
+    """Pixels, in memory or on disk. What `read` returns is the same every time, wherever they are kept."""
+
+    shape: tuple[int, ...]
+    """[H, W, 3] or, with straight alpha, [H, W, 4]."""
+    read: Callable[[], np.ndarray]
+    """The pixels; not to be written to."""
+    is_held: bool = False
+    """Whether they are in memory."""
+    dtype: Any = np.uint8
+
+    @staticmethod
+    def of(pixels: "np.ndarray | Picture") -> "Picture":
+        """Pixels that are held in memory; a picture is returned as it is."""
+        return pixels if isinstance(pixels, Picture) else Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.shape[0], self.shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        """Of its pixels, wherever they are."""
+        return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
+
+
+class Shelf:
+    """Keeps the pictures of one scene; several threads may use it.
+
+    Pixels that no longer fit into memory are forgotten where a file holds just them, for decoding it again takes less
+    time than a training step of that size. Pixels that were undistorted or resized, which takes longer, go to a file
+    without a name in `cache_folder()`, which disappears with the process, however that ends.
+    """
+
+    def __init__(self, room: int | None = None):
+        """Args:
+        room: bytes that the pictures may take in memory; None: `SHARE_OF_MEMORY` of what the process may have.
+        """
+        self._room = int(SHARE_OF_MEMORY * memory_limit()) if room is None else room
+        self._lock = threading.Lock()
+        self._file: BinaryIO | None = None
+        self._end = 0
+
+    def keep(self, pixels: np.ndarray, source: Path | None = None) -> Picture:
+        """A picture of these pixels.
+
+        Args:
+          pixels: of any shape, uint8.
+          source: an image file whose pixels these are as they stand there; None where they were made of it.
+
+        Raises:
+          OSError: where there is no room on disk; it says what to do.
+        """
+        with self._lock:
+            self._room -= pixels.nbytes
+            if self._room >= 0:
+                return Picture.of(pixels)
+            self._room += pixels.nbytes
+        return self._put(pixels) if source is None else _decoded_again(source, pixels)
+
+    def _put(self, pixels: np.ndarray) -> Picture:
+        """Pixels in the file without a name."""
+        folder, shape = cache_folder(), pixels.shape
+        try:
+            with self._lock:
+                if self._file is None:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as there are pictures
+                    weakref.finalize(self, self._file.close)
+                file, start = self._file, self._end
+                file.seek(start)
+                file.write(np.ascontiguousarray(pixels).data)
+                file.flush()
+                self._end += pixels.nbytes
+        except OSError as error:
+            advice = "make room there, name another place in XDG_CACHE_HOME, or use a larger downscale"
+            raise OSError(f"{folder}: cannot keep the scene's photographs ({error.strerror}): {advice}") from error
+
+        def read() -> np.ndarray:
+            again = np.empty(shape, np.uint8)
+            with self._lock:
+                file.seek(start)
+                file.readinto(again)  # type: ignore[attr-defined]
+            return again
+
+        return Picture(shape, read)
+
+
+def _decoded_again(source: Path, pixels: np.ndarray) -> Picture:
+    """The picture in an image file, which must stay as it is."""
+    checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
+
+    def read() -> np.ndarray:
+        again = np.ascontiguousarray(read_pixels(source))
+        if zlib.crc32(again.data) != checksum:
+            raise ValueError(f"{source}: has changed since the scene was loaded; put it back as it was, or start anew")
+        return again
+
+    return Picture(pixels.shape, read)

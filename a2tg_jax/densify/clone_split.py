@@ -1,0 +1,238 @@
+"""Adaptive density control (3DGS, Kerbl et al., 2023; 2DGS, Huang et al., 2024): clone, split, prune, reset opacities.
+
+Arrays hold N rows, of which the first `num_live` exist. All of it happens inside the step at fixed shapes: what is
+pruned leaves its row, the rows behind it move up, and copies are appended while there is room.
+"""
+
+import dataclasses
+import math
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.core.budget import number_to_reach
+from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.core.gradient_statistics import GradientStatistics
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.events import (
+    Change,
+    EventInfo,
+    Now,
+    Seen,
+    Statistic,
+    StepEvent,
+    Times,
+    clear_moments,
+    event,
+    gather_moments,
+    gather_rows,
+    static,
+)
+from a2tg_jax.model import Model
+
+SPLIT_SHRINK = 1.6
+"""The halves of a split Gaussian are so many times smaller."""
+LEAST_BETWEEN_RESETS = 500
+RECOVERY = 100
+"""Iterations after a reset in which nothing is pruned for being faint: Adam needs them to raise an opacity again."""
+
+
+class Edit(NamedTuple):
+    """Which rows stay, and which are doubled; [N] booleans."""
+
+    is_kept: Array
+    is_cloned: Array
+    is_split: Array
+
+
+@event
+class CloneSplitPrune(StepEvent):
+    """Clones small Gaussians and splits large ones where the gradient is large; prunes what is faint or too large.
+
+    It happens every max(10, n/300) of n iterations, from n/60 to n/2. The programs of 3DGS and 2DGS also have a largest
+    radius on the screen, but set the radii back to 0 just before they look at them: it has no effect, and is left out.
+    """
+
+    cap: int = static(default=500_000)
+    """Largest number of Gaussians. Where more are wanted the largest gradients are served, and the others counted."""
+    threshold: float = 2e-4
+    """Smallest average gradient that is densified, by the position on the screen in units of half an image."""
+    dense_share: float = 0.01
+    """Gaussians larger than this share of scene_scale are split, the others cloned."""
+    least_opacity: float = 0.05
+    """Fainter ones are pruned."""
+    largest_share: float = 0.1
+    """Larger ones, as a share of scene_scale, are pruned after the first reset of opacities."""
+
+    impossible: ClassVar[str] = (
+        "adaptive density control would prune every Gaussian: check the cameras and points of the scene, or lower "
+        "densify.least_opacity"
+    )
+
+    @property
+    def statistic(self) -> Statistic:
+        return "center"
+
+    def times(self, num_iterations: int) -> Times:
+        return Times(num_iterations // 60 + 1, num_iterations // 2 - 1, max(10, round(num_iterations / 300)))
+
+    @property
+    def most_gaussians(self) -> int:
+        return self.cap
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        return max(num, self.cap)
+
+    def init(self, model: Model) -> GradientStatistics:
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+
+    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
+        return state.observe_views(seen.gradients, seen.is_visible)
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
+        edit, num_refused = self.plan(now, model, state.average())
+        model, moments = apply_edit(now.keys[0], edit, model, moments)
+        return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
+
+    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
+        """What happens to each row, and how many Gaussians there was no room for.
+
+        Args:
+          gradients: [N] averages.
+        """
+        is_kept = is_live(model) & ~self._is_pruned(now, model)
+        # A copy of what is pruned would be pruned as well.
+        is_wanted = is_kept & (gradients >= self.threshold)
+        room = min(model.gaussians.num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
+        edit = self._edit(now, model, is_kept, is_wanted & (_ranks(gradients, is_wanted) < room))
+        return edit, jnp.sum(is_wanted & ~(edit.is_cloned | edit.is_split), dtype=jnp.int32)
+
+    def _is_pruned(self, now: Now, model: Model) -> Array:
+        """[N] what is too faint or too large."""
+        opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+        between = reset_interval(now.num_iterations)
+        is_late, since_reset = now.iteration > between, now.iteration % between
+        is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
+        return is_faint | (is_late & (_sizes(model) > self.largest_share * now.scene_scale))
+
+    def _edit(self, now: Now, model: Model, is_kept: Array, is_doubled: Array) -> Edit:
+        """Doubled rows are split where they are large, and cloned where they are not."""
+        is_large = _sizes(model) > self.dense_share * now.scene_scale
+        return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large)
+
+
+@event
+class FillingDensity(CloneSplitPrune):
+    """As `CloneSplitPrune`, but with so many Gaussians after each event that the last leaves the cap.
+
+    The largest gradients are doubled, whether above the threshold or not. Pruning goes on while those that are left
+    suffice: where too many would go, the most opaque stay.
+    """
+
+    def num_rows(self, num: int, num_iterations: int) -> int:
+        count = self.times(num_iterations).num_times
+        if num * 2.0**count < self.cap:
+            raise ValueError(
+                f"{num:,} Gaussians that double at most in each of the {count} densifications of {num_iterations} "
+                f"iterations do not become the {self.cap:,} of memory_budget: raise stage1_iterations or "
+                "initial_gaussians, or lower memory_budget"
+            )
+        return max(num, self.cap)
+
+    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
+        assert now.times is not None
+        is_there = is_live(model)
+        num_live = jnp.sum(is_there, dtype=jnp.int32)
+        reached = number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
+        reached = jnp.minimum(reached, 2 * num_live)
+        is_kept = is_there & ~self._is_pruned(now, model)
+        opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+        # Those that would stay anyway come first.
+        place = _ranks(jnp.where(is_kept, jnp.inf, opacities), is_there)
+        is_kept = is_kept | (is_there & jnp.any(is_kept) & (place < (reached + 1) // 2))
+        num_doubled = reached - jnp.sum(is_kept, dtype=jnp.int32)
+        is_doubled = is_kept & (_ranks(gradients, is_kept) < num_doubled)
+        return self._edit(now, model, is_kept, is_doubled), jnp.zeros((), jnp.int32)
+
+
+def is_live(model: Model) -> Array:
+    """[N] which rows exist."""
+    num = model.gaussians.num
+    return jnp.arange(num, dtype=jnp.int32) < (num if model.num_live is None else model.num_live)
+
+
+def _sizes(model: Model) -> Array:
+    """[N] the larger standard deviations."""
+    return jnp.max(model.gaussians.scales, axis=1)
+
+
+def _ranks(values: Array, is_ranked: Array) -> Array:
+    """[N] int32 places in descending order of value, equal ones in the order of rows, those not ranked last."""
+    num = values.shape[0]
+    order = jnp.argsort(jnp.where(is_ranked, -values, jnp.inf), stable=True)
+    return jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
+
+
+def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tuple[Model, AdamState]:
+    """Kept rows move up, in order, and the copies of doubled ones follow; what is new starts with zero moments.
+
+    Both halves of a split Gaussian are drawn from it, each a Gaussian 1.6 times smaller. A clone lies where it came
+    from, which keeps its moments.
+    """
+    num = model.gaussians.num
+    index = jnp.arange(num, dtype=jnp.int32)
+    is_doubled = edit.is_cloned | edit.is_split
+    num_kept, num_copies = (jnp.sum(mask, dtype=jnp.int32) for mask in (edit.is_kept, is_doubled))
+    kept_first = jnp.argsort(~edit.is_kept, stable=True).astype(jnp.int32)
+    doubled_first = jnp.argsort(~is_doubled, stable=True).astype(jnp.int32)
+    is_copy = (index >= num_kept) & (index < num_kept + num_copies)
+    rows = jnp.where(is_copy, doubled_first[jnp.maximum(index - num_kept, 0)], kept_first)
+    is_live = index < num_kept + num_copies
+    is_half = edit.is_split[rows] & is_live
+    moments = clear_moments(model, gather_moments(model, moments, rows), is_copy | is_half | ~is_live)
+    model = gather_rows(model, rows)
+    gaussians = halved(key, model.gaussians, is_half)
+    return dataclasses.replace(model, gaussians=gaussians, num_live=num_kept + num_copies), moments
+
+
+def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
+    """Marked rows [N] moved to a point drawn from their Gaussian, and made 1.6 times smaller."""
+    drawn = jax.random.normal(key, gaussians.scales.shape, gaussians.means.dtype) * gaussians.scales
+    axes = rotation_matrices(gaussians.quats)[:, :, :2]
+    means = gaussians.means + jnp.sum(axes * drawn[:, None, :], axis=2)
+    return dataclasses.replace(
+        gaussians,
+        means=jnp.where(is_half[:, None], means, gaussians.means),
+        log_scales=gaussians.log_scales - jnp.where(is_half[:, None], math.log(SPLIT_SHRINK), 0.0),
+    )
+
+
+def reset_interval(num_iterations):
+    """Iterations between two resets of the opacities: the published 3,000 of 30,000, scaled, but 500 at least."""
+    return jnp.maximum(num_iterations // 10, LEAST_BETWEEN_RESETS)
+
+
+@event
+class OpacityReset(StepEvent):
+    """No Gaussian stays more opaque than `most`: every max(500, n/10) of n iterations, until n/2."""
+
+    most: float = 0.01
+
+    num_keys: ClassVar[int] = 0
+
+    def times(self, num_iterations: int) -> Times:
+        every = int(reset_interval(num_iterations))
+        return Times(every, num_iterations // 2 - 1, every)
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+        before = model.gaussians, model.params
+        after = model.appearance.limit_opacities(*before, model.layout, jnp.asarray(self.most))
+
+        def cleared(moment):
+            # Adam forgets whatever was changed.
+            return jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
+
+        moments = dataclasses.replace(moments, mu=cleared(moments.mu), nu=cleared(moments.nu))
+        return Change(dataclasses.replace(model, gaussians=after[0], params=after[1]), moments, state)

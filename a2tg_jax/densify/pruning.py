@@ -1,0 +1,124 @@
+"""Pruning: the Gaussians that show least go, so that their bytes are spent where they show.
+
+What a Gaussian shows is the sum of its blending weights w = α·T over the pixels of the training views that count: how
+much of the pictures is its colour. Many that densification leaves are hidden, or too faint to matter. This event
+renders, where others take statistics of the steps: a weight is no gradient of the loss.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import Banded, GivenColors
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.jit import jit
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.data import View, counted_pixels, views_by_size
+from a2tg_jax.events import Change, Due, HostEvent, event, gather_moments, gather_rows, static
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, plan_render, render_traced
+
+
+@event
+class Prune(HostEvent):
+    """Removes those Gaussians whose blending weights, summed over the training views, are least.
+
+    The views are seen from the cameras that the scene gives, not from refined ones.
+    """
+
+    share: float = 0.1
+    """Of the Gaussians, in [0, 1), removed each time; not used where `keep` is given."""
+    keep: int | None = static(default=None)
+    """How many are left each time, at most."""
+    at: tuple[float, ...] = static(default=(1.0,))
+    """Fractions of the stage at which it happens; 1: at its end."""
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        if any(not 0 < fraction <= 1 for fraction in self.at) or list(self.at) != sorted(set(self.at)):
+            raise ValueError(f"at must be ascending fractions above 0, up to 1; got {self.at}")
+        return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in self.at))
+
+    def num_after(self, num: int, num_iterations: int) -> int:
+        return num if self.keep is None else min(num, self.keep)
+
+    def num_programs(self, num_iterations: int) -> int:
+        return 2  # Rows keep their number; tile lists grow with the Gaussians.
+
+    def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
+        if isinstance(model.appearance, Banded):
+            raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
+        num, left = model.num, self._num_left(model.num)
+        order = np.argsort(-blending_weights(model, due.views)[:num], kind="stable")
+        rows = np.arange(model.gaussians.num)
+        rows[:num] = np.concatenate([np.sort(order[:left]), np.sort(order[left:])])
+        moments = gather_moments(model, moments, jnp.asarray(rows))
+        model = dataclasses.replace(gather_rows(model, jnp.asarray(rows)), num_live=jnp.asarray(left, jnp.int32))
+        return Change(model, moments, state, rows=rows)
+
+    def _num_left(self, num: int) -> int:
+        if self.keep is not None:
+            if self.keep < 1:
+                raise ValueError(f"keep must be at least 1 Gaussian; got {self.keep}")
+            return min(num, self.keep)
+        if not 0 <= self.share < 1:
+            raise ValueError(f"share must lie in [0, 1); got {self.share}")
+        return num - round(num * float(self.share))
+
+
+def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
+    """[N] Σ α·T of each Gaussian over the pixels of all views that count, in pixels (host).
+
+    Args:
+      model: N rows; those that do not exist have weight 0.
+      views: at least one; their photographs are not looked at, their masks are.
+
+    Raises:
+      ValueError: if there is no view.
+    """
+    if not views:
+        raise ValueError("views must hold at least one view; got none")
+    total = np.zeros(model.gaussians.num)
+    if not len(total):
+        return total
+    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    # Programs are compiled for a capacity: for few of them.
+    settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
+    dtype = model.gaussians.means.dtype
+    for own in views_by_size(views):
+        cameras = [jax.tree.map(lambda leaf: np.asarray(leaf, dtype), view.camera) for view in own]
+        stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *cameras)
+        total += np.asarray(_jitted()(model, stacked, jnp.asarray(counted_pixels(own), dtype), settings), np.float64)
+    return total
+
+
+@functools.cache
+def _jitted() -> jit:
+    return jit(_weights, static_argnums=(3,))
+
+
+def _weights(model: Model, cameras: Camera, counted: Array, settings: RenderSettings) -> Array:
+    """The sums over views of one size: a picture is linear in the colours, and this is the backward pass of ones."""
+    nothing = jnp.zeros_like(model.gaussians.means)
+
+    def of_view(total: Array, view: tuple[Camera, Array]) -> tuple[Array, None]:
+        camera, weight = view
+
+        def draw(colors: Array) -> Array:
+            rule = GivenColors(model.rule, colors)
+            output, _ = render_traced(
+                model.gaussians, camera, rule, jnp.zeros_like(colors[0]), settings,
+                has_geometry=False, num_live=model.num_live,
+            )  # fmt: skip
+            return output.color
+
+        color, back = jax.vjp(draw, nothing)
+        (weights,) = back(jnp.broadcast_to(weight, color.shape))
+        return total + weights[:, 0], None
+
+    return jax.lax.scan(of_view, nothing[:, 0], (cameras, counted))[0]

@@ -1,0 +1,98 @@
+"""Densification that splits where the image is wrong: the schedule of MCMC, hosts by gradient, halves for shares.
+
+3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies where the host is, which look like it together: they part
+slowly, and not where detail is missing. Here hosts are drawn by how much a move by its own size would change the loss,
+and host and copies become halves of it, each at a point drawn from it and 1.6 times smaller, as in adaptive density
+control (`densify`).
+
+Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its gradient times its size is
+thousands of times that of others: drawn with replacement it would be the host of nearly all new Gaussians.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.core.gradient_statistics import GradientStatistics
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.densify.clone_split import halved
+from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, event, gather_rows
+from a2tg_jax.mcmc import FillingMcmc, Moves, num_rows_live, plan_growth, plan_relocation
+from a2tg_jax.model import Model
+
+LEAST_WEIGHT = 1e-12
+"""Of a host that no view has seen."""
+
+
+@event
+class SplitByGradient(FillingMcmc):
+    """Moves dead Gaussians, and adds new ones up to the cap, where the average gradient times the size is largest."""
+
+    @property
+    def statistic(self) -> Statistic:
+        return "position"
+
+    def init(self, model: Model) -> GradientStatistics:
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+
+    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
+        return state.observe_views(seen.gradients, seen.is_visible)
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
+        to_move, to_add, to_split = jax.random.split(now.keys[0], 3)
+        num_live = num_rows_live(model)
+        draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
+        moves = plan_relocation(to_move, self._opacities(model), num_live, draw)
+        model, moments, state = split_rows(to_split, moves, model, moments, state)
+        cap, least = min(self.cap, model.gaussians.num), self.least(now, num_live)
+        draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
+        moves = plan_growth(to_add, self._opacities(model), num_live, cap, least, draw)
+        model, moments, state = split_rows(now.keys[1], moves, model, moments, state)
+        return Change(model, moments, state, EventInfo(is_possible=moves.info.has_hosts))
+
+    @staticmethod
+    def _opacities(model: Model) -> Array:
+        return model.appearance.opacities(model.gaussians, model.params, model.layout)
+
+
+def draw_weights(model: Model, state: GradientStatistics) -> Array:
+    """[N] what the probability of being a host is proportional to: average gradient by position, times the size."""
+    size = jnp.exp(jnp.mean(model.gaussians.log_scales, axis=1))
+    return state.average() * size + LEAST_WEIGHT
+
+
+def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: Array) -> Array:
+    """Draw a host for every target with probability ∝ weight, none twice before all have been drawn once.
+
+    The order of log-weights plus Gumbel noise is that of successive draws without replacement (Yellott, 1977).
+
+    Args:
+      weights: [N], positive.
+      key: a random key.
+      is_host: [N], the rows that may be drawn.
+      is_target: [N], the rows that need a host.
+
+    Returns:
+      [N] int32 rows for which `is_host` holds, if there are any; entries of rows that are no targets have no meaning.
+    """
+    noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
+    order = jnp.argsort(jnp.where(is_host, -noisy, jnp.inf)).astype(jnp.int32)
+    place = jnp.cumsum(is_target, dtype=jnp.int32) - 1
+    return order[jnp.maximum(place, 0) % jnp.maximum(jnp.sum(is_host, dtype=jnp.int32), 1)]
+
+
+def split_rows(
+    key: Array, moves: Moves, model: Model, moments: AdamState, state: GradientStatistics
+) -> tuple[Model, AdamState, GradientStatistics]:
+    """Rows copied from their hosts; hosts and copies are halved, forget Adam's moments, and share the statistic."""
+    is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
+    total = state.total / moves.num_shares.astype(state.total.dtype)
+    state = GradientStatistics(total[moves.rows], state.views[moves.rows])
+    moments = clear_moments(model, moments, is_split)
+    num_live = num_rows_live(model) + moves.info.num_added
+    model = dataclasses.replace(gather_rows(model, moves.rows), num_live=num_live)
+    return dataclasses.replace(model, gaussians=halved(key, model.gaussians, is_split)), moments, state

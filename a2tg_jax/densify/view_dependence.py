@@ -1,0 +1,144 @@
+"""Where spherical harmonics go: a degree per Gaussian, raised where the gradient asks for it, lowered where it is idle.
+
+The image is linear in the coefficients, so that the gradient at a coefficient which a Gaussian does not have yet is
+known: Σ over views of ∂L/∂colour · Y(direction). What residuals of many views have in common adds up in it, what they
+have not cancels.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import Banded
+from a2tg_jax.appearance.sh_bands import MAX_DEGREE, BandLayout, Bands, floats_of_band, reallocate_bands
+from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_of, event_budget, within_budget
+from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.events import Change, Due, HostEvent, Seen, event, iterations_at, static
+from a2tg_jax.model import Model
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ViewDependence:
+    """Sums over views of the gradient at all 16 coefficients of each Gaussian, whether it has them or not."""
+
+    total: Array
+    """[N, 16, 3]."""
+    views: Array
+    """[] int32, views so far."""
+
+    @staticmethod
+    def init(num: int, dtype=jnp.float32) -> "ViewDependence":
+        """Empty sums for `num` Gaussians."""
+        return ViewDependence(jnp.zeros((num, 16, 3), dtype), jnp.zeros((), jnp.int32))
+
+    def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
+        """Adds V views.
+
+        Args:
+          means: [N, 3] of the Gaussians.
+          centers: [V, 3] of the cameras.
+          colors: [V, N, 3] gradients by the colour of each Gaussian.
+        """
+        total = self.total
+        for center, color in zip(centers, colors, strict=True):
+            basis = sh_basis(normalize(means - center[None, :]))
+            total = total + basis[:, :, None] * color[:, None, :]
+        return ViewDependence(total, self.views + len(colors))
+
+    def strengths(self) -> np.ndarray:
+        """[N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
+        mean = np.asarray(self.total) / max(1, int(self.views))
+        return np.stack([np.linalg.norm(mean[:, band], axis=(1, 2)) for band in BAND_SLICES], axis=1)
+
+
+BAND_SLICES = tuple(slice(NUM_BASES[degree - 1], NUM_BASES[degree]) for degree in (1, 2, 3))
+
+
+@event
+class AdaptDegrees(HostEvent):
+    """Lowers degrees that are idle, and raises others by one where the gradient per byte is largest, within a budget.
+
+    Wants `appearance.Banded`.
+    """
+
+    budget_mb: float = 0.0
+    """Reported memory never exceeds this many MB (10^6 bytes)."""
+    at: tuple[float, ...] = static(default=(0.05, 0.1))
+    """Fractions of the stage at which it happens. Each time an equal part of what is left of the budget is spent."""
+    highest: int = static(default=MAX_DEGREE)
+    """No degree rises above it."""
+    idle: float = 0.0
+    """Bands that change a colour by less than this (root mean square over all directions) are given up."""
+
+    observes = True
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        return iterations_at(self.at, num_iterations, "view_dependence.at")
+
+    def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
+        return max(num_bytes, bytes_of(self.budget_mb))
+
+    def init(self, model: Model) -> ViewDependence:
+        return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
+
+    def observe(self, state: ViewDependence, model: Model, seen: Seen) -> ViewDependence:
+        centers = jax.vmap(lambda camera: camera.center)(seen.cameras)
+        return state.observe(model.gaussians.means, centers, seen.colors)
+
+    def apply(self, due: Due, model: Model, moments: AdamState, state: ViewDependence) -> Change:
+        if not isinstance(model.appearance, Banded):
+            raise ValueError(f"{type(model.appearance).__name__} has no degrees that could rise; Banded has")
+        bands, layout, num = model.params.bands, model.layout.bands, model.num
+        degrees = without_idle(bands, layout, self.idle)
+        used = model.num_bytes - saved_bytes(layout, degrees, num)
+        budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
+        degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget, self.highest)
+        bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
+        model = dataclasses.replace(
+            model, params=model.params._replace(bands=bands), layout=model.layout._replace(bands=layout)
+        )
+        return Change(model, moments, self.init(model))
+
+
+def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:
+    """[N] degrees, one less where the highest band changes the colour by less than `idle` (host).
+
+    Spherical harmonics are orthonormal, so that the mean square of what a band adds, over all directions and three
+    channels, is the sum of its squared coefficients by 12π.
+    """
+    degrees = layout.degrees
+    highest = degrees.copy()
+    for band, table, owners in zip(layout.bands, bands.tables, layout.owners, strict=True):
+        rows = np.asarray(owners)[np.asarray(owners) < layout.num]
+        energy = np.square(np.asarray(table)[: len(rows)]).sum(axis=(1, 2)) / (12 * np.pi)
+        is_idle = (energy < idle**2) & (degrees[rows] == band)
+        highest[rows[is_idle]] -= 1
+    return highest
+
+
+def saved_bytes(layout: BandLayout, degrees: np.ndarray, num: int) -> int:
+    """Bytes that the first `num` Gaussians need less at lower degrees (host)."""
+    floats = np.asarray([3 * NUM_BASES[degree] for degree in range(MAX_DEGREE + 1)])
+    return BYTES_PER_FLOAT * int((floats[layout.degrees[:num]] - floats[degrees[:num]]).sum())
+
+
+def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
+    """[N] degrees, one more for as many as the budget allows, in descending order of gradient per added byte (host).
+
+    Args:
+      degrees: [N] 0 to 3.
+      strengths: [N, 3] of the bands of degree 1, 2 and 3.
+      budget: bytes.
+      highest: no degree rises above it.
+    """
+    following = np.minimum(degrees, MAX_DEGREE - 1)
+    cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]
+    strength = np.take_along_axis(strengths, following[:, None], axis=1)[:, 0]
+    is_candidate = (degrees < highest) & (strength > 0)
+    return degrees + within_budget(strength, is_candidate, cost, budget)

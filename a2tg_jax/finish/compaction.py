@@ -1,0 +1,227 @@
+"""How small the file of a model can be: what each choice of bits costs in dB, and the smallest file within a loss.
+
+A loss is a function of a model: how many dB it is below the one that it was made from. It is measured on photographs,
+or, where there are none, guessed from how far renders are from that model's.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.origin import Color
+from a2tg_jax.data import View, view_image
+from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
+from a2tg_jax.io.quantise import Precision
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings
+from a2tg_jax.renderer import Renderer
+
+Loss = Callable[[Model], float]
+Ladder = Mapping[str, tuple[Precision, ...]]
+
+LADDER: Ladder = MappingProxyType(
+    {
+        "means": (10, 11, 12, 13, 14, 16),
+        "log_scales": (4, 5, 6, 7, 8, 10),
+        "quats": (5, 6, 7, 8, 10),
+        "opacities": (3, 4, 5, 6, 8, 10),
+        "sh_0": (4, 5, 6, 7, 8, 10),
+        "sh_rest": (2, 3, 4, 5, 6, 8, 10),
+        "texels": (3, 4, 5, 6, 7, 8, 10),
+    }
+)
+"""What is tried, of each group from coarse to fine."""
+ASSUMED_PSNR = 30.0
+"""Of a model against photographs that are not there, in dB."""
+LEAST_LOSS = 1e-4
+"""Differences in dB below it are taken for this one: they are noise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """A file, measured."""
+
+    choices: CompactChoices
+    num_bytes: int
+    """On disk."""
+    losses: tuple[float, ...]
+    """dB, by each measure of loss."""
+    group: str = ""
+    """What is kept more coarsely than the rest, where one group is."""
+
+    @property
+    def precision(self) -> Precision:
+        """Of its group."""
+        return getattr(self.choices, self.group)
+
+
+def loss_on_views(
+    model: Model,
+    views: Sequence[View],
+    *,
+    background: Color | None = None,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> Loss:
+    """How much PSNR, as a mean over the photographs of some views, models have less than the given one."""
+    background = model.background if background is None else background
+    draw = _drawing(model, [view.camera for view in views], background, settings)
+
+    def psnr(other: Model) -> float:
+        errors = (_error_on(view, image, background) for view, image in zip(views, draw(other), strict=True))
+        return float(np.mean([-10 * math.log10(max(error, 1e-12)) for error in errors]))
+
+    own = psnr(model)
+    return lambda other: own - psnr(other)
+
+
+def loss_beside_renders(
+    model: Model,
+    cameras: Sequence[Camera],
+    *,
+    assumed_psnr: float = ASSUMED_PSNR,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> Loss:
+    """How much PSNR models would have less than the given one on photographs that it renders with `assumed_psnr`.
+
+    10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR stands for. Errors
+    that have nothing to do with each other add up so.
+    """
+    draw = _drawing(model, cameras, model.background, settings)
+    renders = list(draw(model))
+    assumed_error = 10 ** (-assumed_psnr / 10)
+
+    def loss(other: Model) -> float:
+        errors = (_squared_error(*pair) for pair in zip(draw(other), renders, strict=True))
+        return float(np.mean([10 * math.log10(1 + error / assumed_error) for error in errors]))
+
+    return loss
+
+
+def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings):
+    """Draws models like the given one for cameras, clipped to [0, 1]; compiled once as long as the room suffices."""
+    if not cameras:
+        raise ValueError("there are no views to measure a loss on")
+    options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
+    first = Renderer(model, cameras=cameras, **options)
+    capacities = {size: 2 * capacity for size, capacity in first.capacities.items()}
+
+    def draw(other: Model) -> Iterator[np.ndarray]:
+        renderer = Renderer(other, capacities=capacities, **options)
+        return (np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras)
+
+    return draw
+
+
+def _error_on(view: View, image: np.ndarray, background: Color) -> float:
+    """Mean squared error of a render over the pixels of a photograph that count."""
+    counts = ... if view.mask is None else view.mask.read()
+    return _squared_error(image[counts], np.clip(view_image(view, background), 0, 1)[counts])
+
+
+def _squared_error(image: np.ndarray, target: np.ndarray) -> float:
+    return float(np.mean((np.asarray(image, np.float64) - target) ** 2))
+
+
+def try_choices(model: Model, choices: CompactChoices, losses: Sequence[Loss], group: str = "") -> Trial:
+    """The size of a file, and what the model that is read from it loses by each measure (host)."""
+    data = encode_model(model, choices)
+    again = decode_model(data)
+    return Trial(choices, len(data), tuple(loss(again) for loss in losses), group)
+
+
+def finest_choices(ladder: Ladder = LADDER) -> CompactChoices:
+    """The last of each group."""
+    return CompactChoices().keeping({group: steps[-1] for group, steps in ladder.items()})
+
+
+def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDER) -> list[Trial]:
+    """Each group kept as each of its steps says, the other groups at their finest: sizes and losses (host).
+
+    Args:
+      model: the model.
+      losses: measures of what is lost.
+      ladder: steps of groups, from coarse to fine.
+
+    Returns:
+      Trials by group, from coarse to fine; of the groups that the model has any numbers of.
+    """
+    finest = finest_choices(ladder)
+    trials = []
+    for group, steps in ladder.items():
+        coarsest = finest.keeping({group: steps[0]})
+        if len(encode_model(model, coarsest)) < 0.999 * len(encode_model(model, finest)):
+            tried = (finest.keeping({group: step}) for step in steps)
+            trials += [try_choices(model, choices, losses, group) for choices in tried]
+    return trials
+
+
+def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial]) -> Trial:
+    """The smallest file that loses so much at most by the first measure, found by greed (host).
+
+    From the finest choices on, the step that saves most bytes for what it loses is taken, as long as the losses of all
+    groups together, as measured apart, stay within; then the last steps are taken back until the file itself does, and
+    at last single steps are tried that may still be there.
+
+    Args:
+      model: the model.
+      losses: measures of what is lost.
+      max_loss: in dB.
+      trials: what `measure_choices` found.
+
+    Raises:
+      ValueError: if the finest choices lose more.
+    """
+    by_group: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_group.setdefault(trial.group, []).append(trial)
+    by_size = {group: sorted(own, key=lambda trial: trial.num_bytes) for group, own in by_group.items()}
+    finest = {group: own[-1].precision for group, own in by_size.items()}
+    for chosen in [*reversed(_descent(by_size, max_loss)), finest]:
+        found = try_choices(model, finest_choices().keeping(chosen), losses)
+        if found.losses[0] <= max_loss:
+            return _with_single_steps(model, losses, max_loss, by_size, found)
+    raise ValueError(f"max_loss must be {found.losses[0]:.4f} dB or more: the finest choices lose that; got {max_loss}")
+
+
+def _with_single_steps(
+    model: Model, losses: Sequence[Loss], max_loss: float, by_size: Mapping[str, Sequence[Trial]], found: Trial
+) -> Trial:
+    """The file with each group a step smaller, where it loses no more than it may: those that save most first."""
+
+    def next_step(group: str) -> tuple[int, Precision]:
+        """What the next smaller step of a group saves, and its precision; nothing where there is none."""
+        own = by_size[group]
+        at = [trial.precision for trial in own].index(getattr(found.choices, group))
+        return own[at].num_bytes - own[max(at - 1, 0)].num_bytes, own[max(at - 1, 0)].precision
+
+    for group in sorted(by_size, key=lambda group: -next_step(group)[0]):
+        saved, precision = next_step(group)
+        if saved:
+            tried = try_choices(model, found.choices.keeping({group: precision}), losses)
+            found = tried if tried.losses[0] <= max_loss and tried.num_bytes < found.num_bytes else found
+    return found
+
+
+def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[dict[str, Precision]]:
+    """The precisions after each step down, of groups' trials from small to large."""
+    at = {group: own[-1] for group, own in by_group.items()}
+    path: list[dict[str, Precision]] = []
+    while True:
+        predicted = sum(max(trial.losses[0], 0.0) for trial in at.values())
+        steps = [
+            ((at[group].num_bytes - trial.num_bytes) / max(lost, LEAST_LOSS), group, trial)
+            for group, own in by_group.items()
+            for trial in own
+            if trial.num_bytes < at[group].num_bytes
+            and predicted + (lost := max(trial.losses[0], 0.0) - max(at[group].losses[0], 0.0)) <= max_loss
+        ]
+        if not steps:
+            return path
+        _, group, trial = max(steps, key=lambda step: step[0])
+        at[group] = trial
+        path.append({group: trial.precision for group, trial in at.items()})

@@ -1,0 +1,175 @@
+"""The best colours for given shapes: least squares over all that a picture is linear in.
+
+A picture is linear in the RGB texels, and in the spherical harmonics of those Gaussians whose colour is not cut off at
+0. With positions, rotations, scales, opacities and alpha textures held, the squared error over all views is therefore
+quadratic in them, and a few steps of conjugate gradients come near its least: of J d = photograph − picture, where J
+draws a change of colours and its transpose is the backward pass.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import Banded, GivenColors, Plain, Textured
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.jit import jit
+from a2tg_jax.core.optim import solve_cg
+from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.texture import Textures
+
+HIGHEST_DEGREE = 3
+
+
+class Colors(NamedTuple):
+    """What a picture is linear in."""
+
+    sh: Array
+    """[N, K, 3] of the Gaussians."""
+    bands: Any
+    """Those beyond, or ()."""
+    rgb: tuple[Array, ...]
+    """[capacity, Tv, Tu, 3] of each bucket of textures."""
+
+
+class Photographs(NamedTuple):
+    """V views of one image size, stacked."""
+
+    viewmats: Array
+    Ks: Array
+    images: Array
+    """[V, H, W, 3] over the background."""
+    weights: Array
+    """[V, H, W, 1]: 1 where a pixel counts, else 0; or [V, 1, 1, 1] where all of them do."""
+
+
+def polish(model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background=None) -> Model:
+    """The model with colours nearer to the least squared error over the views (host).
+
+    Args:
+      model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
+      views: those it was trained on.
+      num_steps: of conjugate gradients, each of which draws every view forwards and backwards. Few steps are a
+        regularisation: many fit the training views at the price of others.
+      ridge: what the squares of the changes weigh beside the squared error, summed over pixels.
+      background: [3] colour; None is the model's own.
+
+    Raises:
+      ValueError: if there is no view, or the model shows something that is not linear in its parameters.
+    """
+    _check(model, views)
+    model = model.live
+    background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
+    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    groups = _stacked(views, background)
+    changes = _jitted()(model, groups, background, settings, num_steps, ridge)
+    return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
+
+
+@functools.cache
+def _jitted() -> jit:
+    return jit(_solve, static_argnums=(3, 4))
+
+
+def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):
+    """The changes of the colours."""
+
+    def over_views(function):
+        """The sum over all views of what a function of camera and photograph gives."""
+        total = jax.tree.map(jnp.zeros_like, colors_of(model))
+        for group in groups:
+            height, width = group.images.shape[1:3]
+
+            def step(total, view, height=height, width=width):
+                camera = Camera(view.viewmats, view.Ks, width, height)
+                return jax.tree.map(jnp.add, total, function(camera, view)), None
+
+            total, _ = jax.lax.scan(step, total, group)
+        return total
+
+    def right(camera: Camera, view: Photographs) -> Colors:
+        residual = view.images - _drawn(model, camera, background, settings)
+        return _transpose(model, camera, settings, view.weights * residual)
+
+    def normal(change: Colors) -> Colors:
+        def of_view(camera: Camera, view: Photographs) -> Colors:
+            return _transpose(model, camera, settings, view.weights * draw_change(model, change, camera, settings))
+
+        return over_views(of_view)
+
+    return solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
+
+
+def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSettings) -> Array:
+    output, _ = render_traced(model.gaussians, camera, model.rule, background, settings, has_geometry=False)
+    return output.color
+
+
+def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
+    """[H, W, 3] what a change of the colours adds to a picture; linear in it."""
+    is_shown = model.rule.own_color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
+    changed = with_colors(model, change)
+    sums = changed.rule.own_color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
+    rule = GivenColors(changed.rule, jnp.where(is_shown, sums, 0.0))
+    black = jnp.zeros(3, model.gaussians.means.dtype)
+    output, _ = render_traced(model.gaussians, camera, rule, black, settings, has_geometry=False)
+    return output.color
+
+
+def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Array) -> Colors:
+    """The transpose of `draw_change`, of an image."""
+    nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
+    _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
+    return back(image)[0]
+
+
+def colors_of(model: Model) -> Colors:
+    """What a picture of the model is linear in."""
+    bands = model.params.bands if isinstance(model.appearance, Banded) else ()
+    buckets = model.textures[0].buckets if model.textures else ()
+    return Colors(model.gaussians.sh, bands, tuple(bucket[..., :3] for bucket in buckets))
+
+
+def with_colors(model: Model, colors: Colors) -> Model:
+    """The model with other colours; alpha textures stay."""
+    gaussians = dataclasses.replace(model.gaussians, sh=colors.sh)
+    params = model.params._replace(bands=colors.bands) if isinstance(model.appearance, Banded) else model.params
+    model = dataclasses.replace(model, gaussians=gaussians, params=params)
+    if model.textures is None:
+        return model
+    textures, layout = model.textures
+    pairs = zip(colors.rgb, textures.buckets, strict=True)
+    return model.with_textures(Textures(tuple(jnp.concatenate([rgb, old[..., 3:]], -1) for rgb, old in pairs)), layout)
+
+
+def _check(model: Model, views: Sequence[View]) -> None:
+    if not views:
+        raise ValueError("views must hold at least one view; got none")
+    inner = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
+    is_linear = isinstance(inner, Plain) or (isinstance(inner, Textured) and inner.options.rgb == "signed")
+    if not is_linear:
+        raise ValueError(
+            f"a picture is not linear in what {type(inner).__name__} shows: Plain, Textured with signed RGB, or Banded "
+            "around one of these can be polished"
+        )
+
+
+def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
+    """The views, one stack for each image size, in the dtype of the background."""
+    color, dtype = np.asarray(background), background.dtype
+    return [
+        Photographs(
+            jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
+            jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
+            jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),
+            jnp.asarray(counted_pixels(own), dtype),
+        )
+        for own in views_by_size(views)
+    ]

@@ -1,0 +1,239 @@
+"""Textures that shrink where that costs next to nothing: the reverse of upscaling, for finished models.
+
+A texture is halved along the side where its pairs of texels differ least, weighed by how much they show; a texture of
+one texel, which is no more than another colour and opacity, goes into those of its Gaussian. The cheapest of these
+steps per byte are taken, as many as a loss of PSNR on given views allows, again and again.
+
+h: how much a texel shows, Σ over pixels and views of (∂picture/∂texel)², estimated as Hutchinson does from a vector of
+random signs for each view. Changing texels by δ then changes the squared error by about Σ h·δ².
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import Banded, Textured
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.jit import jit
+from a2tg_jax.data import View
+from a2tg_jax.finish.compaction import loss_on_views
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
+
+LEAST_OPACITY = 1e-4
+"""Of a Gaussian that takes over a texel's alpha: its logit must be finite."""
+LEAST_SAVED = 0.005
+"""Rounds that save less of a model's bytes are the last."""
+
+
+def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.02, background=None) -> Model:
+    """The model with smaller textures, and as many Gaussians (host).
+
+    Args:
+      model: of `Textured` with signed RGB, or of `Banded` around it.
+      views: on which the loss is measured, such as those it was trained on.
+      max_loss: dB of PSNR, as a mean over the views, that may be lost at most.
+      background: [3] colour; None is the model's own.
+
+    Returns:
+      A model whose `num_bytes` are no more, and whose loss is no more than `max_loss`; the same where nothing shrinks.
+
+    Raises:
+      ValueError: if there are no views, the loss is negative, or the model has no such textures.
+    """
+    _check(model, views, max_loss)
+    model = model.live
+    background = model.background if background is None else background
+    loss = loss_on_views(model, views, background=background)
+    while True:
+        shrunk = _shrunk_once(model, views, background, lambda found: loss(found) <= max_loss)
+        saved = model.num_bytes - shrunk.num_bytes
+        model = shrunk
+        if saved < LEAST_SAVED * model.num_bytes:
+            return model
+
+
+def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
+    if not views:
+        raise ValueError("views must hold at least one view; got none")
+    if not max_loss >= 0:
+        raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
+    inner = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
+    if type(inner) is not Textured or inner.options.rgb != "signed" or inner.options.alpha != "projected":
+        raise ValueError(
+            f"{type(inner).__name__} has no textures that can shrink: Textured with signed RGB and projected alpha, or "
+            "Banded around it, has"
+        )
+
+
+def _shrunk_once(model: Model, views: Sequence[View], background: Any, is_allowed: Any) -> Model:
+    """The model after the cheapest of one step for each texture, as many as are allowed."""
+    step = halved(model, texel_weights(model, views, background))
+    saved = step.saved
+    order = np.argsort(step.cost / np.maximum(saved, 1), kind="stable")
+    order = order[saved[order] > 0]
+
+    def after(count: int) -> Model:
+        is_chosen = np.zeros(model.num, bool)
+        is_chosen[order[:count]] = True
+        return taken(model, step, is_chosen)
+
+    # The most steps that are allowed, by bisection: what is lost grows with their number.
+    least, most, best = 0, len(order), model
+    while least < most:
+        middle = (least + most + 1) // 2
+        found = after(middle)
+        if is_allowed(found):
+            least, best = middle, found
+        else:
+            most = middle - 1
+        if most - least < LEAST_SAVED * len(order):
+            break
+    return best
+
+
+class Step(NamedTuple):
+    """One step for each texture, of N."""
+
+    gaussians: Gaussians
+    """That have taken over their single texels."""
+    textures: Textures
+    layout: AtlasLayout
+    cost: np.ndarray
+    """[N] about how much the squared error grows."""
+    saved: np.ndarray
+    """[N] bytes."""
+
+
+def halved(model: Model, weights: Textures) -> Step:
+    """Every texture halved along the side that costs less, and single texels taken over (host).
+
+    Args:
+      model: with textures.
+      weights: h of every texel, in the layout of the model.
+    """
+    assert model.textures is not None
+    textures, layout = model.textures
+    old_sizes, cost = layout.sizes, np.zeros(layout.num)
+    sizes = old_sizes.copy()
+    pieces = []
+    for index, (tv, tu) in enumerate(layout.resolutions):
+        ids = np.flatnonzero(np.asarray(layout.bucket) == index)
+        rows = np.asarray(layout.row)[ids]
+        old, own = (np.asarray(tree.buckets[index])[rows] for tree in (textures, weights))
+        choices = [_halved_along(old, own, axis) for axis, side in ((1, tv), (2, tu)) if side > 1 and side % 2 == 0]
+        if (tv, tu) == (1, 1):
+            sizes[ids] = 0
+        elif choices:
+            costs = np.stack([own_cost for _, own_cost in choices])
+            best = costs.argmin(axis=0)
+            cost[ids] = costs.min(axis=0)
+            for place, (smaller, _) in enumerate(choices):
+                is_own = best == place
+                sizes[ids[is_own]] = smaller.shape[1:3]
+                pieces.append((ids[is_own], smaller[is_own]))
+        else:
+            pieces.append((ids, old))
+    new, new_layout = _filled(sizes, pieces, np.asarray(textures.buckets[0]).dtype)
+    saved = BYTES_PER_TEXEL * (old_sizes.prod(axis=1) - sizes.prod(axis=1))
+    return Step(_with_single_texels(model), new, new_layout, cost, saved)
+
+
+def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Textures [n, Tv, Tu, 4] with weighted means of pairs along an axis, and what each costs [n]."""
+    pairs = texels.reshape(*texels.shape[:axis], -1, 2, *texels.shape[axis + 1 :])
+    own = weights.reshape(pairs.shape) + 1e-9
+    means = (own * pairs).sum(axis=axis + 1) / own.sum(axis=axis + 1)
+    error = own * (pairs - np.expand_dims(means, axis + 1)) ** 2
+    return means.astype(texels.dtype), error.sum(axis=tuple(range(1, error.ndim)))
+
+
+def _with_single_texels(model: Model) -> Gaussians:
+    """The Gaussians, those with a texture of one texel in its colour and as opaque as it makes them."""
+    textures, layout = model.textures  # type: ignore[misc]
+    gaussians = model.gaussians
+    texels = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (layout.num, 1))
+    if (1, 1) in layout.resolutions:
+        index = layout.resolutions.index((1, 1))
+        ids = np.flatnonzero(np.asarray(layout.bucket) == index)
+        texels[ids] = np.asarray(textures.buckets[index])[np.asarray(layout.row)[ids], 0, 0]
+    sh = np.array(gaussians.sh, np.float64)
+    sh[:, 0] += texels[:, :3] / SH_C0
+    opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * texels[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
+    logits = np.where(texels[:, 3] == 1, np.asarray(gaussians.logit_opacities), np.log(opacities / (1 - opacities)))
+    dtype = gaussians.means.dtype
+    return dataclasses.replace(gaussians, sh=jnp.asarray(sh, dtype), logit_opacities=jnp.asarray(logits, dtype))
+
+
+def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
+    """The model in which the chosen Gaussians [N] have taken their step (host)."""
+    old, old_layout = model.textures  # type: ignore[misc]
+    sizes = np.where(is_chosen[:, None], step.layout.sizes, old_layout.sizes)
+    pieces = []
+    for textures, layout, is_from in ((old, old_layout, ~is_chosen), (step.textures, step.layout, is_chosen)):
+        for index, bucket in enumerate(textures.buckets):
+            ids = np.flatnonzero(is_from & (np.asarray(layout.bucket) == index))
+            pieces.append((ids, np.asarray(bucket)[np.asarray(layout.row)[ids]]))
+    textures, layout = _filled(sizes, pieces, np.asarray(old.buckets[0]).dtype)
+
+    def chosen(before: Array, after: Array) -> Array:
+        return jnp.where(is_chosen.reshape(-1, *[1] * (before.ndim - 1)), after, before)
+
+    gaussians = jax.tree.map(chosen, model.gaussians, step.gaussians)
+    return dataclasses.replace(model, gaussians=gaussians).with_textures(textures, layout)
+
+
+def _filled(sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype) -> tuple[Textures, AtlasLayout]:
+    """Textures of the given sizes [N, 2], from pieces: Gaussians and their texels [n, Tv, Tu, 4], of one size each."""
+    layout, capacities = plan_layout(sizes)
+    shapes = zip(capacities, layout.resolutions, strict=True)
+    buckets = [np.tile(np.asarray(NEUTRAL_TEXEL, dtype), (capacity, *size, 1)) for capacity, size in shapes]
+    rows = np.asarray(layout.row)
+    for ids, texels in pieces:
+        if len(ids):
+            buckets[layout.resolutions.index(texels.shape[1:3])][rows[ids]] = texels
+    return Textures(tuple(map(jnp.asarray, buckets))), layout
+
+
+def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textures:
+    """h of every texel, in the layout of the model (host).
+
+    Args:
+      model: with textures.
+      views: what is looked at; their photographs are not.
+      background: [3] colour.
+    """
+    assert model.textures is not None
+    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    background = jnp.asarray(background, model.gaussians.means.dtype)
+    total = jax.tree.map(jnp.zeros_like, model.textures[0])
+    for index, view in enumerate(views):
+        total = jax.tree.map(jnp.add, total, _jitted()(model, view.camera, background, jax.random.key(index), settings))
+    return total
+
+
+@functools.cache
+def _jitted() -> jit:
+    return jit(_weights_in, static_argnums=(4,))
+
+
+def _weights_in(model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings) -> Textures:
+    """What one view adds to the weights."""
+    textures, layout = model.textures  # type: ignore[misc]
+
+    def draw(textures: Textures) -> Array:
+        shown = model.with_textures(textures, layout)
+        output, _ = render_traced(shown.gaussians, camera, shown.rule, background, settings, has_geometry=False)
+        return output.color
+
+    color, back = jax.vjp(draw, textures)
+    (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
+    return jax.tree.map(jnp.square, slopes)

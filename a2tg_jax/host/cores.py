@@ -1,0 +1,80 @@
+"""How many threads native loops run on."""
+
+import functools
+import math
+import os
+from pathlib import Path
+
+from a2tg_jax.host.control_groups import group_folders
+
+VARIABLE = "A2TG_NUM_THREADS"
+
+_chosen: int | None = None
+
+
+def set_num_threads(num_threads: int | None) -> None:
+    """Sets the number of threads of native loops, from their next call on; XLA's own threads are not affected.
+
+    Results depend on it in the last bits of gradients only; on nothing else, such as timing.
+
+    Args:
+      num_threads: at least 1; None: the environment's A2TG_NUM_THREADS, or else as many as the process may use.
+
+    Raises:
+      ValueError: if the number is not a positive integer.
+    """
+    global _chosen
+    if num_threads is not None and (
+        not isinstance(num_threads, int) or isinstance(num_threads, bool) or num_threads < 1
+    ):
+        raise ValueError(f"num_threads must be a positive integer or None; got {num_threads!r}")
+    _chosen = num_threads
+
+
+def num_threads() -> int:
+    """The number that was set, or the environment's, or that of the cores that this process may use.
+
+    Raises:
+      ValueError: if the environment's is not a positive integer.
+    """
+    if _chosen is not None:
+        return _chosen
+    wanted = os.environ.get(VARIABLE)
+    if not wanted:
+        return _usable_cores()
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise ValueError(f"the environment's {VARIABLE} must be a positive integer; got {wanted!r}")
+    return int(wanted)
+
+
+def _usable_cores() -> int:
+    """The cores that the process may run on, or fewer where a control group (a container) gives it less time."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    return max(1, math.ceil(min(cores, _own_quota())))
+
+
+@functools.cache
+def _own_quota() -> float:
+    return cpu_quota(Path("/"))
+
+
+def cpu_quota(root: Path) -> float:
+    """The processors' time per time that control groups leave to this process; inf without a limit.
+
+    Args:
+      root: of the file system, as for `host.control_groups.group_folders`.
+    """
+    return min([math.inf, *map(_folder_quota, group_folders(root, "cpu"))])
+
+
+def _folder_quota(folder: Path) -> float:
+    """The limit of one group: cpu.max of version 2, or the files of version 1."""
+    try:
+        if (folder / "cpu.max").is_file():
+            quota, period = (folder / "cpu.max").read_text().split()
+        else:
+            quota, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        return int(quota) / int(period) if int(quota) > 0 else math.inf
+    except (OSError, ValueError, ZeroDivisionError):
+        return math.inf  # "max", or no limit that can be read

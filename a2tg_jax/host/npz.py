@@ -1,0 +1,84 @@
+"""Reading .npz files of numbers. Nothing is allocated that the file is too small for, and nothing is unpickled."""
+
+import ast
+import math
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from a2tg_jax.host.text import shortened
+
+LARGEST_RATIO = 64
+FREE_ROOM = 1 << 20
+"""What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
+LONGEST_HEADER = 10_000
+"""Bytes of what an array says of itself."""
+CHUNK = 1 << 24
+LONGEST_REASON = 200
+
+
+def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, np.ndarray]:
+    """The wanted arrays of an .npz, by name.
+
+    Raises:
+      OSError: if the file cannot be opened.
+      ValueError: saying what is wrong, if it is damaged, an array is not of numbers, or claims more than there is.
+    """
+    with open(path, "rb") as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return _read_arrays(archive, FREE_ROOM + LARGEST_RATIO * Path(path).stat().st_size, is_wanted)
+        except Exception as error:  # what a damaged zip raises goes from zlib.error to NotImplementedError
+            raise ValueError(shortened(str(error) or type(error).__name__, LONGEST_REASON)) from error
+
+
+def _read_arrays(archive: zipfile.ZipFile, room: int, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(".npy")
+        if not is_wanted(name):
+            continue
+        room -= entry.file_size
+        if name in arrays or room < 0:
+            raise ValueError(f"{name} {'occurs twice' if name in arrays else 'would take more than the file may hold'}")
+        with archive.open(entry) as file:
+            arrays[name] = _read_array(file, name, entry.file_size)
+    return arrays
+
+
+def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
+    """One array, of as many bytes as its entry has left after its header."""
+    dtype, is_fortran, shape = _read_header(file, name)
+    left = size - file.tell()
+    if math.prod(shape) * dtype.itemsize != left:
+        raise ValueError(f"{name} claims the shape {shape} of {dtype}, but has {left} bytes")
+    flat = np.empty(math.prod(shape), dtype)
+    target = flat.view(np.uint8)
+    for start in range(0, left, CHUNK):
+        piece = target[start : start + CHUNK]
+        if file.readinto(memoryview(piece)) != len(piece):  # type: ignore[attr-defined, arg-type]
+            raise ValueError(f"{name} is cut off")
+    if file.read(1):  # Also makes the zip compare its checksum.
+        raise ValueError(f"{name} goes on where it should end")
+    return flat.reshape(shape, order="F" if is_fortran else "C").astype(dtype.newbyteorder("="), copy=False)
+
+
+def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int, ...]]:
+    """The dtype of one array, whether its first index runs fastest, and its shape."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"{name} is of the version {version} of .npy, which is not known here")
+    length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
+    if length > LONGEST_HEADER:
+        raise ValueError(f"{name} has a header of {length} bytes")
+    told: Any = ast.literal_eval(file.read(length).decode())
+    dtype, shape = np.dtype(told["descr"]), told["shape"]
+    if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.shape:
+        raise ValueError(f"{name} must be of plain numbers; got {dtype}")
+    if type(shape) is not tuple or not all(type(side) is int and side >= 0 for side in shape) or len(shape) > 32:
+        raise ValueError(f"{name} has no shape")
+    return dtype, told["fortran_order"] is True, shape

@@ -1,0 +1,10 @@
+"""Short texts for messages."""
+
+from typing import Any
+
+
+def shortened(value: Any, most: int = 80) -> str:
+    """A value as an error tells it, on one line of bounded length; texts without quotes, nor what steers a terminal."""
+    text = " ".join((value if isinstance(value, str) else repr(value)).split())
+    text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
+    return text if len(text) <= most else f"{text[: most - 1]}…"

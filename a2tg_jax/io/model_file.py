@@ -1,0 +1,200 @@
+"""Models on disk: Gaussians, what they show and where they were trained, in one archive, without padding.
+
+The header names the class of the appearance and holds its options. Reading a file imports nothing: a class that is not
+this package's must be handed over, or its module be imported already.
+"""
+
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax import appearance as built_in
+from a2tg_jax.appearance import Appearance, Plain, Textured
+from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.validate import check_model
+from a2tg_jax.model import Model
+
+FORMAT = "a2tg-jax model"
+FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
+LONGEST_REASON = 500
+"""Characters of what is wrong with a file: it may say anything of itself."""
+APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
+"""What the names of their arrays begin with."""
+
+
+def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
+    """Writes the rows of a model that exist, with its appearance and its origin.
+
+    Args:
+      path: the file, by custom *.npz; an older one is replaced once the new one is whole.
+      model: any model.
+      header: JSON-able values to keep along; `read_archive_header` returns them.
+
+    Raises:
+      ValueError: if `load_model` would refuse it, as it does numbers that are not finite, or the options of the
+        appearance cannot be written as JSON.
+    """
+    check_gaussians(model.gaussians, "model.gaussians")
+    model = model.live
+    check_model(model)
+    arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
+    shown = model.appearance.arrays(model.params, model.layout)
+    arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}
+    described = {**(header or {}), "appearance": appearance_to_dict(model.appearance)}
+    if model.origin is not None:
+        described["origin"] = origin_to_dict(model.origin)
+        arrays |= {ORIGIN + name: array for name, array in origin_arrays(model.origin).items()}
+        arrays |= {ORIGIN + CORRECTIONS + name: rows for name, rows in model.origin.corrections.items()}
+    write_archive(path, described, arrays, format=FORMAT)
+
+
+def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance]] = ()) -> Model:
+    """The model that `save_model` wrote.
+
+    A model of version 0.1.0, which knew one kind of textures, gets them with the default options.
+
+    Args:
+      path: the file.
+      appearances: classes of appearances that are not this package's.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not a model, is damaged, is of another version, or shows a class that is not known here.
+    """
+    header, arrays = read_archive(path, format=FORMAT)
+    try:
+        return _model_of(header, arrays, appearances)
+    except KeyError as error:
+        raise ValueError(f"{os.fspath(path)}: the model lacks {error}; it is damaged or of another version") from error
+    except (TypeError, IndexError, AttributeError, OverflowError) as error:
+        reason = shortened(str(error))
+        raise ValueError(f"{os.fspath(path)}: the model is damaged or of another version ({reason})") from error
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {shortened(str(error), LONGEST_REASON)}") from error
+
+
+def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances) -> Model:
+    gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
+    check_gaussians(gaussians)
+    gaussians = jax.tree.map(jnp.asarray, gaussians)
+    shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
+    if "appearance" in header:
+        appearance = appearance_from_dict(header["appearance"], appearances)
+    else:
+        shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
+        appearance = Textured() if shown else Plain()
+    params, layout = appearance.from_arrays(shown)
+    of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
+    origin = origin_of(header["origin"], of_origin) if "origin" in header else None
+    model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
+    check_model(model)
+    return model
+
+
+# Appearances
+
+
+def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
+    """Class and options; of an appearance that holds others, theirs too."""
+    kind = type(appearance)
+    held = _held_appearances(appearance)
+    described: dict[str, Any] = {"module": kind.__module__, "name": kind.__qualname__}
+    if held:
+        described["held"] = {name: appearance_to_dict(inner) for name, inner in held.items()}
+    options = {name: value for name, value in config_to_dict(appearance).items() if name not in held}
+    try:
+        back = config_from_dict(kind, json.loads(json.dumps(options, allow_nan=False)), given=held)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
+    if back != appearance:
+        raise ValueError(f"the options of {kind.__name__} do not come back from JSON: {options}")
+    return {**described, "options": options}
+
+
+def _held_appearances(appearance: Appearance) -> dict[str, Appearance]:
+    values = {field.name: getattr(appearance, field.name) for field in dataclasses.fields(appearance)}
+    return {name: value for name, value in values.items() if isinstance(value, Appearance)}
+
+
+def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
+    """The appearance that `appearance_to_dict` was given. ValueError: its class is not known here."""
+    kind = _known_class(data["module"], data["name"], appearances)
+    held = {name: appearance_from_dict(inner, appearances) for name, inner in data.get("held", {}).items()}
+    return config_from_dict(kind, data["options"], f"options of {kind.__name__}", given=held)
+
+
+def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]) -> type[Appearance]:
+    """The class that a file names: one that was handed over, this package's, or one of a module already imported."""
+    given = [kind for kind in appearances if kind.__qualname__ == name]
+    found: Any = given[0] if given else None
+    if found is None and module.partition(".")[0] == __name__.partition(".")[0]:
+        found = getattr(built_in, name, None)
+    if found is None:
+        found = getattr(sys.modules.get(module), name, None)
+    if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
+        return found
+    raise ValueError(
+        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
+        f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
+    )
+
+
+# Origins
+
+
+def origin_to_dict(origin: Origin) -> dict[str, Any]:
+    """What of an origin is not numbers."""
+    return {"names": list(origin.names), "background": list(origin.background)}
+
+
+def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
+    """The numbers of an origin."""
+    world = origin.transform
+    return {
+        "viewmats": origin.viewmats,
+        "Ks": origin.Ks,
+        "sizes": origin.sizes,
+        "is_test": origin.is_test,
+        "scale": np.asarray(world.scale, np.float64),
+        "rotation": np.asarray(world.rotation, np.float64),
+        "translation": np.asarray(world.translation, np.float64),
+    }
+
+
+def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
+    """The origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape or a number is wrong."""
+    names, (red, green, blue) = data["names"], data["background"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"origin/names must be texts; got {shortened(names)}")
+    num = len(names)
+    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
+    shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+    for name, shape in shapes.items():
+        check_shape(ORIGIN + name, arrays[name], shape)
+    viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[name] for name in shapes)
+    if not np.issubdtype(sizes.dtype, np.integer) or is_test.dtype != bool:
+        raise ValueError(f"origin/sizes must be integers, origin/is_test bool; got {sizes.dtype}, {is_test.dtype}")
+    learned = [name for name in arrays if name.startswith(CORRECTIONS)]
+    return Origin(
+        viewmats=viewmats,
+        Ks=Ks,
+        sizes=sizes,
+        names=tuple(names),
+        is_test=is_test,
+        transform=Similarity(float(scale), rotation, translation),
+        background=(float(red), float(green), float(blue)),
+        corrections={name.removeprefix(CORRECTIONS): arrays[name] for name in learned},
+    )

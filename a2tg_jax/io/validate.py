@@ -1,0 +1,121 @@
+"""Whether what was read from a file is a model at all: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
+
+Native loops believe the layout that they are given. Both loaders, of models and of checkpoints, go through here first.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import numpy as np
+
+from a2tg_jax.appearance import Appearance, Banded
+from a2tg_jax.core.cameras import check_calibration
+from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import check_similarity
+from a2tg_jax.host.text import shortened
+from a2tg_jax.model import Model
+from a2tg_jax.texture import AtlasLayout, Textures, check_textures
+
+DTYPES = ("float32", "float64")
+
+
+def check_model(model: Model) -> None:
+    """Raises ValueError, naming the field, unless a model can be rendered and trained.
+
+    All fields have their shapes and one dtype, all numbers are finite, what is shown has a row for each Gaussian, and
+    rows of textures and of coefficients lie within their tables.
+    """
+    gaussians = model.gaussians
+    check_gaussians(gaussians)
+    if str(dtype_of(gaussians.means)) not in DTYPES:
+        raise ValueError(f"gaussians must be {' or '.join(DTYPES)}; got {dtype_of(gaussians.means)}")
+    check_rows(model.appearance, model.params, model.layout, gaussians)
+    check_finite("gaussians", gaussians)
+    check_finite("params", model.params)
+    largest = np.log(np.finfo(gaussians.means.dtype).max)
+    if (np.asarray(gaussians.log_scales) > largest).any():
+        raise ValueError(f"gaussians.log_scales must be logarithms of finite scales, below {largest:.0f}; some are not")
+    if model.num_live is not None:
+        check_count("num_live", model.num_live, gaussians.num)
+    if model.origin is not None:
+        check_origin(model.origin)
+
+
+def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaussians) -> None:
+    """Raises ValueError unless floats are shown, by as many rows as there are Gaussians, with bands above their own."""
+    num, kind = gaussians.num, type(appearance).__name__
+    if isinstance(appearance, Banded):
+        own, base = gaussians.sh_degree, layout.bands.base_degree
+        if own != base:
+            raise ValueError(f"Banded is of bands above degree {base}, but the Gaussians have degree {own}")
+        if layout.bands.num != num:
+            raise ValueError(f"Banded is of {layout.bands.num} degrees, but there are {num} Gaussians")
+        check_rows(appearance.inner, params.inner, layout.inner, gaussians)
+        return
+    for leaf in jax.tree.leaves(params):
+        if str(leaf.dtype) not in DTYPES:
+            raise ValueError(f"the parameters of {kind} must be floats, {' or '.join(DTYPES)}; got {leaf.dtype}")
+    has_rows = not jax.tree.leaves(layout)
+    found = {leaf.shape[0] for leaf in jax.tree.leaves(params)} if has_rows else {getattr(layout, "num", num)}
+    if found - {num}:
+        raise ValueError(f"{kind} is of {min(found - {num})} rows, but there are {num} Gaussians")
+    if isinstance(params, Textures) and isinstance(layout, AtlasLayout):
+        check_textures(params, layout, num)
+        check_places(params, layout)
+
+
+def check_places(textures: Textures, layout: AtlasLayout) -> None:
+    """Raises ValueError unless each texture has a row of its own that its bucket has."""
+    bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
+    if bucket.size and not 0 <= bucket.min() <= bucket.max() < len(textures.buckets):
+        raise ValueError(f"layout.bucket must lie below {len(textures.buckets)}; got {bucket.min()}..{bucket.max()}")
+    capacities = np.asarray([len(texels) for texels in textures.buckets], np.int64)
+    if bucket.size and ((row < 0) | (row >= capacities[bucket])).any():
+        raise ValueError("layout.row must lie within the buckets; some are beyond theirs")
+    starts = np.cumsum(capacities) - capacities
+    if bucket.size and np.bincount(starts[bucket] + row).max() > 1:
+        raise ValueError("layout must give each texture a row of its own; some share one")
+
+
+def check_origin(origin: Origin) -> None:
+    """Raises ValueError, naming the field, unless all cameras and the world of an origin are such."""
+    cameras = zip(origin.names, origin.viewmats, origin.Ks, origin.sizes.tolist(), strict=True)
+    for name, viewmat, K, (width, height) in cameras:
+        check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
+    if not np.isfinite(origin.background).all():
+        raise ValueError(f"origin.background must be finite; got {origin.background}")
+    check_similarity(origin.transform, "origin.transform")
+    for name, rows in origin.corrections.items():
+        check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
+        check_finite(f"origin.corrections.{name}", rows)
+
+
+def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
+    """Raises ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        values = np.asarray(leaf)
+        if not np.issubdtype(values.dtype, np.floating):
+            continue
+        if not (np.isfinite(values) if is_signed else values >= 0).all():
+            wanted, found = ("finite", "NaN or infinite") if is_signed else ("at least 0", "negative or NaN")
+            raise ValueError(f"{name}{jax.tree_util.keystr(path)} must be {wanted}; some are {found}")
+
+
+def check_count(name: str, value: Any, most: int) -> None:
+    """Raises ValueError unless a value is one integer in 0..most."""
+    number = np.asarray(value)
+    if number.shape or number.dtype.kind not in "iu" or not 0 <= int(number) <= most:
+        raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(value)}")
+
+
+def check_like(name: str, tree: Any, wanted: Any) -> None:
+    """Raises ValueError, naming the leaf, unless two pytrees of one structure have the same shapes and dtypes."""
+    pairs: Iterable = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
+    for (path, leaf), like in pairs:
+        label = f"{name}{jax.tree_util.keystr(path)}"
+        check_shape(label, leaf, tuple(like.shape))
+        if dtype_of(leaf) != like.dtype:
+            raise ValueError(f"{label} must be {like.dtype}; got {dtype_of(leaf)}")

@@ -1,0 +1,129 @@
+"""What test views are aligned by before they are scored: their colours by least squares, their poses by descent.
+
+A model that was trained with exposures or refined poses is right up to those of a photograph that it has never seen. As
+is the custom, these few numbers of a test photograph are found from itself, with the model held.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.jit import jit
+from a2tg_jax.core.optim import adam_init, adam_update
+from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.data import View, view_image
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
+
+NUM_STEPS = 100
+FIRST_RATE = 2e-3
+LAST_RATE = 2e-5
+"""In radians and units of the normalised world; the rate falls exponentially, and all steps together lead some 2.5°."""
+HEAD_ROOM = 1.5
+
+
+def color_fit(image: Any, target: Any, mask: Any = None) -> np.ndarray:
+    """The affine map of colours [3, 4] = [A | b] of least squared error |A·image + b − target|² (host).
+
+    Args:
+      image: [H, W, 3] a render.
+      target: [H, W, 3] the photograph.
+      mask: [H, W] bool, the pixels that count; None: all.
+
+    Returns:
+      float64. Where an image of few colours leaves it open, the smallest such numbers.
+    """
+    counts = np.ones(np.shape(image)[:2], bool) if mask is None else np.asarray(mask)
+    colors, wanted = np.asarray(image, np.float64)[counts], np.asarray(target, np.float64)[counts]
+    inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
+    return np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
+
+
+def align_poses(
+    views: Sequence[View],
+    model: Model,
+    *,
+    background: Any = None,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    num_steps: int = NUM_STEPS,
+) -> tuple[View, ...]:
+    """The views with cameras from which the model looks most like their photographs (host).
+
+    Adam descends the photometric loss by a twist of the camera in its own frame; the best step of each view is kept,
+    so that no loss becomes worse.
+
+    Args:
+      views: near their places.
+      model: held.
+      background: [3] colour; None is the model's own.
+      settings: all but the capacity, which is found.
+      num_steps: of Adam.
+    """
+    model = model.live
+    background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
+    cameras = [view.camera for view in views]
+    planned = plan_render(model.gaussians, cameras, rule=model.rule, head_room=HEAD_ROOM, settings=settings)
+    return tuple(_aligned(view, model, background, planned, num_steps) for view in views)
+
+
+class _Best(NamedTuple):
+    """The best camera that was looked from so far."""
+
+    loss: Array
+    twist: Array
+    overflow: Array
+    """At any step."""
+
+
+def _aligned(view: View, model: Model, background: Array, settings: RenderSettings, num_steps: int) -> View:
+    dtype = background.dtype
+    target = jnp.asarray(view_image(view, np.asarray(background)), dtype)
+    mask = None if view.mask is None else jnp.asarray(view.mask.read())
+    camera = jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera)
+    best = _jitted_descent()(model.gaussians, model.rule, camera, target, mask, background, settings, num_steps)
+    if bool(best.overflow):
+        assert settings.capacity is not None
+        more = dataclasses.replace(settings, capacity=2 * settings.capacity)
+        return _aligned(view, model, background, more, num_steps)
+    viewmat = moved_viewmat(best.twist, camera.viewmat)
+    return dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat.astype(jnp.float32)))
+
+
+@functools.cache
+def _jitted_descent() -> jit:
+    return jit(_descent, static_argnums=(6, 7))
+
+
+def _descent(gaussians, rule, camera: Camera, target: Array, mask, background, settings, num_steps: int) -> _Best:
+    """The twist of least loss among those that Adam comes to."""
+    ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
+    shown = target if mask is None else jnp.where(mask[..., None], target, 0.0)
+
+    def loss(twist):
+        moved = dataclasses.replace(camera, viewmat=moved_viewmat(twist, camera.viewmat))
+        output, _ = render_traced(gaussians, moved, rule, background, settings, has_geometry=False)
+        color = output.color if mask is None else jnp.where(mask[..., None], output.color, 0.0)
+        return photometric_loss(color, shown, ssim_weight=ssim_weight), output.overflow
+
+    def step(carry, index):
+        twist, moments, best = carry
+        (value, overflow), grad = jax.value_and_grad(loss, has_aux=True)(twist)
+        is_better = value < best.loss
+        loss_now, twist_now = jnp.where(is_better, value, best.loss), jnp.where(is_better, twist, best.twist)
+        rate = FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (index / num_steps)
+        twist, moments = adam_update(twist, grad, moments, rate)
+        return (twist, moments, _Best(loss_now, twist_now, best.overflow | overflow)), None
+
+    start = jnp.zeros(6, target.dtype)
+    best = _Best(jnp.asarray(jnp.inf, target.dtype), start, jnp.zeros((), bool))
+    steps = jnp.arange(num_steps + 1, dtype=target.dtype)
+    (_, _, best), _ = jax.lax.scan(step, (start, adam_init(start), best), steps)
+    return best

@@ -1,0 +1,154 @@
+"""Image quality and speed of a trained model on given views."""
+
+import dataclasses
+import os
+import time
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.appearance import Plain, Textured
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import Color
+from a2tg_jax.data import View, view_image
+from a2tg_jax.measure.alignment import color_fit
+from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings, appearance_of
+from a2tg_jax.renderer import Renderer
+from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.training.corrections import exposed
+from a2tg_jax.training.learning import flat_psnr, has_learned
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewMetrics:
+    """Quality of one view, its image clipped to [0, 1]."""
+
+    name: str
+    psnr: float
+    """dB, higher is better."""
+    ssim: float
+    """At most 1, higher is better."""
+    lpips: float | None
+    """Lower is better; None where no weights were given."""
+    flat_psnr: float
+    """PSNR of the best flat colour in place of the render, in dB (`metrics.flat_psnr`)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Quality of all the views, and the speed at which they are drawn."""
+
+    per_view: tuple[ViewMetrics, ...]
+    lpips_network: str | None
+    """The network of the LPIPS figures, which cannot be compared with another's; None where there are none."""
+    frames_per_second: float
+    """Median over all the views evaluated together, compiled and warm."""
+    renders: tuple[np.ndarray, ...]
+    """Images of the first views, uint8 [H, W, 3]; as many as were asked for."""
+
+    def __getitem__(self, views: slice) -> "Evaluation":
+        """The figures of some of the views."""
+        return dataclasses.replace(self, per_view=self.per_view[views], renders=self.renders[views])
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.psnr for view in self.per_view]))
+
+    @property
+    def flat_psnr(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.flat_psnr for view in self.per_view]))
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether the model shows more than one flat colour per view."""
+        return has_learned(self.psnr, self.flat_psnr)
+
+    @property
+    def ssim(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.ssim for view in self.per_view]))
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean over the views; None without weights."""
+        return None if self.lpips_network is None else float(np.mean([view.lpips for view in self.per_view]))
+
+
+def evaluate(
+    views: Sequence[View],
+    gaussians: Gaussians | Model,
+    textures: Textures | None = None,
+    layout: AtlasLayout | None = None,
+    *,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    background: Color | None = None,
+    lpips_weights: str | os.PathLike | None = None,
+    num_renders: int = 0,
+    fit_colors: bool = False,
+) -> Evaluation:
+    """Renders every view and compares it with its photograph, where its pixels count (host).
+
+    Args:
+      views: at least one.
+      gaussians, textures, layout, settings: what `render_image` takes; the capacity is found here. Or a model, alone.
+      background: RGB behind the Gaussians, and behind photographs with an alpha channel; None is the model's own, or
+        black.
+      lpips_weights: a weights file for LPIPS; None leaves it out.
+      num_renders: return the images of the first so many views, too.
+      fit_colors: before a render is compared, its colours are mapped to the photograph's by the affine map of least
+        squares (`measure.alignment.color_fit`), for photographs whose exposure the model cannot know.
+
+    Raises:
+      ValueError: if there are no views, or a model is given with textures.
+      FileNotFoundError: if `lpips_weights` is not there.
+    """
+    if not views:
+        raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
+    weights = None if lpips_weights is None else load_lpips(lpips_weights)
+    model = _model_of(gaussians, textures, layout, settings)
+    background = model.background if background is None else background
+    cameras = [view.camera for view in views]
+    renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
+    measure = jax.jit(lambda *compared: (psnr(*compared), ssim(*compared), flat_psnr(*compared[1:])))
+    per_view: list[ViewMetrics] = []
+    seconds: list[float] = []
+    renders: list[np.ndarray] = []
+    for view in views:
+        image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
+        seconds.append(_seconds_to_draw(renderer, view.camera))
+        mask = None if view.mask is None else jnp.asarray(view.mask.read())
+        if fit_colors:
+            image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
+        decibels, similarity, flat = (float(figure) for figure in measure(image, target, mask))
+        distance = None if weights is None else float(lpips(image, target, weights, mask))
+        per_view.append(ViewMetrics(view.name, decibels, similarity, distance, flat))
+        if len(renders) < num_renders:
+            renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))
+    network = None if weights is None else weights.network
+    return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
+
+
+def _model_of(gaussians: Gaussians | Model, textures, layout, settings: RenderSettings) -> Model:
+    """The one value that all these are."""
+    if isinstance(gaussians, Model):
+        if textures is not None or layout is not None:
+            raise ValueError("textures and layout are part of a model: give the model alone")
+        return gaussians
+    appearance_of(gaussians, textures, layout, settings)
+    if textures is None:
+        return Model(gaussians, appearance=Plain(settings.texture.max_alpha))
+    return Model(gaussians, textures, layout, appearance=Textured(options=settings.texture))
+
+
+def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:
+    """Time of one image; the renderer has drawn this size before."""
+    start = time.perf_counter()
+    jax.block_until_ready(renderer(camera))
+    return time.perf_counter() - start

@@ -1,0 +1,88 @@
+"""Front-to-back compositing of tiles, given any appearance rule, with an exact gradient in constant memory.
+
+What happens at one pixel is `pixel`'s; a module of `kernels` does it for all of them: `native` on CPUs, `pallas` on
+GPUs, or `xla`. Each has a `forward` and a `backward` of the same arguments and results.
+
+The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
+"""
+
+import functools
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.appearance import AppearanceRule, StaticRule
+from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
+from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, Splats
+from a2tg_jax.rasterize.tiles import TileGrid, TileLists
+
+
+def composite(
+    settings: CompositingSettings, splats: Splats, rule: AppearanceRule, cutoff: Array, lists: TileLists,
+    jacobian: Array, probe: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Channels [D, H, W] and final transmittance [H, W]; D is red, green, blue(, depth, depth², normal x, y, z).
+
+    Args:
+      settings: static choices.
+      splats: N splats.
+      rule: what they show. Its texels are differentiated; of its other arrays none is read but the regions.
+      cutoff: [N] squared distance beyond which each splat need not be looked at.
+      lists: the splats of each tile.
+      jacobian: [3, 3] ∂M[:, 2]/∂μ = K·Rc, used by the statistic alone.
+      probe: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
+        `rasterize.pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
+    """
+    arrays = splats, rule.texels, rule.regions, cutoff, lists, jacobian, probe
+    channels, transmittance = _composite_tiles(settings, StaticRule.of(rule), *arrays)
+    return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _composite_tiles(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
+    """Channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group, P pixels a tile."""
+    return _kernels(settings.compositor).forward(settings, rule, splats, texels, regions, cutoff, lists)
+
+
+def _composite_tiles_fwd(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
+    shown = _kernels(settings.compositor).forward(settings, rule, splats, texels, regions, cutoff, lists)
+    return shown, (splats, texels, regions, cutoff, lists, jacobian, probe, *shown)
+
+
+def _composite_tiles_bwd(settings, rule, residuals, cotangents):
+    *arrays, channels, transmittance = residuals
+    g, g_transmittance = cotangents
+    suffix_sum = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
+    cotangents = _kernels(settings.compositor).backward(settings, rule, *arrays, g, suffix_sum)
+    d_splats, d_texels, d_probe = cotangent_of((arrays[0], arrays[1], arrays[-1]), cotangents)
+    return d_splats, d_texels, None, None, None, None, d_probe
+
+
+_composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
+
+
+def _kernels(compositor: Compositor) -> ModuleType:
+    """The module that composites, imported where it is used: Pallas adds to JAX's settings when it is."""
+    if compositor == "native":
+        from a2tg_jax.rasterize.kernels.native import composite as native
+
+        return native
+    if compositor == "pallas":
+        from a2tg_jax.rasterize.kernels import pallas
+
+        return pallas
+    from a2tg_jax.rasterize.kernels import xla
+
+    return xla
+
+
+def _assemble(tiles: Array, grid: TileGrid) -> Array:
+    """[groups, G, ..., P] tiles as one image [..., H, W]."""
+    tiles = tiles.reshape(-1, *tiles.shape[2:])[: grid.num]
+    inner = tiles.shape[1:-1]
+    blocks = tiles.reshape(grid.rows, grid.columns, *inner, grid.tile_size, grid.tile_size)
+    image = jnp.moveaxis(blocks, (0, 1), (-4, -2))
+    size = grid.tile_size
+    return image.reshape(*inner, grid.rows * size, grid.columns * size)[..., : grid.height, : grid.width]

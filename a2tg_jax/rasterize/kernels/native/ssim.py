@@ -1,0 +1,249 @@
+"""A score of two images, natively: of every window the means of x, y, x² + y² and x·y, a function of them, its average.
+
+    score(x, y, sums, d_means, rows; first, last, channels, height, width)
+    pull_back(x, y, d_mean, d_squares, d_product, share, d_x, rows; the same)
+
+Windows are separable; their T taps go down the columns first, then along the row. `score` does the rows from `first`
+up to `last` of windows, counted through all channels, `pull_back` those of pixels.
+
+Buffers: x, y and d_x [C, height, width]; sums [C·down] of the scores of a row of down × across windows; d_means
+[4, C, down + 2·(T − 1), across] their derivatives by each mean, between margins of zeros; d_mean, d_squares and
+d_product three of these; share [1] what each score counts; rows for the columns' sums.
+"""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from llvmlite import ir
+
+from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of, vary_with
+from a2tg_jax.rasterize.kernels.native import ffi, llvm_modules, threads
+from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
+from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
+
+SCORE = ("x", "y", "sums", "d_means", "rows")
+PULL_BACK = ("x", "y", "d_mean", "d_squares", "d_product", "share", "d_x", "rows")
+INTEGERS = ("first", "last", "channels", "height", "width")
+LEAST_PIXELS = 10_000
+"""Fewer pixels than this are not worth another thread."""
+
+
+class Score(NamedTuple):
+    """What is averaged over windows; hashable."""
+
+    function: Callable[[Array, Array, Array, Array], Array]
+    """Element-wise, of the means of x, y, x² + y² and x·y."""
+    taps: tuple[float, ...]
+    """Weights of a window along one axis."""
+
+
+def least_width(dtype, num_taps: int) -> int:
+    """The narrowest image that the loops can do: the windows of a row fill a vector."""
+    return llvm_modules.vector_bytes() // np.dtype(dtype).itemsize + num_taps - 1
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def mean_score(score: Score, x: Array, y: Array) -> Array:
+    """The average over all windows of images [C, H, W], float32 or float64, which are at least `least_width` wide."""
+    return _score(score, x, y)[0]
+
+
+def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:
+    count, height, width = x.shape
+    margin = len(score.taps) - 1
+    down, across = height - margin, width - margin
+    shapes = (
+        jax.ShapeDtypeStruct((count * down,), x.dtype),
+        jax.ShapeDtypeStruct((4, count, down + 2 * margin, across), x.dtype),
+    )
+    name = _registered(score, str(x.dtype), "score", _score_handler)
+    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
+    sums, d_means = vary_with((x, y), call(x, y))
+    return jnp.sum(sums) / (count * down * across), d_means
+
+
+def _score_forward(score: Score, x: Array, y: Array):
+    value, d_means = _score(score, x, y)
+    return value, (x, y, d_means)
+
+
+def _score_backward(score: Score, residuals, cotangent: Array) -> tuple[Array, Array]:
+    x, y, (d_x_mean, d_y_mean, *d_products) = residuals
+    count, height, _ = x.shape
+    name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
+    call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype), vmap_method="sequential")
+    num_windows = count * (height - len(score.taps) + 1) * d_x_mean.shape[2]
+    share = cotangent[None] / num_windows
+    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
+    # Where nobody asks for the second, XLA leaves it out.
+    return cotangent_of((x, y), tuple(vary_with(given, call(*given)) for given in inputs))
+
+
+mean_score.defvjp(_score_forward, _score_backward)
+
+
+def _registered(score: Score, dtype: str, which: str, handler: Callable) -> str:
+    function = getattr(score.function, "__qualname__", type(score.function).__name__)
+    make_handler = lambda: functools.partial(handler, getattr(_loops(score, dtype), which), len(score.taps) - 1)  # noqa: E731
+    return ffi.registered(f"{which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
+
+
+def _score_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    sums, d_means = results
+    count, height, width = arguments[0].shape
+    d_means[:, :, :margin], d_means[:, :, -margin:] = 0, 0
+
+    def part(first: int, last: int, _: int) -> None:
+        rows = np.empty(4 * width, sums.dtype)
+        run(*(array.ctypes.data for array in (*arguments, *results, rows)), first, last, count, height, width)
+
+    _in_spans(part, len(sums), arguments[0].size)
+
+
+def _pull_back_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    (d_x,) = results
+    count, height, width = d_x.shape
+
+    def part(first: int, last: int, _: int) -> None:
+        # A row of windows stands between margins that stay zero.
+        rows = np.zeros(3 * (width + margin), d_x.dtype)
+        run(*(array.ctypes.data for array in (*arguments, d_x, rows)), first, last, count, height, width)
+
+    _in_spans(part, count * height, d_x.size)
+
+
+def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: int) -> None:
+    """part(first, last, _) for all rows, on as many threads as the pixels are worth."""
+    threads.run_spans(part, threads.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
+
+
+class _Rows(Writer):
+    """What both loops share."""
+
+    def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], score: Score, dtype: str):
+        super().__init__(module, name, buffers, INTEGERS, dtype)
+        self.score, self.margin = score, len(score.taps) - 1
+        self.lanes = Lanes(self.b, llvm_modules.vector_bytes() // np.dtype(dtype).itemsize)
+        self.reals = self.lanes.vector(self.real)
+        self.channels, self.height, self.width = (self.long(self.arguments[name]) for name in INTEGERS[2:])
+        self.down, self.across = (self.b.sub(size, LONG(self.margin)) for size in (self.height, self.width))
+
+    def loop_over_rows(self):
+        return self.loop(self.long(self.arguments["first"]), self.long(self.arguments["last"]))
+
+    @contextlib.contextmanager
+    def vectors(self, num: ir.Value) -> Iterator[tuple[ir.Value, ir.Value]]:
+        """A loop over `num` numbers, L at a time. The last vector may overlap the one before: yields where it begins,
+        and how many of its numbers were done already."""
+        b, length = self.b, LONG(self.lanes.width)
+        with self.loop(LONG(0), b.sdiv(b.add(num, LONG(self.lanes.width - 1)), length)) as (k, _):
+            place, last = b.mul(k, length), b.sub(num, length)
+            start = b.select(b.icmp_signed("<", place, last), place, last)
+            yield start, b.sub(place, start)
+
+    def row(self, name: str, index: ir.Value, length: ir.Value) -> ir.Value:
+        """The address of a row of an array."""
+        return self.at(self.arguments[name], self.b.mul(index, length), self.real)
+
+    def vector(self, base: ir.Value, index: ir.Value) -> ir.Value:
+        """L numbers of an array from an index on."""
+        return self.load(self.at(base, index, self.real), 0, self.reals)
+
+    def weighed(self, numbers: Sequence[ir.Value], taps: Sequence[float]) -> ir.Value:
+        """Σ taps·numbers."""
+        weights = [self.lanes.constant(tap, self.real) for tap in taps]
+        return functools.reduce(self.sum, map(self.product, numbers, weights))
+
+    def along(self, base: ir.Value, start: ir.Value, stride: ir.Value) -> list[ir.Value]:
+        """The numbers under a window's taps, from `start` on."""
+        places = [self.b.add(start, self.times(stride, i)) for i in range(self.margin + 1)]
+        return [self.vector(base, place) for place in places]
+
+
+class _ScoreRows(_Rows):
+    def write(self, dtype: str) -> None:
+        b, number = self.b, jax.ShapeDtypeStruct((), dtype)
+        with_slopes, _ = trace(jax.value_and_grad(self.score.function, argnums=(0, 1, 2, 3)), *[number] * 4)
+        lane = ir.Constant(self.lanes.vector(INT), list(range(self.lanes.width)))
+        total, zero = self.variable(self.reals), self.lanes.constant(0.0, self.real)
+        means = [self.row("rows", LONG(k), self.width) for k in range(4)]
+        padded = b.add(self.down, LONG(2 * self.margin))
+        with self.loop_over_rows() as (index, _):
+            channel, y = b.sdiv(index, self.down), b.srem(index, self.down)
+            self.store_columns(means, b.add(b.mul(channel, self.height), y))
+            b.store(zero, total)
+            with self.vectors(self.across) as (start, num_done):
+                windows = [self.weighed(self.along(mean, start, LONG(1)), self.score.taps) for mean in means]
+                value, *slopes = self.lanes.emit(with_slopes, windows)
+                is_new = b.icmp_signed(">=", lane, self.lanes.broadcast(b.trunc(num_done, INT)))
+                b.store(self.sum(b.load(total, typ=self.reals), b.select(is_new, value, zero)), total)
+                for k, slope in enumerate(slopes):
+                    row = b.add(
+                        b.mul(b.add(self.times(self.channels, k), channel), padded), b.add(y, LONG(self.margin))
+                    )
+                    self.store(slope, self.at(self.row("d_means", row, self.across), start, self.real), 0)
+            self.store(self.lanes.sum(b.load(total, typ=self.reals)), self.arguments["sums"], index)
+        b.ret_void()
+
+    def store_columns(self, means: Sequence[ir.Value], first: ir.Value) -> None:
+        """Of every column, the weighed sums of x, y, x² + y² and x·y over the rows of a window, from row `first` on."""
+        with self.vectors(self.width) as (start, _):
+            xs, ys = (self.along(self.row(name, first, self.width), start, self.width) for name in "xy")
+            squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
+            products = list(map(self.product, xs, ys))
+            for mean, numbers in zip(means, (xs, ys, squares, products), strict=True):
+                self.store(self.weighed(numbers, self.score.taps), self.at(mean, start, self.real), 0)
+
+
+class _PullBackRows(_Rows):
+    def write(self) -> None:
+        b, taps = self.b, self.score.taps[::-1]
+        length = b.add(self.width, LONG(self.margin))
+        rows = [self.row("rows", LONG(k), length) for k in range(3)]
+        two, share = (
+            self.lanes.broadcast(number)
+            for number in (self.real(2.0), self.load(self.arguments["share"], 0, self.real))
+        )
+        with self.loop_over_rows() as (index, _):
+            channel, y = b.sdiv(index, self.height), b.srem(index, self.height)
+            first = b.add(b.mul(channel, b.add(self.height, LONG(self.margin))), y)
+            with self.vectors(self.across) as (start, _):
+                for name, row in zip(PULL_BACK[2:5], rows, strict=True):
+                    column = self.along(self.row(name, first, self.across), start, self.across)
+                    self.store(self.weighed(column, taps), self.at(row, b.add(start, LONG(self.margin)), self.real), 0)
+            with self.vectors(self.width) as (start, _):
+                d_mean, d_squares, d_product = (self.weighed(self.along(row, start, LONG(1)), taps) for row in rows)
+                x, y = (self.vector(self.row(name, index, self.width), start) for name in "xy")
+                by_x = self.sum(self.product(self.product(two, x), d_squares), self.product(y, d_product))
+                d_x = self.product(share, self.sum(d_mean, by_x))
+                self.store(d_x, self.at(self.row("d_x", index, self.width), start, self.real), 0)
+        b.ret_void()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Loops:
+    """Compiled loops; each releases the GIL."""
+
+    score: Any
+    pull_back: Any
+
+
+@functools.cache
+def _loops(score: Score, dtype: str) -> _Loops:
+    module = ir.Module("windows")
+    forward, backward = (llvm_modules.unique(name) for name in ("score", "pull_back"))
+    _ScoreRows(module, forward, SCORE, score, dtype).write(dtype)
+    _PullBackRows(module, backward, PULL_BACK, score, dtype).write()
+    addresses = llvm_modules.compile_module(module)
+    return _Loops(
+        score=llvm_modules.as_function(addresses[forward], len(SCORE), len(INTEGERS)),
+        pull_back=llvm_modules.as_function(addresses[backward], len(PULL_BACK), len(INTEGERS)),
+    )

@@ -1,0 +1,36 @@
+"""The threads that native loops run on, made at the first need."""
+
+import concurrent.futures
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+
+from a2tg_jax.host.cores import num_threads
+
+Span = tuple[int, int]
+"""First item, and the one after the last."""
+
+
+def even_spans(num: int, least_items: int) -> list[Span]:
+    """0..num in one span for each thread that gets at least so many items; at least one span."""
+    count = max(1, min(num_threads(), num // max(1, least_items)))
+    return list(itertools.pairwise(num * k // count for k in range(count + 1)))
+
+
+def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> None:
+    """work(first, last, index) for every span, the first one on this thread, the others on the pool's."""
+    others: list[concurrent.futures.Future] = []
+    try:
+        for index, span in enumerate(spans[1:], start=1):
+            others.append(_pool(num_threads()).submit(work, *span, index))
+        work(*spans[0], 0)
+    finally:
+        # Whatever happens, nobody may write to XLA's buffers once they are given back.
+        concurrent.futures.wait(others)
+    for other in others:
+        other.result()
+
+
+@functools.cache
+def _pool(size: int) -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(size, thread_name_prefix="a2tg")

@@ -1,0 +1,108 @@
+"""What native loops are made for (`KernelSpec`), and the scalar functions that they apply, traced to jaxprs."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.appearance import StaticRule
+from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
+from a2tg_jax.rasterize import pixel
+from a2tg_jax.rasterize.kernels.native import llvm_modules
+from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.packing import num_numbers
+
+
+@dataclasses.dataclass(frozen=True)
+class KernelSpec:
+    """What a pair of loops is made for; hashable."""
+
+    rule: StaticRule
+    """What the splats show."""
+    num_rule_numbers: int
+    """K, what else the rule knows of a splat."""
+    num_columns: int
+    """C, numbers of a texel; 0 where its splats have no textures."""
+    dtype: str
+    """Of all that is computed: "float32" or "float64"."""
+    tile_size: int
+    near_plane: float
+    has_geometry: bool
+    statistic: pixel.Statistic | None
+
+    @property
+    def num_channels(self) -> int:
+        return 8 if self.has_geometry else 3
+
+    @property
+    def num_floats(self) -> int:
+        """S: the splat's own numbers, and the squared distance beyond which it does not show."""
+        return num_numbers(self.has_geometry) + self.num_rule_numbers + 1
+
+    @property
+    def lanes(self) -> int:
+        """L, numbers that fit the processor's vectors."""
+        return llvm_modules.vector_bytes() // np.dtype(self.dtype).itemsize
+
+    @property
+    def num_vectors(self) -> int:
+        """Vectors of L pixels in a tile, the last one perhaps not full."""
+        return -(-(self.tile_size**2) // self.lanes)
+
+
+class Functions:
+    """The jaxprs of one spec, all of scalars.
+
+    `prepare` and `prepare_vjp` are run once per splat and tile; `reach`, `forward` and `backward` at every pixel.
+    """
+
+    def __init__(self, spec: KernelSpec):
+        self._spec, self._rule = spec, spec.rule.rule
+        number: Any = jax.ShapeDtypeStruct((), spec.dtype)
+        integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
+        flag = jax.ShapeDtypeStruct((), jnp.bool_)
+        triple = (number,) * 3
+        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
+        splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
+        values = (number,) * spec.num_columns
+        region = TextureRegion(integer, integer, integer) if values else None
+        lookup = Lookup(region, Sample(values, values, values)) if region else None
+
+        self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
+        self.num_planes = structure.num_leaves
+        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
+        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, number, number, planes)
+        self.reach, _ = trace(self._reach, planes, region, number, number)
+        at_pixel, channels = (number, number, number, flag), (number,) * spec.num_channels
+        self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
+        of_backward = number, channels, (number, number), (triple,) * 3
+        self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
+
+    def _reach(self, planes, region, x, y):
+        """Squared distance ρ of the pixel, and where the splat's texture is looked up."""
+        hit = pixel.intersect(planes, x, y, self._spec.near_plane, self._rule.has_low_pass)
+        return hit.rho, () if region is None else self._rule.texel_position(region, hit.u, hit.v)
+
+    def _forward(self, planes, splat, values, x, y, transmittance, is_live, channels):
+        """Transmittance and liveness behind the splat, and the channels with it."""
+        at_pixel = planes, splat, values, x, y, transmittance, is_live
+        added, transmittance, is_live = pixel.blend(self._rule, self._spec.near_plane, *at_pixel)
+        return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
+
+    def _backward(self, planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g, center, jacobian):
+        """The state behind the splat, whether it contributes, and the cotangents: of texture values, and all others."""
+        spec, rule = self._spec, self._rule
+        at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
+        state, weight, d = pixel.blend_vjp(rule, spec.near_plane, *at_pixel, spec.statistic is not None)
+        added = ()
+        if spec.statistic:
+            moved = splat.M, x, y, *center, d.rho, jacobian
+            added = pixel.positional_gradient(spec.statistic, *moved, spec.near_plane, rule.has_low_pass)
+        return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
+
+
+def _planes_vjp(M, x, y, d_planes):
+    """The cotangent of M, given that of its planes."""
+    return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]

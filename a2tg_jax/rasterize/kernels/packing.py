@@ -1,0 +1,38 @@
+"""The splats and their texture regions as plain arrays, as kernels read them; and their cotangents back again."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.rasterize.splats import Splats
+
+
+def num_numbers(has_geometry: bool) -> int:
+    """Numbers of every splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
+    return 16 if has_geometry else 13
+
+
+def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
+    """[N, S] with one splat a row, in the order of `rasterize.pixel.Splat`, and further columns [N] after it."""
+    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
+    columns += [splats.normals] if has_geometry else []
+    return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
+
+
+def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
+    """Cotangents [N, S] as those of splats."""
+    first = num_numbers(has_geometry)
+    return Splats(
+        M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
+        opacities=packed[:, 9].astype(like.opacities.dtype),
+        colors=packed[:, 10:13].astype(like.colors.dtype),
+        normals=packed[:, 13:16].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
+        numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
+    )
+
+
+def pack_regions(regions: TextureRegion | None, least_columns: int = 0) -> Array:
+    """[N, 3] int32 `TextureRegion` of every splat; without textures there is one row of `least_columns`."""
+    if regions is None:
+        return jnp.zeros((1, least_columns), jnp.int32)
+    return jnp.stack(regions, axis=1).astype(jnp.int32)

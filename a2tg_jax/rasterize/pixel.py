@@ -1,0 +1,288 @@
+"""One splat at one pixel: where the ray meets it, what it shows there, how much light it lets through.
+
+Every function here is element-wise: it takes scalars, or arrays that broadcast. It is the one definition of what is
+rendered: `kernels.xla` runs it over arrays, the other kernels compile it into loops, and all differentiate it by
+`jax.vjp`.
+
+M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of a splat, g the cotangent of the channels, B
+(`suffix_sum`) what the splats from here to the last one make of g.
+"""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.core.bilinear import Lookup, follow
+
+MIN_ALPHA = 1 / 255
+MIN_TRANSMITTANCE = 1e-4
+
+Triple = tuple[Array, Array, Array]
+Statistic = Literal["position", "screen", "center"]
+"""What densification asks of the backward pass (`positional_gradient`)."""
+
+
+class Splat(NamedTuple):
+    """What is differentiated of a splat besides its appearance."""
+
+    M: tuple[Triple, Triple, Triple]
+    """Rows of the homography from (u, v, 1) to pixels."""
+    opacity: Array
+    """Peak opacity, before the falloff."""
+    color: Triple
+    """Red, green and blue of its spherical harmonics."""
+    normal: Triple | None
+    """In the world, facing the camera; None where only colour is composited."""
+    numbers: tuple[Array, ...] = ()
+    """What else its appearance rule knows of it (`AppearanceRule.numbers`)."""
+
+
+class Planes(NamedTuple):
+    """A splat seen from a tile: p = k × l is linear in the pixel (x, y), counted from the tile's centre."""
+
+    p0: Triple
+    """Coefficients of x, y and 1 in p₀, where u = p₀/p₂."""
+    p1: Triple
+    """The same of p₁, where v = p₁/p₂."""
+    p2: Triple
+    """The same of p₂."""
+    determinant: Array
+    """det(M); over p₂ it is the depth of the hit."""
+    center_x: Array
+    """The projected mean, in pixels from the tile's centre."""
+    center_y: Array
+    """Its other coordinate."""
+    depth: Array
+    """Depth of the mean."""
+
+
+class Hit(NamedTuple):
+    """Where the ray of a pixel meets a splat."""
+
+    u: Array
+    """Along the first axis, in standard deviations; 0 without a hit."""
+    v: Array
+    """Along the second axis."""
+    rho: Array
+    """min(u² + v², 2·|(x, y) − c|²), the squared distance that the falloff sees. Without the low-pass filter u² + v²,
+    infinite without a hit."""
+    depth: Array
+    """Depth of the hit; of the mean where the low-pass filter decides."""
+    is_ray: Array
+    """Whether the hit decides ρ, not the low-pass filter."""
+
+
+class Shown(NamedTuple):
+    """What a splat shows at a pixel."""
+
+    alpha: Array
+    """In [0, max_alpha]; 0 where it would be less than 1/255."""
+    channels: tuple[Array, ...]
+    """Red, green, blue; and depth, depth², normal x, y, z where the splat has a normal."""
+
+
+def _cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def planes_of(M: tuple[Triple, Triple, Triple], x: Array, y: Array) -> Planes:
+    """The planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1)."""
+    last = M[2]
+    # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
+    first = (M[0][0] - x * last[0], M[0][1] - x * last[1], M[0][2] - x * last[2])
+    second = (M[1][0] - y * last[0], M[1][1] - y * last[1], M[1][2] - y * last[2])
+    a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
+    return Planes(
+        p0=(a[0], b[0], c[0]),
+        p1=(a[1], b[1], c[1]),
+        p2=(a[2], b[2], c[2]),
+        determinant=last[0] * c[0] + last[1] * c[1] + last[2] * c[2],
+        center_x=first[2] / last[2],
+        center_y=second[2] / last[2],
+        depth=last[2],
+    )
+
+
+def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pass: bool = True) -> Hit:
+    """The hit of a pixel's ray, or the low-pass filter where there is one and it is nearer (2DGS, equations 10, 11).
+
+    The point is (p₀, p₁)/p₂ and its depth det(M)/p₂; depths below `near_plane` are no hit.
+    """
+    p0, p1, p2 = (plane[0] * x + plane[1] * y + plane[2] for plane in planes[:3])
+    # Far out on a nearly parallel plane u² would overflow, and 1/p₂² for the tiniest splats: there the divisor is
+    # held, with a finite gradient.
+    far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
+    q0, q1, q2, determinant = jax.lax.stop_gradient((p0, p1, p2, planes.determinant))
+    least = jnp.maximum(jnp.maximum(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
+    least = jnp.maximum(least, tiny)
+    is_far = jnp.abs(q2) <= least
+    is_parallel = q2 == 0
+    inverse = 1 / jnp.where(is_far, jnp.where(q2 < 0, -least, least), p2)
+    depth = planes.determinant * inverse
+    is_hit = ~is_parallel & (depth >= near_plane)
+    u, v = jnp.where(is_hit, p0 * inverse, 0.0), jnp.where(is_hit, p1 * inverse, 0.0)
+
+    rho_ray = u * u + v * v
+    if not has_low_pass:
+        return Hit(u, v, jnp.where(is_hit, rho_ray, jnp.inf), jnp.where(is_hit, depth, planes.depth), is_hit)
+    dx, dy = x - planes.center_x, y - planes.center_y
+    rho_screen = 2 * (dx * dx + dy * dy)
+    is_ray = is_hit & (rho_ray <= rho_screen)
+    return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth), is_ray)
+
+
+def values_at(rule: AppearanceRule, lookup: Lookup | None, hit: Hit, values: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The values of a lookup, differentiable in themselves and in where the ray meets the splat."""
+    if lookup is None:
+        return ()
+    return follow(lookup.sample._replace(values=values), *rule.texel_position(lookup.region, hit.u, hit.v))
+
+
+def show(
+    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_probe: Array | None = None
+) -> Shown:
+    """α = min(rule.max_alpha, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
+
+    Args:
+      rule: the appearance rule.
+      splat: its homography is not read.
+      hit: where the ray meets the splat.
+      values: what the splat's texture shows there.
+      rho_probe: zero, added to what the falloff is given, to read the gradient there; or None.
+    """
+    residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
+    # No falloff is asked for its slope at infinity, which need not be a number.
+    rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
+    rho = rho if rho_probe is None else rho + rho_probe
+    a = splat.opacity * rule.falloff(splat.numbers, rho)
+    a = a if factor is None else a * factor
+    # What is not a number stays so, here and in `absorb`: it must not vanish.
+    is_hidden = a < MIN_ALPHA if rule.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
+    alpha = jnp.where(is_hidden, 0.0, jnp.where(a >= rule.max_alpha, rule.max_alpha, a))
+    channels: tuple[Array, ...] = splat.color
+    if residual is not None:
+        channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
+    if splat.normal is not None:
+        channels = (*channels, hit.depth, hit.depth * hit.depth, *splat.normal)
+    return Shown(alpha, channels)
+
+
+def absorb(alpha: Array, transmittance: Array, is_live: Array) -> Triple:
+    """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
+    leave less than 10⁻⁴."""
+    is_live = is_live & ~(transmittance * (1 - alpha) < MIN_TRANSMITTANCE)
+    weight = jnp.where(is_live, alpha * transmittance, 0.0)
+    return weight, transmittance - weight, is_live
+
+
+def absorb_vjp(alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, shown: Array):
+    """`absorb`, and ∂L/∂α, walking front to back.
+
+    With B = Σ g·c·α·T over the splats behind + g_T·T_final, all of which is linear in what this splat lets through,
+    ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never reaches 1.
+
+    Args:
+      alpha, transmittance, is_live: as for `absorb`.
+      suffix_sum: B with this splat's own g·c·α·T still in it.
+      shown: g·c, the cotangent's product with this splat's channels.
+
+    Returns:
+      weight; transmittance and is_live behind the splat; B of the splats behind it; and ∂L/∂α.
+    """
+    weight, after, live_after = absorb(alpha, transmittance, is_live)
+    suffix_sum = suffix_sum - weight * shown
+    d_alpha = jnp.where(live_after, transmittance * shown - suffix_sum / (1 - alpha), 0.0)
+    return weight, after, live_after, suffix_sum, d_alpha
+
+
+class Cotangents(NamedTuple):
+    """What one splat at one pixel adds to the gradient."""
+
+    planes: Planes
+    opacity: Array
+    color: Triple
+    normal: Triple | None
+    numbers: tuple[Array, ...]
+    values: tuple[Array, ...]
+    """Of what the splat's texture shows."""
+    rho: Array | None
+    """∂L/∂ρ through the falloff, where asked for."""
+
+
+def blend(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, transmittance, is_live):
+    """One splat at one pixel, forward: what it adds to the channels, and transmittance and liveness behind it."""
+    shown = show(rule, splat, intersect(planes, x, y, near_plane, rule.has_low_pass), values)
+    weight, transmittance, is_live = absorb(shown.alpha, transmittance, is_live)
+    return tuple(weight * channel for channel in shown.channels), transmittance, is_live
+
+
+def blend_vjp(
+    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x, y,
+    transmittance, is_live, suffix_sum, g, has_rho: bool,
+):  # fmt: skip
+    """One splat at one pixel, backward; `suffix_sum` and `g` as in `absorb_vjp`, g channel by channel.
+
+    Returns:
+      (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents, which mean something only
+      where the weight is positive: elsewhere they may not even be finite.
+    """
+
+    def of_floats(planes, opacity, color, normal, numbers, values, rho_probe):
+        hit = intersect(planes, x, y, near_plane, rule.has_low_pass)
+        values = values_at(rule, lookup, hit, values)
+        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_probe)
+
+    rho_probe = jnp.zeros_like(transmittance) if has_rho else None
+    values = () if lookup is None else lookup.sample.values
+    floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, rho_probe
+    shown, pull_back = jax.vjp(of_floats, *floats)
+    seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
+    state = transmittance, is_live, suffix_sum
+    weight, *state, d_alpha = absorb_vjp(shown.alpha, *state, seen)
+    cotangents = Cotangents(*pull_back(Shown(d_alpha, tuple(weight * g_k for g_k in g))))
+    return tuple(state), weight, cotangents
+
+
+def positional_gradient(
+    statistic: Statistic, M, x: Array, y: Array, tile_x, tile_y, d_rho: Array, jacobian, near_plane: float,
+    has_low_pass: bool,
+) -> Triple:  # fmt: skip
+    """What a pixel adds to a statistic of densification, through the falloff only; zero where `d_rho` is.
+
+    "position": |∂L/∂μ| per world component (A²TG).
+    "screen": |∂L/∂c| per pixel axis of the projected mean c, where the low-pass filter decides, and 0 (gsplat's
+    `absgrad` of 2D Gaussians).
+    "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, where the hit decides, and 0 (2DGS).
+
+    Args:
+      statistic: which.
+      M: rows of the homography.
+      x, y: the pixel, from the tile's centre (tile_x, tile_y).
+      d_rho: ∂L/∂ρ through the falloff.
+      jacobian: rows of ∂M[:, 2]/∂μ = K·Rc.
+      near_plane, has_low_pass: as for `intersect`.
+    """
+    axes = tuple((row[0], row[1]) for row in M)
+    mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
+
+    def rho(mean):
+        rows = tuple((*axes[i], mean[i]) for i in range(3))
+        hit = intersect(planes_of(rows, tile_x, tile_y), x, y, near_plane, has_low_pass)
+        return hit.rho, hit.is_ray
+
+    _, pull_back, is_ray = jax.vjp(rho, mean, has_aux=True)
+    (d_mean,) = pull_back(d_rho)
+    if statistic == "position":
+        components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
+        return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
+    # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c where the low-pass filter decides.
+    on_screen = d_mean[0] * mean[2], d_mean[1] * mean[2]
+    if statistic == "center":
+        along_x, along_y = (jnp.where(is_ray, number, 0.0) for number in on_screen)
+    else:
+        along_x, along_y = (jnp.where(is_ray, 0.0, jnp.abs(number)) for number in on_screen)
+    return along_x, along_y, jnp.zeros_like(along_x)

@@ -1,0 +1,114 @@
+"""What compositors are given: the splats of a view, projected from Gaussians, and the static choices of a pass.
+
+It stands below the kernels, so that `compositor` and all of them speak of the same two types.
+"""
+
+import functools
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.geometry import homographies
+from a2tg_jax.rasterize.pixel import Statistic
+from a2tg_jax.rasterize.tiles import TileGrid
+
+Compositor = Literal["native", "pallas", "xla"]
+"""Native loops (CPUs), Pallas kernels (GPUs) or XLA (everywhere)."""
+
+
+class Splats(NamedTuple):
+    """What the compositor needs of N splats; each differentiable."""
+
+    M: Array
+    """[N, 3, 3] homographies from (u, v, 1) to pixels."""
+    colors: Array
+    """[N, 3] of their spherical harmonics."""
+    opacities: Array
+    """[N] peak opacities."""
+    normals: Array
+    """[N, 3] in the world, facing the camera."""
+    numbers: Array
+    """[N, K] what else the appearance rule knows of them."""
+
+
+class CompositingSettings(NamedTuple):
+    """The static choices of a compositing pass."""
+
+    grid: TileGrid
+    """The tiles of the image."""
+    near_plane: float
+    """Hits nearer than this do not show."""
+    has_geometry: bool
+    """Depth, squared depth and normals are composited beside the colour."""
+    statistic: Statistic | None
+    """What densification asks of the backward pass, if anything."""
+    compositor: Compositor
+    """Native loops, Pallas kernels, or XLA."""
+    tile_batch: int
+    """Tiles composited at once by XLA; 1 with the others."""
+
+    @property
+    def num_channels(self) -> int:
+        """D: colour, and with geometry depth, depth² and normal."""
+        return 8 if self.has_geometry else 3
+
+    @property
+    def num_groups(self) -> int:
+        """Batches of tiles in the image."""
+        return -(-self.grid.num // self.tile_batch)
+
+
+def project_gaussians(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, near_plane: float, sh_degree: Any, num_live: Any = None
+) -> tuple[Splats, Array]:
+    """The N splats, and [N] the squared distance within which each shows: not positive where it shows nowhere, NaN
+    where it would show, but a number of it is not finite.
+
+    Args:
+      gaussians: N Gaussians.
+      camera: the view.
+      rule: what they show.
+      near_plane: splats nearer than this do not show.
+      sh_degree: highest degree of spherical harmonics used; may be traced.
+      num_live: only the first so many rows show; may be traced.
+
+    Raises:
+      ValueError: if the rule gives opacities or numbers of another shape, or a `max_alpha` outside (0, 1).
+    """
+    M, normals = homographies(gaussians, camera)
+    opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
+    _check_rule(rule, opacities, numbers, gaussians.num)
+    colors = rule.own_colors(gaussians, camera, sh_degree)
+    # Not >=: a depth that is no number is not behind the camera.
+    is_drawn = ~(M[:, 2, 2] < near_plane)
+    if num_live is not None:
+        is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
+    cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
+    is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
+    cutoff = jnp.where(is_broken, jnp.nan, cutoff)
+    is_shown = (cutoff > 0)[:, None]
+    # Rows that show nowhere may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
+    M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
+    colors, normals, numbers = (jnp.where(is_shown, x, 0.0) for x in (colors, normals, numbers))
+    return Splats(M, colors, opacities, normals, numbers), cutoff
+
+
+def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, num: int) -> None:
+    if opacities.shape != (num,) or numbers.shape[:-1] != (num,):
+        raise ValueError(
+            f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {type(rule).__name__} "
+            f"gave {opacities.shape} and {numbers.shape}"
+        )
+    if not 0 < rule.max_alpha < 1:
+        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
+
+
+def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:
+    """[N] whether all numbers of a splat are."""
+    columns = [*(M[:, i, k] for i in range(3) for k in range(3)), *colors.T, *numbers.T]
+    return functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))

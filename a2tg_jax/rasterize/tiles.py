@@ -1,0 +1,167 @@
+"""Which splats touch which tile, in depth order, at a fixed capacity.
+
+A pair is one splat in one tile. Pairs are emitted splat by splat in depth order, and those whose outline misses the
+tile are dropped. Here one stable sort by tile makes the lists; `kernels.native` makes the same ones by counting. Tiles
+of P = tile_size² pixels are numbered row by row.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.core.geometry import Outline, ScreenBounds, screen_bounds
+
+
+class TileGrid(NamedTuple):
+    """The tiles that cover an image of width × height pixels; all static."""
+
+    width: int
+    height: int
+    tile_size: int
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.tile_size)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // self.tile_size)
+
+    @property
+    def num(self) -> int:
+        return self.columns * self.rows
+
+
+class TileLists(NamedTuple):
+    """The splats of each tile, front to back."""
+
+    ids: Array
+    """[capacity] splat indices, tile after tile."""
+    starts: Array
+    """[tiles + 1] where the list of each tile begins in `ids`."""
+    num_pairs: Array
+    """Float: pairs before the outline test, which the capacity must hold."""
+    overflow: Array
+    """Boolean: the pairs did not fit; the lists are then empty."""
+
+
+class Rectangles(NamedTuple):
+    """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + rows of each splat, and how many these are."""
+
+    x0: Array
+    y0: Array
+    columns: Array
+    counts: Array
+
+
+def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
+    """The tiles that each splat's box covers."""
+    x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
+    y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
+    columns = jnp.where(rows > 0, columns, jnp.int32(0))
+    return Rectangles(x0, y0, columns, columns * rows)
+
+
+def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
+    """First tile along an axis with a pixel centre in [low, high], and how many tiles there are."""
+    as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
+    nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
+    first = jnp.maximum(as_pixels(jnp.ceil(low - 0.5)), nothing)
+    last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), last_pixel)
+    # Not //, which does more for negative numbers; there are none but a `last` of -1, less than `first`.
+    begin, end = jax.lax.div(first, side), jax.lax.div(last, side) + 1
+    return begin, jnp.where(last < first, nothing, end - begin)
+
+
+def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
+    """Pairs before the outline test, as a float (it cannot wrap): what the capacity must hold."""
+    return total_pairs(tile_rectangles(bounds, grid).counts)
+
+
+def total_pairs(counts: Array) -> Array:
+    """The sum of counts [N] as a float32, to a few units in the last place: blocks are summed as integers first, so
+    that no small count is lost beside a large sum."""
+    blocks = jnp.pad(counts, (0, -counts.shape[0] % 256)).reshape(-1, 256)
+    return jnp.sum(jnp.sum(blocks, axis=1, dtype=jnp.int32).astype(jnp.float32))
+
+
+def exceeds(total: Array, capacity: int) -> Array:
+    """Whether so many pairs, known to about 2⁻²⁰ of their number, may be more than there is room for."""
+    return total + jnp.floor(total * 2.0**-20) > capacity
+
+
+def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:
+    """Whether an outline reaches a pixel centre of the tile whose first pixel is (x0, y0); element-wise."""
+
+    def distance_to_box(origin_x, origin_y):
+        left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
+        return left, left + (tile_size - 1), top, top + (tile_size - 1)
+
+    left, right, top, bottom = distance_to_box(outline.ellipse_x, outline.ellipse_y)
+    xx, xy, yy = outline.xx, outline.xy, outline.yy
+    # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
+    x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
+    y_on_side = jnp.clip(xy / xx * x_side, top, bottom)
+    x_on_side = jnp.clip(xy / yy * y_side, left, right)
+
+    def squared_distance(x, y):
+        return yy * x * x - 2 * xy * x * y + xx * y * y
+
+    nearest = jnp.minimum(squared_distance(x_side, y_on_side), squared_distance(x_on_side, y_side))
+    is_in_ellipse = nearest <= (xx * yy - xy * xy)
+    left, right, top, bottom = distance_to_box(outline.mean_x, outline.mean_y)
+    nearest = jnp.clip(0.0, left, right) ** 2 + jnp.clip(0.0, top, bottom) ** 2
+    return is_in_ellipse | (nearest <= outline.radius**2) | outline.is_clipped
+
+
+def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
+    """Lists of the splats that touch each tile, ordered by depth, ties by index.
+
+    Args:
+      M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
+      grid: the tiles.
+      capacity: how many pairs there is room for, before the outline test; `overflow` tells when it did not suffice.
+    """
+    bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
+    order = jnp.argsort(depths, stable=True)
+    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid))
+    total = total_pairs(rectangles.counts)
+    overflow = exceeds(total, capacity)
+    counts = jnp.where(overflow, 0, rectangles.counts)
+    ends = jnp.cumsum(counts)
+    num = depths.shape[0]
+    rank = jnp.repeat(jnp.arange(num, dtype=jnp.int32), counts, total_repeat_length=capacity)
+    position = jnp.arange(capacity, dtype=jnp.int32)
+    local = position - (ends - counts)[rank]
+    columns = jnp.maximum(rectangles.columns[rank], 1)
+    x = rectangles.x0[rank] + local % columns
+    y = rectangles.y0[rank] + local // columns
+    ids = order[rank].astype(jnp.int32)
+    dtype = bounds.left.dtype
+    per_pair = jax.tree.map(lambda leaf: leaf[ids], bounds.outline)
+    tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
+    is_kept = (position < ends[-1]) & outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
+    tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
+    ids, starts = _sort_by_tile(tile, rank, order, grid.num)
+    return TileLists(ids, starts, total, overflow)
+
+
+def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:
+    """Splat indices sorted by tile, then by depth rank; and the start of each tile's list.
+
+    Where both fit 32 bits they are packed into one key: sorting keys alone is several times faster than pairs.
+    """
+    num = order.shape[0]
+    rank_bits = max(1, (num - 1).bit_length())
+    if num_tiles.bit_length() + rank_bits <= 32:
+        key = jnp.sort(tile.astype(jnp.uint32) << rank_bits | rank.astype(jnp.uint32))
+        sorted_tile, sorted_rank = (key >> rank_bits).astype(jnp.int32), key & ((1 << rank_bits) - 1)
+        ids = order[sorted_rank].astype(jnp.int32)
+    else:
+        tile_type = jnp.uint16 if num_tiles < 2**16 else jnp.uint32
+        sorted_tile, sorted_rank = jax.lax.sort((tile.astype(tile_type), rank), num_keys=1, is_stable=True)
+        ids, sorted_tile = order[sorted_rank].astype(jnp.int32), sorted_tile.astype(jnp.int32)
+    starts = jnp.searchsorted(sorted_tile, jnp.arange(num_tiles + 1, dtype=jnp.int32), method="scan_unrolled")
+    return ids, starts.astype(jnp.int32)

@@ -1,0 +1,167 @@
+"""Pictures made from renders: errors, crops, side-by-side sheets, texture resolutions.
+
+Images are uint8 [H, W, 3] unless said otherwise.
+"""
+
+import base64
+import dataclasses
+import io
+import itertools
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from matplotlib import colormaps
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import uniform_filter
+
+from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.model import Model
+from a2tg_jax.texture import AtlasLayout
+
+ERROR_GAIN = 4
+MARGIN, CAPTION_HEIGHT = 6, 22
+FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
+"""Pillow's own font lacks × and ²."""
+LONGEST_SIDE = 1280
+"""Of a picture in the report, in pixels."""
+
+
+def to_uint8(image) -> np.ndarray:
+    """8-bit pixels of a float image, clipped to [0, 1] and rounded."""
+    return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
+
+
+def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Absolute difference, brightened ERROR_GAIN times."""
+    difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
+    return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Crop:
+    """A square part of an image."""
+
+    top: int
+    left: int
+    side: int
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        return image[self.top : self.top + self.side, self.left : self.left + self.side]
+
+
+def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> Crop:
+    """The square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`.
+
+    Squares whose error is above the picture's mean afterwards are left out, unless all are: there, both fail.
+    """
+    height, width = target.shape[:2]
+    side = max(8, min(height, width) // 4)
+
+    def in_squares(error: np.ndarray) -> np.ndarray:
+        means = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
+        return means[: max(1, height - side + 1), : max(1, width - side + 1)]
+
+    errors = [np.sum(_squared_error(image, target), axis=-1) for image in (before, after)]
+    left_over = in_squares(errors[1])
+    gain = in_squares(errors[0] - errors[1])
+    is_good = left_over <= errors[1].mean()
+    best = np.where(is_good, gain, -np.inf) if is_good.any() else gain
+    top, left = np.unravel_index(int(best.argmax()), best.shape)
+    return Crop(int(top), int(left), side)
+
+
+def _squared_error(image: np.ndarray, target: np.ndarray) -> np.ndarray:
+    return (image.astype(np.float32) - target.astype(np.float32)) ** 2
+
+
+def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
+    """One sheet of images in a row, each under its caption, which is cut off where the image ends."""
+    height, width = images[0].shape[:2]
+    sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
+    font = ImageFont.truetype(FONT, size=13)
+    for index, (image, caption) in enumerate(zip(images, captions, strict=True)):
+        left = index * (width + MARGIN)
+        strip = Image.new("RGB", (width, CAPTION_HEIGHT), "white")
+        ImageDraw.Draw(strip).text((2, 2), caption, fill="black", font=font)
+        sheet.paste(strip, (left, 0))
+        sheet.paste(Image.fromarray(image), (left, CAPTION_HEIGHT))
+    return sheet
+
+
+def picture_names(view_names: Iterable[str]) -> dict[str, str]:
+    """File names of the views' pictures, no two alike, in capitals or not: folders become part of the name.
+
+    Where that is another's, as of a/b.png and a_b.jpg, a number follows; names count in their sorted order.
+    """
+    names: dict[str, str] = {}
+    taken: set[str] = set()
+    for view_name in sorted(view_names):
+        stem = os.path.splitext(view_name)[0].replace("/", "_")
+        choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        chosen = next(choice for choice in choices if choice.casefold() not in taken)
+        taken.add(chosen.casefold())
+        names[view_name] = f"{chosen}.png"
+    return names
+
+
+def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> None:
+    """Writes a PNG, whole or not at all."""
+    picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
+    with replacing(path) as temporary:
+        picture.save(temporary, format="PNG", optimize=True)
+
+
+def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
+    """An image as a data: URI, enlarged `zoom` times without smoothing, or reduced if it is very large."""
+    picture = Image.fromarray(np.ascontiguousarray(image))
+    picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
+    picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=quality, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def file_uri(path: Path) -> str:
+    """An image file, by its suffix, as a data: URI."""
+    return f"data:image/{path.suffix[1:]};base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def resolution_colors(num_levels: int) -> np.ndarray:
+    """[num_levels, 3] colours of textures with 2⁰, 2¹, … texels, dark to bright."""
+    return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
+
+
+def texel_levels(layout: AtlasLayout) -> np.ndarray:
+    """[N] integers log₂(Tu·Tv), rounded; 0 where a texture is empty."""
+    return np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
+
+
+def colored_by_resolution(model: Model) -> Model:
+    """A model with textures, every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
+
+    Alpha textures stay, RGB residuals and view dependence go.
+    """
+    assert model.textures is not None
+    textures, layout = model.textures
+    levels = texel_levels(layout)
+    colors = (resolution_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
+    flat = model.with_textures(jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures), layout)
+    return with_colors(flat, np.ones(model.gaussians.num, bool), colors)
+
+
+def with_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
+    """A model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
+    sh = np.where(is_chosen[:, None, None], 0, model.appearance.sh(model.gaussians, model.params, model.layout))
+    sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
+    own = jnp.asarray(sh[:, : model.gaussians.sh.shape[1]], model.gaussians.sh.dtype)
+    return dataclasses.replace(
+        model,
+        gaussians=dataclasses.replace(model.gaussians, sh=own),
+        params=model.appearance.with_sh(sh, model.params, model.layout),
+    )

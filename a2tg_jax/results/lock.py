@@ -1,0 +1,74 @@
+"""One process at a time writes in a run folder, and none finds what a killed one left half done."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from a2tg_jax.host.atomic import left_over
+from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.replacement import is_unfinished, undo_unfinished
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+
+@contextlib.contextmanager
+def claimed(run: RunFolder) -> Iterator[None]:
+    """Keeps other processes from training and measuring in a run folder, which is made if it is not there.
+
+    The lock is the operating system's, on the marker: it ends with the process, however that ends. On Windows, and
+    where the file system knows no locks, there is none. What a killed process left half written is removed, and a run
+    that it was about to replace is put back.
+
+    Raises:
+      FileExistsError: if another process is at it.
+      ValueError: if the marker is not this program's.
+    """
+    run.written()
+    run.path.mkdir(parents=True, exist_ok=True)
+    with open(run.marker, "a", encoding="utf-8") as file:
+        _lock(file.fileno(), run)
+        run.own(run.marker)
+        undo_unfinished(run)
+        remove_left_over(run)
+        yield
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike) -> Iterator[RunFolder]:
+    """An existing run folder, claimed.
+
+    Raises:
+      FileNotFoundError: if there is none at `path`.
+      FileExistsError, ValueError: as `claimed` does.
+    """
+    run = RunFolder(Path(path))
+    if not is_unfinished(run):
+        open_run(path)
+    with claimed(run):
+        yield open_run(path)
+
+
+def remove_left_over(run: RunFolder) -> None:
+    """Removes what was being written when a process of the run was killed."""
+    own = {run.path / name for name in run.written()}
+    for folder in {path.parent for path in own}:
+        for partial, path in left_over(folder).items():
+            if path in own:
+                partial.unlink(missing_ok=True)
+
+
+def _lock(number: int, run: RunFolder) -> None:
+    if fcntl is None or os.name == "nt":
+        return
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise FileExistsError(
+            f"another process is training or measuring in {run.path}: wait until it ends, or choose another --out"
+        ) from None
+    except OSError:
+        return  # a file system without locks

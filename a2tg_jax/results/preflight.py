@@ -1,0 +1,83 @@
+"""What is looked at before anything is trained or written: options, weights, places, room on the disk."""
+
+import os
+import shutil
+from pathlib import Path
+
+from a2tg_jax.core.budget import bytes_per_gaussian
+from a2tg_jax.data import Scene
+from a2tg_jax.measure.metrics import load_lpips
+from a2tg_jax.results.folder import KEPT_CHECKPOINTS, check_free
+from a2tg_jax.results.forecast import room_for_photographs, tell_forecast
+from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.record import SYNTHETIC, RunRecord
+from a2tg_jax.training.start import check_start, initial_number
+
+STATE_SIZE = 3
+"""A checkpoint holds parameters and two moments of each."""
+
+
+def check_new_run(
+    record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None, max_memory: int | None = None
+) -> Scene:
+    """The scene of a run that can be trained in a folder. What the run will need is printed.
+
+    Raises:
+      ValueError, OSError: naming what is wrong: an option, the weights, the folder, the scene, the disk, the memory.
+    """
+    record.check()
+    check_weights(lpips_weights)
+    if record.scene.path != SYNTHETIC:
+        check_apart(out, Path(record.scene.path))
+    check_free(out, overwrite=overwrite)
+    scene = record.scene.load(room_for_photographs(max_memory))
+    for system in record.systems.values():
+        check_start(scene, system)
+    check_room(record, scene, out)
+    tell_forecast(scene, record.plan, max_memory)
+    return scene
+
+
+def check_weights(lpips_weights: Path | None) -> None:
+    """Raises ValueError or FileNotFoundError unless these are weights of LPIPS, or None."""
+    if lpips_weights is not None:
+        load_lpips(lpips_weights)
+
+
+def check_apart(out: Path, source: Path) -> None:
+    """Raises ValueError where a folder that is to be written lies in one that is to be read, or that in it."""
+    written, read = out.resolve(), source.resolve()
+    if written.is_relative_to(read) or read.is_relative_to(written):
+        raise ValueError(f"{out} and {source} lie in each other: choose a folder besides it for what is written")
+
+
+def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
+    """Raises ValueError unless the disk has room for what will surely be written.
+
+    Models and checkpoints of the Gaussians that there will be, without what they show besides.
+    """
+    stages = [(planned, gaussian_bytes(planned, scene)) for planned in record.plan.stages]
+    largest = max(num_bytes for _, num_bytes in stages)
+    needed = sum(num_bytes for _, num_bytes in stages) + STATE_SIZE * (KEPT_CHECKPOINTS + 1) * largest
+    free = shutil.disk_usage(_existing(out)).free
+    if needed > free:
+        raise ValueError(
+            f"{out} needs {needed / 1e9:.1f} GB at least for models and checkpoints, and the disk has "
+            f"{free / 1e9:.1f} GB: make room, or choose another --out, fewer Gaussians or fewer --compare"
+        )
+
+
+def gaussian_bytes(planned: PlannedStage, scene: Scene) -> int:
+    """Of the Gaussians that the first stage of a system leaves at most."""
+    system, first = planned.system, planned.system.stages()[0]
+    num = initial_number(scene, system)
+    num = max([num, *(event.num_rows(num, first.iterations) for event in first.events)])
+    if system.budget_bytes is not None:
+        return system.budget_bytes
+    return int(num * bytes_per_gaussian(system.initial_sh_degree))
+
+
+def _existing(path: Path) -> Path:
+    """The folder, or the nearest above it that there is."""
+    path = Path(os.path.abspath(path))
+    return next(folder for folder in (path, *path.parents) if folder.is_dir())

@@ -1,0 +1,235 @@
+"""Corrections: the exposure and the pose of each training photograph, learned beside the model.
+
+A correction has one row of numbers for each training view and changes, inside the step, the camera from which the
+model is drawn, or the colours that come of it. The rows are part of the training state, not of the model. Like an
+event, a correction is a frozen dataclass that is a pytree of its numbers. V views.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.optim import AdamState, adam_init, adam_update
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.events import event
+
+
+class Correction:
+    """What all corrections have in common; this one changes nothing."""
+
+    name: ClassVar[str]
+    """Unique in its stage; files call its rows so."""
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """The row that changes nothing."""
+        raise NotImplementedError(f"{type(self).__name__} must say what changes nothing")
+
+    def learning_rate(self, progress: Array) -> Array:
+        """Adam's, at a share of the stage between 0 and 1; traced."""
+        raise NotImplementedError(f"{type(self).__name__} must say how fast it learns")
+
+    def camera(self, row: Array, camera: Camera) -> Camera:
+        """The camera that the view is drawn from; traced."""
+        return camera
+
+    def color(self, row: Array, color: Array) -> Array:
+        """[H, W, 3] what the photograph shows of a render [H, W, 3]; traced."""
+        return color
+
+    def project(self, rows: Array) -> Array:
+        """The rows of all views [V, ...] after a step, where they belong; traced."""
+        return rows
+
+
+@event
+class Exposure(Correction):
+    """An affine map of colours per view, [3, 4], c ↦ A·c + b; on average over the views it changes nothing.
+
+    Where all views could change alike, the model would do so the other way round, and test views had no exposure.
+    """
+
+    rate: float = 1e-2
+    final_factor: float = 0.1
+    """The rate at the end of a stage over that at its start."""
+
+    name = "exposure"
+
+    @property
+    def neutral(self) -> np.ndarray:
+        return np.eye(3, 4)
+
+    def learning_rate(self, progress: Array) -> Array:
+        return self.rate * self.final_factor**progress
+
+    def color(self, row: Array, color: Array) -> Array:
+        return exposed(row, color)
+
+    def project(self, rows: Array) -> Array:
+        return rows - jnp.mean(rows, axis=0, keepdims=True) + jnp.asarray(self.neutral, rows.dtype)[None]
+
+
+@event
+class PoseRefinement(Correction):
+    """A small rigid motion per view, a twist [6] in the camera's frame (`core.rigid.moved_viewmat`)."""
+
+    rate: float = 1e-3
+    """In radians, and in units of the normalised world, in which cameras are about 1 from what they look at."""
+    final_factor: float = 0.01
+    """The rate at the end of a stage over that at its start."""
+
+    name = "pose"
+
+    @property
+    def neutral(self) -> np.ndarray:
+        return np.zeros(6)
+
+    def learning_rate(self, progress: Array) -> Array:
+        return self.rate * self.final_factor**progress
+
+    def camera(self, row: Array, camera: Camera) -> Camera:
+        return dataclasses.replace(camera, viewmat=moved_viewmat(row, camera.viewmat))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class CorrectionState:
+    """What one correction has learned."""
+
+    rows: Array
+    """[V, ...], in the order of the training views."""
+    moments: AdamState
+    """Adam's memory, of each view its own: `count` [V] counts how often it was seen."""
+
+
+def exposed(exposure: Array, color: Array) -> Array:
+    """A·c + b for colours [H, W, 3] and an exposure [3, 4] = [A | b]."""
+    mixed = jnp.einsum("ij,hwj->hwi", exposure[:, :3], color, precision=jax.lax.Precision.HIGHEST)
+    return mixed + exposure[:, 3][None, None]
+
+
+def initial_corrections(
+    corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype
+) -> tuple[CorrectionState, ...]:
+    """The states before a stage: as an earlier stage left them, and neutral where none did.
+
+    Args:
+      corrections: of the stage.
+      names: of the V training views.
+      origin: of the model that the stage starts from.
+      dtype: of the rows.
+    """
+    return tuple(
+        _state(jnp.asarray(np.stack([_known_row(correction, name, origin) for name in names]), dtype))
+        for correction in corrections
+    )
+
+
+def _known_row(correction: Correction, name: str, origin: Origin | None) -> np.ndarray:
+    rows = None if origin is None else origin.corrections.get(correction.name)
+    if origin is None or rows is None or name not in origin.names:
+        return correction.neutral
+    row = rows[origin.names.index(name)]
+    if row.shape != correction.neutral.shape:
+        shapes = f"{list(correction.neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
+        raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")
+    return row
+
+
+def _state(rows: Array) -> CorrectionState:
+    moments = adam_init(rows)
+    return CorrectionState(rows, dataclasses.replace(moments, count=jnp.zeros(len(rows), jnp.int32)))
+
+
+def check_corrections(states: Sequence[CorrectionState], num_views: int) -> None:
+    """Raises ValueError unless there is a row for each training view."""
+    for state in states:
+        if len(state.rows) != num_views:
+            raise ValueError(
+                f"the checkpoint has corrections of {len(state.rows)} training views, but the scene has {num_views}: "
+                "go on with the scene that it was made from"
+            )
+
+
+def rows_of(states: Sequence[CorrectionState], views: Array | None) -> tuple[Array, ...]:
+    """Of each correction the rows [B, ...] of some views [B]."""
+    return tuple(state.rows[views] for state in states)
+
+
+def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], camera: Camera) -> Camera:
+    """The camera of a view, given its row of each correction."""
+    for correction, row in zip(corrections, rows, strict=True):
+        camera = correction.camera(row, camera)
+    return camera
+
+
+def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], color: Array) -> Array:
+    """The colours of a view, given its row of each correction."""
+    for correction, row in zip(corrections, rows, strict=True):
+        color = correction.color(row, color)
+    return color
+
+
+def updated(
+    correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
+) -> CorrectionState:
+    """The state after a step of Adam on the rows of the views that were seen, and on no others.
+
+    Args:
+      correction: whose state it is.
+      state: before.
+      views: [B] int32; one may occur twice.
+      grads: [B, ...] of each view's own loss by its row.
+      progress: share of the stage.
+    """
+    sums = jnp.zeros_like(state.rows).at[views].add(grads)
+    is_seen = jnp.zeros(len(state.rows), bool).at[views].set(True)
+    rate = correction.learning_rate(progress)
+    step = jax.vmap(lambda row, grad, moments: adam_update(row, grad, moments, rate))(state.rows, sums, state.moments)
+
+    def chosen(new: Array, old: Array) -> Array:
+        return jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    rows, moments = jax.tree.map(chosen, (step.params, step.state), (state.rows, state.moments))
+    return CorrectionState(correction.project(rows), moments)
+
+
+def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: Sequence[CorrectionState]) -> Origin:
+    """The origin with what was learned, and with the training cameras as they were corrected (host).
+
+    Args:
+      origin: of the scene, training views first.
+      corrections: of the stage.
+      states: after it.
+    """
+    if not corrections:
+        return origin
+    rows = {c.name: _with_neutral(c, state, len(origin.names)) for c, state in zip(corrections, states, strict=True)}
+    viewmats = origin.viewmats.copy()
+    for index in np.flatnonzero(~origin.is_test):
+        own = [jnp.asarray(rows[correction.name][index]) for correction in corrections]
+        viewmats[index] = corrected_camera(corrections, own, origin.cameras[index]).viewmat
+    return dataclasses.replace(origin, viewmats=viewmats, corrections=rows)
+
+
+def _with_neutral(correction: Correction, state: CorrectionState, num: int) -> np.ndarray:
+    """The rows of training views, followed by neutral ones of test views."""
+    rows = np.asarray(state.rows)
+    neutral = np.broadcast_to(correction.neutral, (num - len(rows), *rows.shape[1:]))
+    return np.concatenate([rows, neutral.astype(rows.dtype)])
+
+
+def learned(origin: Origin) -> Mapping[str, Mapping[str, list]]:
+    """What was learned of each training photograph, as lists of numbers: name → correction → row."""
+    training = [(index, name) for index, name in enumerate(origin.names) if not origin.is_test[index]]
+    return {
+        name: {correction: rows[index].tolist() for correction, rows in origin.corrections.items()}
+        for index, name in training
+    }

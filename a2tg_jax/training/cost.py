@@ -1,0 +1,156 @@
+"""What a stage of training will take, from its shapes alone: bytes of memory at its peak, seconds of an iteration.
+
+Photographs, rows of Gaussians and what they show are counted. What a step needs besides, for each byte of the model,
+row, pixel and pair, is what XLA says of compiled steps (`memory_analysis`); what a process takes before it holds any of
+them was measured (`benchmarks/forecasts.py`, which compares all of it with peaks).
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
+from a2tg_jax.core.gaussians import floats_per_gaussian
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.events import HostEvent
+from a2tg_jax.host.cores import num_threads
+from a2tg_jax.training.batches import plan_batches
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.start import initial_number, no_rows, num_rows
+
+MB = 10**6
+PROCESS = 300 * MB
+"""Python, JAX and what else is imported."""
+FIRST_PROGRAM, FURTHER_STAGE, FURTHER_PROGRAM = 270 * MB, 110 * MB, 25 * MB
+"""What a stage's compiled programs leave: the first stage, each further one, and each program of new shapes."""
+COMPILER = 240 * MB
+"""While it compiles a step."""
+STATES = 3
+"""Parameters and the two moments of Adam."""
+STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
+"""Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
+(colours, loss, and the gradients of both) and pair (tile lists)."""
+GEOMETRY_PER_PIXEL = 72
+"""Besides, where a term of the loss reads depth or normals."""
+STATISTIC_PER_ROW = 480
+"""Besides, where events gather a statistic and change rows by it inside the step."""
+VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
+"""Bytes of each view of a batch, beside its gradient of the model."""
+PAIRS_PER_TILE = 90
+"""Room in the tile lists of a stage that begins with few, large Gaussians."""
+DECODER_PER_PIXEL = 15
+"""Bytes while a photograph is read."""
+SECONDS_PER_ROW, SECONDS_PER_PIXEL = 2.4e-6, 0.72e-6
+"""Of an iteration on one core (docs/performance.md), shared by all cores."""
+
+
+class Bytes(NamedTuple):
+    """Bytes in memory at one time, by what they are for."""
+
+    program: float = 0
+    """The program, its libraries and what it compiles."""
+    photographs: float = 0
+    model: float = 0
+    """The model and its moments."""
+    gradients: float = 0
+    """What a step makes for each Gaussian."""
+    pixels: float = 0
+    """Renders, loss and tile lists."""
+
+    @property
+    def total(self) -> float:
+        return sum(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class StageForecast:
+    """What one stage will take."""
+
+    bytes: Bytes
+    """At its peak."""
+    model_bytes: float
+    """Of the model at its largest."""
+    num_rows: int
+    """Gaussians that it can reach."""
+    num_programs: int
+    """Compiled while it runs."""
+    seconds: float
+    """All its iterations, on CPUs, roughly."""
+
+
+def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
+    """What each stage of a system will take, one after the other (host; nothing is compiled)."""
+    num, floats, shown = min(initial_number(scene, system), len(scene.points)), 0.0, None
+    for stage in system.stages():
+        num = num_rows(stage, num)
+        if stage.appearance != shown:
+            floats, shown = floats_shown(stage, system), stage.appearance
+        own = floats_per_gaussian(system.initial_sh_degree) + floats
+        model_bytes = BYTES_PER_FLOAT * own * num
+        for event in stage.events:
+            model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
+        floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
+        programs = 1 + sum(e.num_programs(stage.iterations) for e in stage.events if isinstance(e, HostEvent))
+        seconds = stage.iterations * system.batch_size * _seconds(scene.train, num)
+        yield StageForecast(stage_bytes(scene, system, stage, num, model_bytes), model_bytes, num, programs, seconds)
+        for event in stage.events:
+            num = event.num_after(num, stage.iterations)
+
+
+def floats_shown(stage: Stage, system: System) -> float:
+    """Floats that a Gaussian shows beside its own when a stage begins."""
+    few = no_rows(64, NUM_BASES[system.initial_sh_degree])
+    _, layout = stage.appearance.allocate(jax.random.key(0), few)
+    return stage.appearance.num_floats(layout, few.num) / few.num
+
+
+def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_bytes: float) -> Bytes:
+    """Bytes of a stage's last steps, programs and compilation left out.
+
+    Args:
+      scene: its photographs.
+      system: batch size and tiles.
+      stage: its losses.
+      num: rows.
+      model_bytes: of the model.
+    """
+    largest, batch = largest_view(scene.train), system.batch_size
+    per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * any(term.has_geometry for term in stage.losses)
+    pairs = PAIRS_PER_TILE * largest / system.tile_size**2
+    per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
+    return Bytes(
+        photographs=held_bytes(scene) + fed_bytes(scene.train, batch),
+        model=(STATES + 1) * model_bytes,  # what the stage began with stays
+        gradients=STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num),
+        pixels=largest * (per_pixel + VIEW_PER_PIXEL * (batch - 1)) + STEP_PER_PAIR * pairs,
+    )
+
+
+def held_bytes(scene: Scene) -> int:
+    """Of the photographs that the scene keeps in memory."""
+    return sum(view.picture.nbytes for view in (*scene.train, *scene.test) if view.picture.is_held)
+
+
+def fed_bytes(views: Sequence[View], batch_size: int) -> float:
+    """Of the photographs that wait for the step, all or those that come next, and of reading them."""
+    plan = plan_batches(tuple(views), batch_size)
+    if plan.is_resident:
+        return sum(view.picture.nbytes for view in views)
+    is_read = any(not view.picture.is_held for view in views)
+    readers = min(plan.num_ahead, num_threads()) * is_read
+    return (2 * plan.num_ahead + 1) * plan.batch_bytes + readers * DECODER_PER_PIXEL * largest_view(views)
+
+
+def largest_view(views: Sequence[View]) -> int:
+    """Pixels of the largest."""
+    return max(view.camera.width * view.camera.height for view in views)
+
+
+def _seconds(views: Sequence[View], num: int) -> float:
+    """Of an iteration with one view."""
+    pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+    return (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * pixels) / num_threads()

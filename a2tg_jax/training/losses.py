@@ -1,0 +1,205 @@
+"""What training minimises: the photometric loss, 2DGS's normal consistency, and the regularisers of 3DGS-MCMC.
+
+Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would kill the gradient where it is needed.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_floats, check_shape
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.numerics import normalize, safe_divide
+from a2tg_jax.rasterize.kernels.choice import has_native
+
+SSIM_SIGMA = 1.5
+SSIM_RADIUS = 5
+SSIM_WINDOW = 2 * SSIM_RADIUS + 1
+_WEIGHTS = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
+SSIM_TAPS = tuple((_WEIGHTS / _WEIGHTS.sum()).tolist())
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+
+def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array = 0.2) -> Array:
+    """(1 - w)·L1 + w·(1 - SSIM), the loss of 3DGS; L1 is the mean over all pixels and channels.
+
+    Args:
+      image: [H, W, 3], sides of at least 11 pixels unless `ssim_weight` is 0.
+      target: [H, W, 3].
+      ssim_weight: w in [0, 1].
+
+    Raises:
+      ValueError: if the shapes differ, or as `mean_ssim` does.
+    """
+    check_same_shape(image, target)
+    l1 = jnp.mean(jnp.abs(image - target))
+    if isinstance(ssim_weight, (int, float)) and ssim_weight == 0:
+        return l1
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - mean_ssim(image, target))
+
+
+def mean_ssim(image: Array, target: Array) -> Array:
+    """Structural similarity, averaged over the windows that lie wholly inside the image (Wang et al., 2004).
+
+    The window is a Gaussian of σ 1.5 and 11 taps; the data range is 1. It equals scikit-image's
+    `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`.
+
+    Args:
+      image: [H, W, 3], sides of at least 11 pixels.
+      target: [H, W, 3].
+
+    Returns:
+      A scalar, at most 1 up to rounding.
+
+    Raises:
+      ValueError: if the shapes differ or a side is shorter than the window.
+    """
+    check_same_shape(image, target)
+    if min(image.shape[:2]) < SSIM_WINDOW:
+        raise ValueError(
+            f"SSIM needs images of at least {SSIM_WINDOW} by {SSIM_WINDOW} pixels; got {image.shape[1]} by "
+            f"{image.shape[0]}: use larger images or ssim_weight=0"
+        )
+    x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
+    if has_native():
+        from a2tg_jax.rasterize.kernels.native.ssim import Score, least_width, mean_score
+
+        is_supported = x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64)
+        if is_supported and x.shape[2] >= least_width(x.dtype, SSIM_WINDOW):
+            return mean_score(Score(_similarity, SSIM_TAPS), x, y)
+    # The target's own mean is blurred apart, so that no gradient is computed for it. The two second moments enter
+    # SSIM only through their sum: four blurs instead of five.
+    mean_x, mean_squares, mean_product = jnp.split(_window_mean(jnp.concatenate([x, x * x + y * y, x * y])), 3)
+    return jnp.mean(_similarity(mean_x, _window_mean(y), mean_squares, mean_product))
+
+
+def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:
+    """SSIM of a window, from its means of x, y, x² + y² and x·y; element-wise."""
+    means_product, means_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    luminance = (2 * means_product + SSIM_C1) / (means_squares + SSIM_C1)
+    structure = (2 * (mean_product - means_product) + SSIM_C2) / (mean_squares - means_squares + SSIM_C2)
+    return luminance * structure
+
+
+def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera) -> Array:
+    """2DGS's normal consistency: the mean over pixels of Σ_i ω_i·(1 - n_i·n_depth) = alpha - normal·n_depth.
+
+    n_depth is the normal of the rendered depth. The image border, and pixels beside one where nothing was
+    rendered, have no such normal and count as 0.
+
+    Args:
+      normal: [H, W, 3] rendered normals Σ n·α·T in the world, facing the camera, not divided by alpha.
+      depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
+      alpha: [H, W] rendered alpha in [0, 1].
+      camera: the view.
+
+    Returns:
+      A scalar in [0, 2].
+
+    Raises:
+      ValueError: if an image is not of the camera's size.
+    """
+    size = camera.height, camera.width
+    check_floats("normal", normal, (*size, 3))
+    check_floats("depth", depth, size)
+    check_floats("alpha", alpha, size)
+    surface, is_defined = depth_normals(safe_divide(depth, alpha), alpha > 0, camera)
+    error = alpha[1:-1, 1:-1] - jnp.sum(normal[1:-1, 1:-1] * surface, axis=-1)
+    return jnp.sum(jnp.where(is_defined, error, 0.0)) / alpha.size
+
+
+def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array, Array]:
+    """Normals of a depth map, from central differences of its back-projected points.
+
+    Args:
+      depth: [H, W] depth along the camera's z axis.
+      is_valid: [H, W], where the depth means something.
+      camera: the view.
+
+    Returns:
+      [H-2, W-2, 3] unit normals in the world, facing the camera, of all pixels but the border; and [H-2, W-2],
+      whether the pixel and the four neighbours it needs are valid.
+
+    Raises:
+      ValueError: if an image is not of the camera's size.
+    """
+    check_floats("depth", depth, (camera.height, camera.width))
+    check_shape("is_valid", is_valid, depth.shape)
+    points = _back_project(depth, camera)
+    along_x = points[1:-1, 2:] - points[1:-1, :-2]
+    along_y = points[2:, 1:-1] - points[:-2, 1:-1]
+    is_defined = (
+        is_valid[1:-1, 1:-1] & is_valid[1:-1, 2:] & is_valid[1:-1, :-2] & is_valid[2:, 1:-1] & is_valid[:-2, 1:-1]
+    )
+    # With x right and y down, (down) × (right) points towards the camera for any positive depths.
+    normal = jnp.where(is_defined[..., None], jnp.cross(along_y, along_x), 0.0)
+    return normalize(normal), is_defined
+
+
+def mean_opacity(gaussians: Gaussians, num_live: Array | int) -> Array:
+    """Mean opacity of the first `num_live` rows (the opacity regulariser of 3DGS-MCMC)."""
+    check_gaussians(gaussians)
+    return _live_mean(gaussians.opacities, num_live)
+
+
+def mean_scale(gaussians: Gaussians, num_live: Array | int) -> Array:
+    """Mean scale, over both axes, of the first `num_live` rows (the scale regulariser of 3DGS-MCMC)."""
+    check_gaussians(gaussians)
+    return _live_mean(jnp.mean(gaussians.scales, axis=-1), num_live)
+
+
+def check_same_shape(image: Array, target: Array) -> None:
+    """Raises ValueError unless both are floats [H, W, 3] of one shape."""
+    if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
+    if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):
+        raise ValueError(f"image and target must be floats in [0, 1]; got {image.dtype} and {target.dtype}")
+
+
+def _live_mean(values: Array, num_live: Array | int) -> Array:
+    check_shape("num_live", num_live, ())
+    num_live = jnp.asarray(num_live, jnp.int32)
+    is_live = jnp.arange(values.shape[0], dtype=jnp.int32) < num_live
+    return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)
+
+
+def _back_project(depth: Array, camera: Camera) -> Array:
+    """World points [H, W, 3] of the pixel centres at the given depths."""
+    height, width = depth.shape
+    x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
+    rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
+    rotation = camera.viewmat[:3, :3]
+    return (rays @ rotation) * depth[..., None] + camera.center[None, None]
+
+
+@jax.custom_vjp
+def _window_mean(images: Array) -> Array:
+    """[C, H, W] → [C, H-10, W-10]: the mean under SSIM's window, at every place where it fits."""
+    return _blur(_blur(images, 1), 2)
+
+
+def _window_mean_forward(images: Array) -> tuple[Array, None]:
+    return _window_mean(images), None
+
+
+def _window_mean_backward(_: None, cotangent: Array) -> tuple[Array]:
+    # The window is symmetric: its transpose is the same mean of the padded cotangent.
+    pad = (2 * SSIM_RADIUS, 2 * SSIM_RADIUS)
+    return (_window_mean(jax.lax.optimization_barrier(jnp.pad(cotangent, ((0, 0), pad, pad)))),)
+
+
+_window_mean.defvjp(_window_mean_forward, _window_mean_backward)
+
+
+def _blur(x: Array, axis: int) -> Array:
+    """The 11 Gaussian taps along one axis, as a sum of shifted slices (on a CPU far faster than a convolution)."""
+    size = x.shape[axis] - 2 * SSIM_RADIUS
+    shifted = [jax.lax.slice_in_dim(x, tap, tap + size, axis=axis) for tap in range(SSIM_WINDOW)]
+    blurred = shifted[SSIM_RADIUS] * SSIM_TAPS[SSIM_RADIUS]
+    for tap in range(SSIM_RADIUS):
+        blurred = blurred + (shifted[tap] + shifted[-1 - tap]) * SSIM_TAPS[tap]
+    # Without the barrier XLA fuses the two passes into one of 121 taps.
+    return jax.lax.optimization_barrier(blurred)
