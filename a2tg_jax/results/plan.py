@@ -10,6 +10,7 @@ import numpy as np
 from a2tg_jax.core.jit import classes_of
 from a2tg_jax.training import Stage, System
 
+PACKAGE = "a2tg_jax"
 STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
 """Options of every system that reach training through its stages alone."""
 
@@ -158,8 +159,9 @@ def _is_absent(field: dataclasses.Field, value: Any) -> bool:
 
 
 def _name_of(value: Any) -> str:
-    """Module and name of a class or function."""
+    """Module and name of a class or function; of this package the name alone, for its modules move."""
     name = getattr(value, "__qualname__", "<nameless>")
     if "<" in name and not isinstance(value, type):
         raise ValueError(f"a stage holds {value!r}: make it a function of a module, which has a name of its own")
-    return f"{value.__module__}.{name}"
+    module = value.__module__
+    return f"{PACKAGE if module.partition('.')[0] == PACKAGE else module}.{name}"
