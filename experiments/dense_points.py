@@ -94,11 +94,13 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "dense_points.json"
     found = read_json(path) if path.is_file() else {}
-    for num in NUM_POINTS:
-        scene = dense_scene(num)
-        for ratio in BUDGETS:
-            for name in SYSTEMS:
-                key = key_of(name, num, ratio)
+    for ratio in BUDGETS:
+        for num in NUM_POINTS:
+            wanted = {name: key_of(name, num, ratio) for name in SYSTEMS}
+            if found.keys() >= set(wanted.values()):
+                continue
+            scene = dense_scene(num)
+            for name, key in wanted.items():
                 if key not in found:
                     found[key] = measured(scene, name, ratio)
                     print(key, found[key], flush=True)
