@@ -5,8 +5,10 @@
 The points lie on the surfaces of the built-in scene at 80×60 pixels, but for one in 500, which lies anywhere before the
 cameras, as outliers of a dense reconstruction do. Budgets are multiples of the bytes of the points' Gaussians. Training
 takes 200 + 100 iterations of `quick`. Figures are PSNR on the training views and on those held out: so many Gaussians
-have more numbers than the photographs have pixels, and some methods fit the training views too closely. Each training is kept in
-OUT/dense_points.json as soon as it is measured, so that a second call goes on; the table is OUT/dense_points.md.
+have more numbers than the photographs have pixels, and some methods fit the training views too closely.
+
+Each training is kept in OUT/dense_points.json as soon as it is measured, so that a second call goes on. The table is
+OUT/dense_points.md.
 """
 
 import argparse
