@@ -18,6 +18,7 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View
+from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 
@@ -216,7 +217,7 @@ def iterations_at(fractions: tuple[float, ...], num_iterations: int, name: str =
       ValueError: calling them `name`, unless they are ascending and between 0 and 1.
     """
     if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
-        raise ValueError(f"{name} must be ascending fractions between 0 and 1; got {fractions}")
+        raise ValueError(f"{name} must be ascending fractions between 0 and 1; got {shortened(fractions)}")
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 

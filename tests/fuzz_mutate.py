@@ -8,10 +8,12 @@ import io
 import json
 import re
 import struct
+import tomllib
 import zipfile
 import zlib
 
 import numpy as np
+import tomli_w
 import zstandard
 
 INTEGERS = (0, 1, -1, 127, 255, 256, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**64 - 1)
@@ -50,6 +52,59 @@ def of_json(data, rng):
         value = changed_value(value, rng)
     deep = "[" * NESTED + "]" * NESTED
     return json.dumps(value).replace('"NESTED"', deep).replace('"DIGITS"', "7" * 5000).encode()
+
+
+def of_toml(data, rng):
+    """One to three changes of what a TOML text says."""
+    table = tomllib.loads(data.decode())
+    for _ in range(rng.integers(1, 4)):
+        if isinstance(table.get("options"), dict) and rng.random() < 0.7:
+            table["options"] = _changed_option(table["options"], rng)
+        else:
+            name = list(table)[int(rng.integers(len(table)))] if table else "scene"
+            table[name] = changed_value(table.get(name), rng, strange_option)
+    text = tomli_w.dumps(_without_none(table))
+    deep = "[" * NESTED + "]" * NESTED
+    return text.replace('"NESTED"', deep).replace('"DIGITS"', "7" * 5000).encode("utf-8", "surrogatepass")
+
+
+def _changed_option(options, rng):
+    """The options of a system with another one, mostly of a type that is wanted, or one fewer or more."""
+    name = list(options)[int(rng.integers(len(options)))] if options else "seed"
+    value = options.get(name)
+    if isinstance(value, dict) and value and rng.random() < 0.9:
+        return options | {name: _changed_option(value, rng)}
+    if rng.random() < 0.1:
+        return {key: inner for key, inner in options.items() if key != name} | ({"x": 1} if rng.random() < 0.3 else {})
+    alike = [other for other in OPTIONS if type(other) is type(value)] or OPTIONS
+    others = alike if rng.random() < 0.8 else OPTIONS
+    return options | {name: copy.deepcopy(others[rng.integers(len(others))])}
+
+
+def _without_none(value):
+    """A value that TOML has words for."""
+    if isinstance(value, dict):
+        return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
+    return [_without_none(inner) for inner in value if inner is not None] if isinstance(value, list) else value
+
+
+def strange_option(rng):
+    """A value of an option that it should not have, or that lies at the edge of what it may have."""
+    if rng.random() < 0.25:
+        return strange(rng)
+    return copy.deepcopy(OPTIONS[rng.integers(len(OPTIONS))])
+
+
+OPTIONS = (
+    float("nan"), float("inf"), float("-inf"), 0, 1, 2, -1, 3, 16, 10**6, 2**31 - 1, 2**31, 2**63, 2**64, 0.0, -0.0,
+    0.5, 1.0, 0.999, 1e-300, 1e-6, 1e15, 1e30, 1e300, [], [float("nan")], [0.0], [1.0], [0.5, 0.1], [0.1, 0.1],
+    [-1.0], [1e300],
+    [0.1, 0.2], [0.8], [0.9], [[0.1]], [0.1] * 5000, [1e-300, 0.5], ["0.1"], "None", "none", "5MB", "0.0003",
+    "1e400MB", "1e-300",
+    "a2tg", ["a2tg"], ["a2tg", "a2tg"], ["bytewise", "bbsplat"], ["gaussians-2d-mcmc", "gaussians-2d"], ["os:sep"],
+    [""], ["."], [":"], ["a2tg:"], ["a" * 5000], "..:x", "a b:c", "paper", "official", "quick", "mask", "restore",
+    {"cap": 1}, {"x": {"y": 1}},
+)  # fmt: skip
 
 
 def of_npz(data, rng):
@@ -221,8 +276,8 @@ def strange(rng):
     return copy.deepcopy(values[rng.integers(len(values))])
 
 
-def changed_value(value, rng):
-    """A value of which one part, anywhere in it, is another."""
+def changed_value(value, rng, other=strange):
+    """A value of which one part, anywhere in it, is another; `other` makes such a part."""
     if isinstance(value, dict | list) and value and rng.random() < 0.85:
         keys = list(value) if isinstance(value, dict) else range(len(value))
         key = keys[int(rng.integers(len(keys)))]
@@ -234,12 +289,12 @@ def changed_value(value, rng):
         elif chance < 0.2:
             value[f"{key}x"] = value.pop(key)
         else:
-            value[key] = changed_value(value[key], rng)
+            value[key] = changed_value(value[key], rng, other)
         return value
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
     if is_number and rng.random() < 0.4:
         return value * float(rng.choice([-1, 0, 1e3, 1e-3, 1e30, 1 + 1e-3]))
-    return strange(rng)
+    return other(rng)
 
 
 # Archives

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import fuzz_mutate as mutate
+from fuzz_commands import SYSTEMS, run_commands
 
 BINARY, TEXT = (mutate.of_bytes,), (mutate.of_text, mutate.of_text, mutate.of_bytes)
 JSON = (mutate.of_json, mutate.of_json, mutate.of_json, mutate.of_text, mutate.of_bytes)
 ARCHIVE = (mutate.of_npz, mutate.of_npz, mutate.of_npz, mutate.of_bytes)
 COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
+OF_RUN = ("metrics.json", ".a2tg-run")
 PICTURES = ("png", "jpg", "tif", "webp", "avif", "bmp", "gif", "ppm")
 
 
@@ -52,6 +54,8 @@ READERS = (
     Reader("run", ("history/a.csv",), TEXT, "history"),
     Reader("run", ("run.toml",), TEXT, "record"),
     Reader("run", (".a2tg-run",), TEXT, "marker"),
+    Reader("commands", tuple(f"{name}/run.toml" for name in SYSTEMS), (mutate.of_toml,) * 3 + (mutate.of_text,), "run"),
+    Reader("commands", tuple(f"{name}/{file}" for name in SYSTEMS[:2] for file in OF_RUN), (mutate.of_text,), "run"),
 )  # fmt: skip
 
 
@@ -213,8 +217,12 @@ def _marker(folder: Path, file: Path) -> None:
     check_free(folder, overwrite=True)
 
 
+def _run(folder: Path, file: Path) -> None:
+    run_commands(next(path for path in file.parents if path.parent == folder))
+
+
 TARGETS = {
     "scene": _scene, "points": _points, "picture": _picture, "model": _model, "compact": _compact,
     "checkpoint": _checkpoint, "gaussians": _gaussians, "lpips": _lpips, "info": _info, "history": _history,
-    "record": _record, "marker": _marker,
+    "record": _record, "marker": _marker, "run": _run,
 }  # fmt: skip

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from fuzz_commands import write_runs
 from fuzz_readers import PICTURES
 from PIL import Image
 from small_models import some_checkpoint, some_model
@@ -50,6 +51,7 @@ def write_seeds(folder: Path) -> None:
     save_ply(folder / "gaussians" / "third.ply", some_model(), third_scale=True)
     _write_lpips(folder / "lpips" / "squeeze.npz")
     _write_run(folder / "run")
+    write_runs(folder / "commands")
     jax.clear_caches()
 
 

@@ -1,16 +1,22 @@
 """Files of a run that are damaged: metrics, histories, records."""
 
 import json
+import time
+import tracemalloc
 
 import numpy as np
 import pytest
+from hostile_files import put
 
+from a2tg_jax.cli import main as cli
+from a2tg_jax.host.json_text import DEEPEST, parse_json, parse_toml
 from a2tg_jax.results.figures import curves_figure
-from a2tg_jax.results.folder import RunFolder, read_json
+from a2tg_jax.results.folder import MOST_NAMES, RunFolder, create_run, open_run, read_json
 from a2tg_jax.results.history import NAMES, read_history, write_history
 from a2tg_jax.results.info import read_psnrs
-from a2tg_jax.results.record import read_run_file
+from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, read_record, read_run_file, write_record
 from a2tg_jax.training import History
+from a2tg_jax.training.checkpoint import HistoryLog
 
 HEAD = ",".join(NAMES)
 
@@ -78,7 +84,8 @@ def test_a_history_without_rows_is_shown(tmp_path):
         (b"\xff\xfe", "is not valid TOML"),
         (b"scene = 1979-05-27", "scene must be"),
         (b"options = 3", "options must be"),
-        (b'scene = ["' + b"x" * 10**6 + b'"]', "scene must be"),
+        (b'scene = ["' + b"x" * 200_000 + b'"]', "scene must be"),
+        (b'scene = ["' + b"x" * 10**6 + b'"]', "the most that such a file may have"),
     ],
 )
 def test_records_made_to_do_harm(tmp_path, text, message):
@@ -105,3 +112,206 @@ def test_a_marker_names_no_file_but_those_in_its_folder(tmp_path, line):
     with open(run.marker, "ab") as file:
         file.write(line + b"\n")
     assert run.own_files(run.written()) == [run.metrics]
+
+
+# Records whose options cannot be
+
+
+@pytest.fixture
+def bytewise_run(tmp_path):
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("synthetic"), "bytewise", chosen_system("bytewise", "smoke"), (), "smoke"))
+    return run
+
+
+def with_lines(run, **lines):
+    """Other values in run.toml, by the key that their line begins with."""
+    text = run.record.read_text()
+    for key, value in lines.items():
+        found = [line for line in text.splitlines() if line.startswith(f"{key} = ")]
+        text = text.replace(found[0], f"{key} = {value}", 1) if found else f"{key} = {value}\n{text}"
+    run.record.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ({"base_degree": 7}, "base_degree must lie in"),
+        ({"base_degree": -9}, "base_degree must lie in"),
+        ({"base_degree": 2**63}, "base_degree must lie in"),
+        ({"stage1_iterations": 0}, "at least 1 iteration"),
+        ({"stage1_iterations": -5}, "must"),
+        ({"stage1_iterations": 2**63}, "fewer than 2.31"),
+        ({"seed": -1}, "seed must lie in"),
+        ({"cap": 0}, "densify.cap must"),
+        ({"memory_budget": "1e-300"}, "memory_budget"),
+        ({"compare": json.dumps(["a" * 5000])}, "there is no system"),
+        ({"compare": '["bytewise"]'}, "two systems of the run"),
+        ({"compare": '[":"]'}, "there is no system|cannot be imported"),
+        ({"system": json.dumps("x:" + "y" * 5000)}, "cannot be imported"),
+    ],
+)
+def test_records_of_options_out_of_range(bytewise_run, capsys, monkeypatch, lines, message):
+    with_lines(bytewise_run, **lines)
+    check_refused(bytewise_run, capsys, monkeypatch, message)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1])
+@pytest.mark.parametrize("at", ["[nan]", "[inf]", "[1e400]", "[-inf, 0.5]", "[0.1, nan]", '["0.1"]', "[[0.1]]", "nan"])
+def test_times_of_pruning_that_are_none(bytewise_run, capsys, monkeypatch, at, share):
+    """They are looked at even if nothing is pruned."""
+    text = bytewise_run.record.read_text()
+    start, end = text.index("[options.prune]"), text.index("[options.view_dependence]")
+    text = text[:start] + f"[options.prune]\nshare = {share}\nat = {at}\n\n" + text[end:]
+    bytewise_run.record.write_text(text)
+    check_refused(bytewise_run, capsys, monkeypatch, r"prune\.at must be")
+
+
+def check_refused(run, capsys, monkeypatch, message):
+    """Every command that reads a record tells one line."""
+    with pytest.raises(ValueError, match=message):
+        read_record(open_run(run.path))
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    folder, record, new = str(run.path), str(run.record), str(run.path.with_name("new"))
+    resume = ["train", "--out", folder, "--resume"]
+    for command in (["info", folder], ["eval", folder], ["train", "--config", record, "--out", new], resume):
+        assert cli.main(command) == 2
+        printed = capsys.readouterr()
+        assert printed.out == "" and printed.err.count("\n") == 1 and len(printed.err) < 1200
+
+
+def test_errors_are_one_line_of_bounded_length(capsys, monkeypatch):
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    assert cli.main(["info", "x" * 5000]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("a2tg: error: ") and len(printed) < 1200
+
+
+# Texts that would take memory or time
+
+
+def peak_of(read, *arguments):
+    """Bytes and seconds that a refusal takes."""
+    tracemalloc.start()
+    start = time.perf_counter()
+    try:
+        with pytest.raises(ValueError):
+            read(*arguments)
+        return tracemalloc.get_traced_memory()[1], time.perf_counter() - start
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        (parse_json, b"[" + b",".join([b'{"a":' * 900 + b"1" + b"}" * 900] * 1000) + b"]"),
+        (parse_json, b"[" + b"{}," * 1_500_000 + b"1]"),
+        (parse_json, b"[" * 10**7),
+        (parse_json, b" " * (1 << 26)),
+        (parse_toml, "\n".join(f"a{i}{'.a' * 1000} = 1" for i in range(2000)).encode()),
+        (parse_toml, "\n".join(f"a{i}{'.a' * 1000} = 1" for i in range(100)).encode()),
+        (parse_toml, b"\n".join(b"a%d = " % i + b"[" * 500 + b"]" * 500 for i in range(200))),
+        (parse_toml, b" " * (1 << 20)),
+    ],
+)
+def test_texts_are_measured_before_they_are_parsed(parse, text):
+    num_bytes, seconds = peak_of(parse, text)
+    assert num_bytes < 6 * len(text) + 10**6 and num_bytes < 70e6 and seconds < 5
+
+
+def test_brackets_and_dots_in_strings_do_not_count():
+    deep = "[" * 100 + "." * 100
+    told = json.dumps({'a"' + deep: ["\\", deep, '\\"' + deep]})
+    assert parse_json(told) == json.loads(told)
+    text = f"a = '{deep}' # {deep}\nb = \"\\\"{deep}\"\nc = \"\"\"\n\"{deep}\"\"\"\nd = '''{deep}'''\n'{deep}' = 1\n"
+    assert parse_toml(text.encode())["b"] == '"' + deep
+    assert parse_toml(b"a = [" + b"0.5," * 100 + b"]") == {"a": [0.5] * 100}
+
+
+def test_brackets_may_be_as_deep_as_is_said():
+    assert parse_json("[" * DEEPEST + "]" * DEEPEST)
+    with pytest.raises(ValueError, match="nested too deeply"):
+        parse_json("[" * (DEEPEST + 1) + "]" * (DEEPEST + 1))
+
+
+# Files of many lines
+
+
+def test_a_marker_of_a_million_files_is_refused(tmp_path):
+    run = create_run(tmp_path / "run")
+    with open(run.marker, "a") as file:
+        file.writelines(f"x/{i}.png\n" for i in range(10**6))
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match=r"lists 1,000,00\d files, and 100,000 are the most"):
+        run.written()
+    assert time.perf_counter() - start < 5
+
+
+def test_many_files_are_noted_at_once(tmp_path):
+    run = create_run(tmp_path / "run")
+    names = [f"test/{i}.png" for i in range(MOST_NAMES - 10)]
+    start = time.perf_counter()
+    run.own_all([*names, *names])
+    run.own_all(names)
+    assert time.perf_counter() - start < 5 and run.written().count(names[7]) == 1 and set(names) <= set(run.written())
+
+
+def test_a_history_of_200_000_rows_is_read_and_drawn_in_seconds(tmp_path):
+    num = 200_000
+    iteration, values = np.arange(1, num + 1), np.linspace(1.0, 2.0, num)
+    history = History(
+        np.ones(num, int), iteration, values, np.where(iteration == 5, np.inf, 20.0), iteration, values, values
+    )
+    start = time.perf_counter()
+    write_history(tmp_path / "a.csv", history)
+    found = read_history(tmp_path / "a.csv")
+    curves_figure({"a": found}, {"a": 0})
+    assert time.perf_counter() - start < 15
+    np.testing.assert_array_equal(found.iteration, iteration)
+    np.testing.assert_array_equal(found.psnr, history.psnr)
+
+
+def test_rows_are_logged_in_constant_time_and_earlier_histories_stay():
+    log, expected = HistoryLog(History.empty()), History.empty()
+    kept = []
+    for index in range(100):
+        point = (1, index, 0.5 / (index + 1), float("inf") if index == 3 else 20.0, 7, 0.1, float(index))
+        log.add(*point)
+        expected = expected.with_point(*point)
+        kept.append(log.history)
+    again = HistoryLog(kept[49])
+    again.add(2, 0, 9.0, 9.0, 9, 9.0, 9.0)
+    for field in ("stage", "iteration", "loss", "psnr", "num_gaussians", "megabytes", "seconds"):
+        wanted = getattr(expected, field)
+        assert getattr(log.history, field).dtype == wanted.dtype
+        assert all(np.array_equal(getattr(kept[k], field), wanted[: k + 1]) for k in (0, 20, 49, 99))
+    assert len(again.history.loss) == 51 and kept[50].loss[50] == expected.loss[50]
+    start = time.perf_counter()
+    for index in range(200_000):
+        log.add(1, index, 0.5, 20.0, 7, 0.1, 1.0)
+    assert time.perf_counter() - start < 15
+
+
+# Things that are no files
+
+
+@pytest.mark.parametrize("name", ["run.toml", "metrics.json", ".a2tg-run"])
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse"])
+def test_runs_whose_files_are_none(bytewise_run, capsys, monkeypatch, name, kind):
+    path = bytewise_run.path / name
+    put(path, kind)
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    commands = ["eval"] if name == ".a2tg-run" else ["info"]
+    for command in commands:
+        assert cli.main([command, str(bytewise_run.path)]) == 2
+        printed = capsys.readouterr().err
+        assert printed.count("\n") == 1 and name in printed
+        assert ("is not a regular file" if kind != "sparse" else "100,000,000,000 bytes") in printed
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe"])
+def test_histories_that_are_no_files(tmp_path, kind):
+    put(tmp_path / "a.csv", kind)
+    with pytest.raises(ValueError, match=r"a\.csv: is not a regular file"):
+        read_history(tmp_path / "a.csv")

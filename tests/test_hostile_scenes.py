@@ -1,12 +1,14 @@
 """Scenes that are cut off, lie about their lengths, or hold numbers that no camera has: one clear line each."""
 
 import json
+import os
 import struct
 import time
 import warnings
 
 import numpy as np
 import pytest
+from hostile_files import put
 from PIL import Image
 from test_data_colmap import CAMERAS
 from test_data_colmap import write_scene as write_colmap
@@ -346,3 +348,52 @@ def test_names_in_a_model_do_not_lead_out(tmp_path):
     file = scene / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"secret.png\0", b"../../secret.png\0"))
     refused(scene, "leads out of the scene's folder")
+
+
+# Things that are no files
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "masks/01.png", "points.ply", "images/01.png"])
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse"])
+def test_scenes_whose_files_are_none(tmp_path, name, kind):
+    write_ply(tmp_path / "points.ply")
+    write_json(tmp_path, write_frames(tmp_path), ply_file_path="points.ply", **FOCAL, **SIZE)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    put(tmp_path / name, kind)
+    refused(tmp_path, "is not a regular file" if kind != "sparse" else "has 100,000,000,000 bytes")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse"])
+def test_models_of_colmap_whose_files_are_none(tmp_path, name, kind):
+    write_colmap(tmp_path)
+    put(tmp_path / "sparse" / "0" / name, kind)
+    refused(tmp_path, "is not a regular file" if kind != "sparse" else "has 100,000,000,000 bytes")
+
+
+def test_a_text_of_colmap_of_one_endless_line(tmp_path):
+    (tmp_path / "points3D.txt").touch()
+    os.truncate(tmp_path / "points3D.txt", 10**9)
+    with pytest.raises(ValueError, match=r"points3D\.txt: has a line of more than"):
+        check_text(tmp_path / "points3D.txt")
+
+
+def test_links_to_files_are_followed(tmp_path):
+    write_ply(tmp_path / "points.ply")
+    (tmp_path / "link.ply").symlink_to(tmp_path / "points.ply")
+    assert len(read_ply_points(tmp_path / "link.ply").points) == 4
+
+
+def test_points_that_are_nowhere_in_the_normalised_world_are_left_out(tmp_path):
+    """Cameras that stand close together make its unit small."""
+    frames = write_frames(tmp_path)
+    for frame in frames:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 1e-6
+    write_ply(tmp_path / "points.ply")
+    text = (tmp_path / "points.ply").read_text().splitlines()
+    text[-1] = " ".join(["9e11", "0", "0", *text[-1].split()[3:]])
+    (tmp_path / "points.ply").write_text("\n".join(text) + "\n")
+    write_json(tmp_path, frames, ply_file_path="points.ply", **FOCAL, **SIZE)
+    with pytest.warns(UserWarning, match="1 points are not finite, or beyond .*left out"):
+        assert np.abs(load_scene(tmp_path).points).max() <= 1e12

@@ -206,11 +206,11 @@ def test_wrong_record_is_one_clear_line(tmp_path, text, message):
 
 def test_configuration_file_says_a_part(tmp_path):
     run = create_run(tmp_path / "run")
-    run.record.write_text('scene = "../fox"\npreset = "quick"\n[options.texture]\nk_a = 9\nupscale_at = [1, 0.5]\n')
+    run.record.write_text('scene = "../fox"\npreset = "quick"\n[options.texture]\nk_a = 9\nupscale_at = [0.25, 0.5]\n')
     record = read_record(run)
     assert record.scene == SceneSource(str(tmp_path / "fox"))
     assert (record.system.stage1_iterations, record.system.densify.cap) == (2_000, 10_000)
-    assert (record.system.texture.k_a, record.system.texture.upscale_at) == (9.0, (1.0, 0.5))
+    assert (record.system.texture.k_a, record.system.texture.upscale_at) == (9.0, (0.25, 0.5))
     assert all(isinstance(number, float) for number in (record.system.texture.k_a, *record.system.texture.upscale_at))
 
 

@@ -19,6 +19,7 @@ from a2tg_jax.cli.view import Export, View
 from a2tg_jax.data import run_sfm
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
+from a2tg_jax.host.text import shortened
 from a2tg_jax.results.compress import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
@@ -29,6 +30,8 @@ from a2tg_jax.results.whole_run import measure
 from a2tg_jax.training import SYSTEMS
 
 BROKEN_PIPE = 128 + 13
+LONGEST_ERROR = 1000
+"""Characters of the line that tells an error."""
 OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
@@ -209,7 +212,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _fail(message: str) -> int:
     """Prints an error as one line and returns its exit code."""
-    print(f"a2tg: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"a2tg: error: {shortened(message, LONGEST_ERROR)}", file=sys.stderr)
     return 2
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.gaussians import floats_per_gaussian
+from a2tg_jax.host.text import shortened
 
 BYTES_PER_FLOAT = 4
 MEGABYTE = 10**6
@@ -34,10 +35,10 @@ def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> flo
     except (KeyError, decimal.InvalidOperation):
         raise ValueError(
             f"{name} must be a number of MB (10^6 bytes), or one with a unit, such as 1.5MB, 800kB or 2GB; "
-            f"got {budget!r}"
+            f"got {shortened(budget)}"
         ) from None
     if not 0 < megabytes < math.inf:
-        raise ValueError(f"{name} must be positive and finite; got {budget!r}")
+        raise ValueError(f"{name} must be positive and finite; got {shortened(budget)}")
     return megabytes
 
 

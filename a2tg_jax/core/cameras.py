@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import check_floats, short_repr
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, short_repr
 
 LONGEST_SIDE = 100_000
 """Pixels of the longer side of an image."""
@@ -17,8 +17,8 @@ LARGEST_OFFSET = 100.0
 """The principal point is at most so many longer sides away from the image's corner."""
 MAX_SKEW = 1e-2
 """Largest deviation of a rotation from an orthonormal matrix that still passes as rounding."""
-LARGEST_COORDINATE = 1e12
-"""Of a camera's position, in any world."""
+LARGEST_COORDINATE = LARGEST_NUMBER
+"""Largest coordinate of a camera or a point, in any world."""
 
 
 @jax.tree_util.register_dataclass

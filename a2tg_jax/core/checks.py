@@ -9,6 +9,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+LARGEST_NUMBER = 1e12
+"""Largest magnitude of a number that geometry in float32 carries: products of it with focal lengths, and their
+squares, stay finite, and with them gradients, which overflow from 1e20 on."""
 Wanted = tuple[int | str, ...]
 """Sides of an array: numbers, or letters for any size, such as ("N", 16, 3)."""
 

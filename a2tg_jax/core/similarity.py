@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from a2tg_jax.core.cameras import MAX_SKEW
+from a2tg_jax.core.checks import LARGEST_NUMBER
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,8 +46,11 @@ class Similarity:
 def check_similarity(similarity: Similarity, what: str) -> None:
     """Raises ValueError, calling it `what`, unless its scale is positive, its rotation is one, and all is finite."""
     scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
-    if not (0 < scale < np.inf and np.isfinite(translation).all()):
-        raise ValueError(f"{what} must have a positive scale and a finite translation; got {scale:g}, {translation}")
+    if not (1 / LARGEST_NUMBER <= scale <= LARGEST_NUMBER and (np.abs(translation) <= LARGEST_NUMBER).all()):
+        raise ValueError(
+            f"{what} must have a positive scale and a finite translation, up to {LARGEST_NUMBER:g}, the scale from "
+            f"{1 / LARGEST_NUMBER:g}; got {scale:g}, {np.asarray(translation).tolist()}"
+        )
     is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW) and np.linalg.det(rotation) > 0
     if not is_rotation:  # Also of NaN.
         raise ValueError(f"{what} must have a rotation; got {np.asarray(rotation).tolist()}")

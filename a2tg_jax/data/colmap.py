@@ -18,6 +18,7 @@ from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
+from a2tg_jax.host.regular_files import is_regular
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
 """Where a scene folder, or the given part of one, keeps its model, in order of preference."""
@@ -99,7 +100,7 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
 def _model_suffix(folder: Path) -> str | None:
     """ ".bin" or ".txt", whichever a folder keeps a model in (COLMAP prefers .bin), or None."""
     for suffix in EMPTY_POINTS:
-        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+        if all(is_regular(folder / f"{name}{suffix}") for name in ("cameras", "images")):
             return suffix
     return None
 
@@ -108,7 +109,7 @@ def _read_model(model: Path) -> Any:
     """The pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
     suffix = _model_suffix(model) or ".bin"
     for file in (model / f"{kind}{suffix}" for kind in RECORDS):
-        if file.is_file():
+        if is_regular(file):
             (check_binary if suffix == ".bin" else check_text)(file)
     try:
         with _with_points_file(model, suffix) as folder:
@@ -121,7 +122,7 @@ def _read_model(model: Path) -> Any:
 @contextmanager
 def _with_points_file(model: Path, suffix: str) -> Iterator[Path]:
     """The model's folder, or, where points3D is missing, a temporary one like it with an empty points3D."""
-    if (model / f"points3D{suffix}").is_file():
+    if is_regular(model / f"points3D{suffix}"):
         yield model
         return
     with tempfile.TemporaryDirectory() as folder:

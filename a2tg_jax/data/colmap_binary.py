@@ -12,11 +12,13 @@ so that each file is walked through here first. Nothing is copied. The formats, 
 
 import functools
 import mmap
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
 
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.host.regular_files import open_regular
 
 LONGEST_NAME = 4096
 COUNT, SHORT_COUNT = struct.Struct("<Q"), struct.Struct("<I")
@@ -60,8 +62,8 @@ def check_binary(path: Path) -> None:
     Raises:
       ValueError: naming the file, and what of it is wrong.
     """
-    with open(path, "rb") as file:
-        if path.stat().st_size == 0:  # Nothing can be mapped.
+    with open_regular(path) as file:
+        if os.fstat(file.fileno()).st_size == 0:  # Nothing can be mapped.
             _check_records(_Cursor(path, b""))
         else:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:

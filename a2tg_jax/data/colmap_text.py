@@ -6,13 +6,17 @@ pycolmap takes the word before where one is missing, and counts on without end w
 import itertools
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from a2tg_jax.data.colmap_binary import num_params_by_model
+from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
 Words = list[bytes]
+LONGEST_LINE = 1 << 26
+"""Bytes; the points of an image of a million features take half of them."""
 ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
 """How many lines, or pairs of lines for images, there are: a comment of COLMAP's."""
 
@@ -26,8 +30,8 @@ def check_text(path: Path) -> None:
       ValueError: naming the file and the line.
     """
     announced, found = None, 0
-    with open(path, "rb") as file:
-        lines = enumerate(file, 1)
+    with open_regular(path) as file:
+        lines = enumerate(_lines(file, path), 1)
         for number, line in lines:
             words = line.split()
             if match := ANNOUNCED.match(line):
@@ -40,6 +44,14 @@ def check_text(path: Path) -> None:
     if announced not in (None, found):
         message = f"{path}: says that it has {announced} {path.stem}, and has {found}: if it is cut off, export it"
         warnings.warn(message, stacklevel=2)
+
+
+def _lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
+    """The lines of a file, none of which takes more memory than a line can."""
+    while line := file.readline(LONGEST_LINE + 1):
+        if len(line) > LONGEST_LINE:
+            raise ValueError(f"{path}: has a line of more than {LONGEST_LINE:,} bytes; export the model again")
+        yield line
 
 
 def _check_line(path: Path, number: int, words: Words, points: bytes | None) -> None:

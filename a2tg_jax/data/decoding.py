@@ -7,16 +7,20 @@ before its size and its bits are known. Pixels are uint8, [H, W, 3] or, with str
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
 BITS_PER_SAMPLE = 258
 """A tag of TIFF."""
 LONGEST_REASON = 200
+MOST_BYTES = 1 << 30
+"""Largest file of a picture: as many pixels, not compressed."""
 MAX_PIXELS = 128_000_000
 """Width × height of the largest picture that is decoded, which takes up to 1 GB."""
 
@@ -49,8 +53,14 @@ def check_picture(path: str | os.PathLike) -> tuple[int, int]:
 @contextmanager
 def _opened(path: str | os.PathLike) -> Iterator[Image.Image]:
     """An image that may be decoded; whatever is wrong with it, then too, becomes one ValueError."""
+    with open_regular(path, MOST_BYTES) as file:
+        yield from _decoded(path, file)
+
+
+def _decoded(path: str | os.PathLike, file: BufferedReader) -> Iterator[Image.Image]:
+    """The image in an open file, once."""
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(file, formats=FORMATS) as image:
             _check_size(path, image)
             _check_depth(path, image)
             yield image

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -39,7 +40,7 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
     if downscale > 1 and smaller.is_dir():
         folder, downscale = smaller, 1
     for candidate in (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)):
-        if candidate.is_file():
+        if is_regular(candidate):
             return candidate, downscale
     raise FileNotFoundError(
         f"{folder / name}: no such image, but the scene has a camera for it; "

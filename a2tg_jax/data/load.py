@@ -8,6 +8,7 @@ from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
 from a2tg_jax.data.scene import Scene, check_test_every
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
+from a2tg_jax.host.regular_files import is_regular
 
 
 def load_scene(
@@ -58,13 +59,13 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
     options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room}
-    if path.is_file():
+    if is_regular(path):
         return load_transforms(path, **options)
     if find_model(path) is not None:
         return load_colmap(path, **options)
-    if (path / NERFSTUDIO_FILE).is_file():
+    if is_regular(path / NERFSTUDIO_FILE):
         return load_transforms(path / NERFSTUDIO_FILE, **options)
-    if (path / BLENDER_FILES[0]).is_file():
+    if is_regular(path / BLENDER_FILES[0]):
         return load_blender(path, **options)
     raise FileNotFoundError(
         f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "

@@ -14,6 +14,7 @@ from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, Shot, View
+from a2tg_jax.host.regular_files import is_regular
 
 FOLDER = "masks"
 """Beside the folder of images."""
@@ -123,9 +124,9 @@ def alpha_as_mask(scene: Scene, source: str) -> Scene:
 
 def _at_scale(folder: Path, name: str, downscale: int) -> tuple[Path, int] | None:
     smaller = folder.with_name(f"{folder.name}_{downscale}") / name
-    if downscale > 1 and smaller.is_file():
+    if downscale > 1 and is_regular(smaller):
         return smaller, 1
-    return (folder / name, downscale) if (folder / name).is_file() else None
+    return (folder / name, downscale) if is_regular(folder / name) else None
 
 
 def _check_left(mask: Mask, name: str, source: str) -> None:

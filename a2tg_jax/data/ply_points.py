@@ -8,6 +8,7 @@ import numpy as np
 
 from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, read_vertex_header
 from a2tg_jax.data.scene import PointCloud
+from a2tg_jax.host.regular_files import is_regular, open_regular
 
 COLORS = ("red", "green", "blue")
 LEAST_BYTES = 2
@@ -23,9 +24,9 @@ def read_ply_points(path: Path) -> PointCloud:
       FileNotFoundError: if there is no such file.
       ValueError: naming the file, if it is no such PLY or is cut off.
     """
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such point file, but transforms.json names it; correct ply_file_path")
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         header = read_vertex_header(file, path)
         header.require("xyz", "a PLY file of points")
         if header.encoding == "ascii":

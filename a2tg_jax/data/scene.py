@@ -170,7 +170,7 @@ def assemble_scene(
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
     centers = camera_centers(np.stack(list(viewmats.values())))
-    cloud = cloud and _usable(cloud, source)
+    cloud = cloud and _usable(cloud, transform, source)
     if cloud is None or len(cloud.points) < 2:
         message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS} random points instead"
         warnings.warn(message, stacklevel=3)
@@ -220,7 +220,8 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
     """
     rotation = viewmat[:3, :3]
     if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
-        found = "is not finite" if not np.isfinite(viewmat).all() else f"lies beyond ±{LARGEST_COORDINATE:g}"
+        largest = np.abs(viewmat).max()
+        found = f"lies beyond ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
         raise ValueError(f"{what}: its pose {found}; remove it from the scene or correct the pose")
     left, singular_values, right = np.linalg.svd(rotation)
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
@@ -253,14 +254,20 @@ def _check_distances(shots: Sequence[Shot], source: str) -> None:
         )
 
 
-def _usable(cloud: PointCloud, source: str) -> PointCloud:
-    """The points that are somewhere; others are left out with a warning."""
-    is_usable = (np.abs(cloud.points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
+    """The points that are somewhere, in both worlds; others are left out with a warning."""
+    is_usable = _are_somewhere(cloud.points)
+    is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
     if is_usable.all():
         return cloud
     message = f"{source}: {np.count_nonzero(~is_usable)} points are not finite, or beyond ±{LARGEST_COORDINATE:g}"
     warnings.warn(f"{message}; they are left out", stacklevel=4)
     return PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
+
+
+def _are_somewhere(points: np.ndarray) -> np.ndarray:
+    """[P] whether all coordinates of a point are within bounds."""
+    return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
 
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:

@@ -20,7 +20,8 @@ from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_ma
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
-from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.json_text import MOST_BYTES, parse_json
+from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
@@ -81,7 +82,7 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
     shelf = Shelf(room)
     train = _read_shots(train_file, _read_json(train_file), downscale, shelf)
     test: list[Shot] = []
-    if test_file.is_file():
+    if is_regular(test_file):
         test = _read_shots(test_file, _read_json(test_file), downscale, shelf)
     else:
         train, test = every_kth(train, test_every)
@@ -92,9 +93,10 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
 
 def _read_json(file: Path) -> dict[str, Any]:
     """The JSON object in a file, which has a non-empty list `frames` of objects, and texts where files are named."""
+    data = read_regular(file, MOST_BYTES)
     try:
-        meta = parse_json(file.read_bytes(), allow_nan=True)  # Numbers are looked at where they are used.
-    except (OSError, ValueError) as error:
+        meta = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
+    except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is wanted")

@@ -1,14 +1,35 @@
-"""JSON of strangers: what is read is finite, of bounded depth, and small enough to be a number."""
+"""JSON and TOML of strangers: of bounded size and depth before they are parsed, and then of numbers that are finite."""
 
 import json
 import math
+import re
+import tomllib
 from typing import Any
 
-MOST_BYTES = 1 << 28
+import numpy as np
+
+MOST_BYTES = 1 << 25
+"""Largest JSON text; a scene of 10,000 photographs has a third of that."""
+MOST_TOML_BYTES = 1 << 18
+"""Largest TOML text; the record of a run has 3 kB."""
 MOST_DIGITS = 25
-"""Of an integer; 2^64 has 20."""
+"""Largest number of digits of an integer; 2^64 has 20."""
 DEEPEST = 64
-"""Lists and objects within each other."""
+"""Largest number of lists and objects within each other, and of names in one key."""
+MOST_BRACKETS = 2_000_000
+"""Largest number of lists and objects: an empty one takes 64 bytes of memory for 3 of text."""
+
+TOML_STRING = re.compile(
+    rb'"""(?:[^\\]|\\(?:.|\Z))*?(?:"""|\Z)'
+    rb"|'''.*?(?:'''|\Z)"
+    rb'|"[^"\\\n]*(?:\\[^\n][^"\\\n]*)*"?'
+    rb"|'[^'\n]*'?|#[^\n]*",
+    re.DOTALL,
+)
+TOML_WORD = re.compile(rb"[\[\]{}=,\n]")
+STEPS = np.zeros(256, np.int8)
+STEPS[[*b"[{"]], STEPS[[*b"]}"]] = 1, -1
+"""How much deeper a text goes with each byte."""
 
 
 def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
@@ -22,8 +43,9 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     Raises:
       ValueError: saying in a few words what is wrong.
     """
-    if len(text) > MOST_BYTES:
-        raise ValueError(f"it has {len(text)} bytes; {MOST_BYTES} are the most that is read")
+    data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+    _check_size(data, MOST_BYTES)
+    _check_brackets(_outside_strings(data))
 
     def constant(name: str) -> float:
         if not allow_nan:
@@ -34,12 +56,27 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
         value = float(digits)
         return value if math.isfinite(value) else constant(digits)
 
-    try:
-        value = json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
-    except RecursionError:
-        raise ValueError("its brackets are nested too deeply") from None
-    check_depth(value)
-    return value
+    text = data.decode("utf-8-sig", "surrogatepass")
+    return json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
+
+
+def parse_toml(data: bytes) -> dict[str, Any]:
+    """The table of a TOML text.
+
+    Args:
+      data: UTF-8.
+
+    Raises:
+      ValueError: saying in a few words what is wrong.
+    """
+    _check_size(data, MOST_TOML_BYTES)
+    outside = TOML_STRING.sub(b"", data)
+    _check_brackets(np.frombuffer(outside, np.uint8))
+    if max(word.count(b".") for word in TOML_WORD.split(outside)) >= DEEPEST:
+        raise ValueError(f"a key is nested more than {DEEPEST} deep")
+    table = tomllib.loads(data.decode("utf-8"))
+    _check_depth(table)
+    return table
 
 
 def _integer(digits: str) -> int:
@@ -48,11 +85,33 @@ def _integer(digits: str) -> int:
     return int(digits)
 
 
-def check_depth(value: Any) -> None:
-    """Raises ValueError if lists and mappings are nested more than `DEEPEST` deep.
+def _check_size(data: bytes, most: int) -> None:
+    if len(data) > most:
+        raise ValueError(f"it has {len(data):,} bytes; {most:,} are the most that is read")
 
-    Goes level by level, as what is nested too deeply cannot be walked by recursion.
+
+def _outside_strings(data: bytes) -> np.ndarray:
+    """The brackets of a JSON text, and whatever else stands outside its strings, as bytes."""
+    letters = np.frombuffer(data.replace(b"\\\\", b"").replace(b'\\"', b""), np.uint8)
+    num_quotes = np.cumsum(letters == ord('"'), dtype=np.uint8)  # Wraps, which keeps it even or odd.
+    return letters[num_quotes % 2 == 0]
+
+
+def _check_brackets(outside: np.ndarray) -> None:
+    """Raises ValueError unless the brackets among bytes are few enough and nested at most `DEEPEST` deep.
+
+    Texts whose brackets do not match are refused where they are parsed.
     """
+    steps = STEPS[outside]
+    steps = steps[steps != 0]
+    if len(steps) > MOST_BRACKETS:
+        raise ValueError(f"it has {len(steps):,} brackets; {MOST_BRACKETS:,} are the most that is read")
+    if np.cumsum(steps, dtype=np.int32).max(initial=0) > DEEPEST:
+        raise ValueError(f"its brackets are nested too deeply, more than {DEEPEST} deep")
+
+
+def _check_depth(value: Any) -> None:
+    """Raises ValueError if lists and mappings, by brackets or dots, are nested more than `DEEPEST` deep."""
     level = [value]
     for _ in range(DEEPEST):
         level = [inner for held in level for inner in _held(held)]

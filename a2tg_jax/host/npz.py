@@ -5,11 +5,11 @@ import math
 import os
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
+from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
 LARGEST_RATIO = 64
@@ -28,10 +28,11 @@ def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda 
       OSError: if the file cannot be opened.
       ValueError: saying what is wrong, if it is damaged, an array is not of numbers, or claims more than there is.
     """
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
-                return _read_arrays(archive, FREE_ROOM + LARGEST_RATIO * Path(path).stat().st_size, is_wanted)
+                room = FREE_ROOM + LARGEST_RATIO * os.fstat(file.fileno()).st_size
+                return _read_arrays(archive, room, is_wanted)
         except Exception as error:  # what a damaged zip raises goes from zlib.error to NotImplementedError
             raise ValueError(shortened(str(error) or type(error).__name__, LONGEST_REASON)) from error
 

@@ -2,9 +2,13 @@
 
 from typing import Any
 
+SLACK = 10
+"""How many times the letters that are told are looked at; runs of spaces are told as one."""
+
 
 def shortened(value: Any, most: int = 80) -> str:
     """A value as an error tells it, on one line of bounded length; texts without quotes, nor what steers a terminal."""
-    text = " ".join((value if isinstance(value, str) else repr(value)).split())
+    text = (value if isinstance(value, str) else repr(value))[: SLACK * most]  # Words of it all would take memory.
+    text = " ".join(text.split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"

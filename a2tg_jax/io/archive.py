@@ -14,6 +14,7 @@ import numpy as np
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 
 FORMAT = "a2tg-jax checkpoint"
@@ -74,12 +75,12 @@ def read_archive_header(path: str | os.PathLike, *, format: str = FORMAT) -> dic
 
 def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
     """The wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such {format}")
     try:
         return read_npz(path, is_wanted)
     except ValueError as error:
-        raise _damaged(path, format, str(error)) from error
+        raise _damaged(path, format, str(error).removeprefix(f"{path}: ")) from error
 
 
 def _damaged(path: Path, format: str, reason: str) -> ValueError:

@@ -21,6 +21,7 @@ from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.coders import Choice, decode, encode
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
@@ -35,6 +36,7 @@ from a2tg_jax.io.model_file import (
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
 from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
 
@@ -42,6 +44,7 @@ MAGIC = b"a2tgz\r\n\x1a"
 VERSION = 1
 HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
+MOST_BYTES = 1 << 32
 LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
 """What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
@@ -102,7 +105,8 @@ def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoic
       choices: how finely its numbers are kept.
 
     Raises:
-      ValueError: if the model shows anything else, has a number that is not finite, or a choice cannot be.
+      ValueError: if the model shows anything else, has a number that is not finite or too large, or a
+        choice cannot be.
     """
     data = encode_model(model, choices)
     with replacing(path) as temporary:
@@ -117,9 +121,9 @@ def load_compact(path: str | os.PathLike) -> Model:
       ValueError: if it is not a compact scene, is damaged, or is of another version.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such compact scene")
-    return decode_model(path.read_bytes(), str(path))
+    return decode_model(read_regular(path, MOST_BYTES), str(path))
 
 
 def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> bytes:
@@ -128,6 +132,7 @@ def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> byt
     check_gaussians(model.gaussians, "model.gaussians")
     check_kind(model.appearance)
     data, num_unpacked = _encoded(model.live, choices)
+    check_model(model)
     if num_unpacked > _room(data):  # So alike are its numbers that the file would be taken for a bomb.
         data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"))
     return data

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.json_text import MOST_BYTES, parse_json
+from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 FORMAT, VERSION = "a2tg-jax path", 1
@@ -26,10 +27,10 @@ def load_views(path: Path) -> list[Camera]:
       FileNotFoundError: if there is no such file.
       ValueError: naming the file, if it holds anything else.
     """
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such path; the viewer's 'Save path' makes one")
     try:
-        data = parse_json(path.read_bytes())
+        data = parse_json(read_regular(path, MOST_BYTES))
         if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
             raise ValueError(f"is not a path of version {VERSION} that the viewer saved")
         views = data.get("views")

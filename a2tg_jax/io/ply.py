@@ -24,6 +24,7 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.ply_header import read_vertex_header
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
@@ -125,9 +126,9 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
       ValueError: if it is not a binary little-endian PLY, is cut off, lacks an attribute, or a number is not finite.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such PLY file")
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
     gaussians = _gaussians_of(vertices, path)
     try:

@@ -3,6 +3,7 @@
 Native loops believe the layout that they are given. Both loaders, of models and of checkpoints, go through here first.
 """
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance, Banded
 from a2tg_jax.core.cameras import check_calibration
-from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_shape, dtype_of
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import check_similarity
@@ -20,6 +21,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
 DTYPES = ("float32", "float64")
+LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
 
 
 def check_model(model: Model) -> None:
@@ -33,11 +35,13 @@ def check_model(model: Model) -> None:
     if str(dtype_of(gaussians.means)) not in DTYPES:
         raise ValueError(f"gaussians must be {' or '.join(DTYPES)}; got {dtype_of(gaussians.means)}")
     check_rows(model.appearance, model.params, model.layout, gaussians)
-    check_finite("gaussians", gaussians)
-    check_finite("params", model.params)
-    largest = np.log(np.finfo(gaussians.means.dtype).max)
-    if (np.asarray(gaussians.log_scales) > largest).any():
-        raise ValueError(f"gaussians.log_scales must be logarithms of finite scales, below {largest:.0f}; some are not")
+    check_bounded("gaussians", gaussians)
+    check_bounded("params", model.params)
+    if (largest := np.asarray(gaussians.log_scales).max(initial=-np.inf)) > LARGEST_LOG_SCALE:
+        raise ValueError(
+            f"gaussians.log_scales must be logarithms of finite scales, up to {LARGEST_LOG_SCALE:.2f}, of scales up to "
+            f"{LARGEST_NUMBER:g}; got {largest:g}"
+        )
     if model.num_live is not None:
         check_count("num_live", model.num_live, gaussians.num)
     if model.origin is not None:
@@ -85,12 +89,12 @@ def check_origin(origin: Origin) -> None:
     cameras = zip(origin.names, origin.viewmats, origin.Ks, origin.sizes.tolist(), strict=True)
     for name, viewmat, K, (width, height) in cameras:
         check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
-    if not np.isfinite(origin.background).all():
-        raise ValueError(f"origin.background must be finite; got {origin.background}")
+    if not (np.abs(origin.background) <= LARGEST_NUMBER).all():  # False for NaN.
+        raise ValueError(f"origin.background must be finite, within ±{LARGEST_NUMBER:g}; got {origin.background}")
     check_similarity(origin.transform, "origin.transform")
     for name, rows in origin.corrections.items():
         check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
-        check_finite(f"origin.corrections.{name}", rows)
+        check_bounded(f"origin.corrections.{name}", rows)
 
 
 def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
@@ -102,6 +106,19 @@ def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
         if not (np.isfinite(values) if is_signed else values >= 0).all():
             wanted, found = ("finite", "NaN or infinite") if is_signed else ("at least 0", "negative or NaN")
             raise ValueError(f"{name}{jax.tree_util.keystr(path)} must be {wanted}; some are {found}")
+
+
+def check_bounded(name: str, tree: Any) -> None:
+    """Raises ValueError, naming the leaf and the number, if a float is not finite or too large."""
+    check_finite(name, tree)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        values = np.asarray(leaf)
+        if not np.issubdtype(values.dtype, np.floating) or not values.size:
+            continue
+        for value in (values.max(), values.min()):
+            if abs(value) > LARGEST_NUMBER:
+                label = f"{name}{jax.tree_util.keystr(path)}"
+                raise ValueError(f"{label} must lie within ±{LARGEST_NUMBER:g}; got {value:g}")
 
 
 def check_count(name: str, value: Any, most: int) -> None:

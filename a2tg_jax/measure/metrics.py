@@ -20,6 +20,7 @@ from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.npz import read_npz
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.texture import BYTES_PER_TEXEL, AtlasLayout
 from a2tg_jax.training import losses
@@ -140,7 +141,7 @@ def _share_of_windows(mask: Array, dtype) -> Array:
 
 @functools.lru_cache(maxsize=4)
 def _load_lpips(path: pathlib.Path) -> LpipsWeights:
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"there are no LPIPS weights at {path}: give the path of an .npz file")
     try:
         arrays = read_npz(path)

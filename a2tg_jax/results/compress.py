@@ -16,6 +16,7 @@ from a2tg_jax.finish.compaction import (
     smallest_within,
 )
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.compact import GROUPS, encode_model
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.rows import check_kind
@@ -85,7 +86,7 @@ def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
     plan = read_record(run).plan
     planned = plan[plan.main[-1]]
     path = run.model(planned.name)
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
     return path, settings_of(planned.system)
 

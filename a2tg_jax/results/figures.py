@@ -21,6 +21,8 @@ GREY = "#7a8088"
 """Can be read on white and on black."""
 RUNNING_MEANS = 10
 """A running mean covers this share of a stage: a tenth."""
+MOST_POINTS = 4000
+"""Points of a curve; a running mean takes the square of their number in time."""
 CURVES = (
     ("loss", "Loss"),
     ("psnr", "Training PSNR (dB)"),
@@ -47,7 +49,7 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
     colors = dict(zip(histories, itertools.cycle(COLORS), strict=False))
     for axes, (field, title) in zip(figure.subplots(2, 2).flat, CURVES, strict=True):
         for name, history in histories.items():
-            x, y = starts[name] + history.iteration, getattr(history, field)
+            x, y = _thinned(starts[name] + history.iteration), _thinned(getattr(history, field))
             _plot(axes, x, y, name, colors[name], is_noisy=field in ("loss", "psnr"))
         for border in sorted({start for start in starts.values() if start}):
             axes.axvline(border, color="black", linestyle="--", linewidth=0.8)
@@ -59,6 +61,12 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
     figure.axes[0].set_yscale("log")
     figure.axes[0].legend(fontsize=8)
     return figure
+
+
+def _thinned(column: np.ndarray) -> np.ndarray:
+    """A column of at most `MOST_POINTS` numbers, each the mean of as many rows; what is left over at the end goes."""
+    rows = -(-len(column) // MOST_POINTS)
+    return column if rows < 2 else column[: len(column) // rows * rows].reshape(-1, rows).mean(axis=1)
 
 
 def _plot(axes: Axes, x: np.ndarray, y: np.ndarray, name: str, color: str, *, is_noisy: bool) -> None:

@@ -25,15 +25,20 @@ import glob
 import json
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.json_text import MOST_BYTES, parse_json
+from a2tg_jax.host.regular_files import is_regular, read_regular
 
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
+MOST_NAMES = 100_000
+"""Largest number of files that a marker may list."""
+MOST_MARKER_BYTES = 1 << 24
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,26 +53,38 @@ class RunFolder:
 
     def own(self, path: Path) -> Path:
         """The path, noted in the marker as one that this program writes: nothing else is ever replaced or deleted."""
-        name = path.relative_to(self.path).as_posix()
-        if name not in self.written():
-            self.path.mkdir(parents=True, exist_ok=True)
-            with open(self.marker, "a", encoding="utf-8") as file:
-                file.write(f"{name}\n" if os.fstat(file.fileno()).st_size else f"{MARKER}\n{name}\n")
-                file.flush()
-                os.fsync(file.fileno())
+        self.own_all([path.relative_to(self.path).as_posix()])
         return path
+
+    def own_all(self, names: Sequence[str]) -> None:
+        """Notes several files, by their names relative to the folder, in one go."""
+        known = set(self.written())
+        lines = [f"{name}\n" for name in dict.fromkeys(names) if name not in known]
+        if not lines:
+            return
+        self.path.mkdir(parents=True, exist_ok=True)
+        with open(self.marker, "a", encoding="utf-8") as file:
+            file.writelines(lines if os.fstat(file.fileno()).st_size else [f"{MARKER}\n", *lines])
+            file.flush()
+            os.fsync(file.fileno())
 
     def written(self) -> list[str]:
         """What the marker lists, relative to the folder; nothing where there is no marker.
 
         Raises:
-          ValueError: if the marker is not this program's.
+          ValueError: if the marker is not this program's, or lists more than `MOST_NAMES` files.
         """
-        if not self.marker.is_file() or not self.marker.stat().st_size:
+        if not is_regular(self.marker) or not self.marker.stat().st_size:
             return []
-        first, *names = self.marker.read_text(encoding="utf-8", errors="replace").splitlines()
+        data = read_regular(self.marker, MOST_MARKER_BYTES)
+        first, *names = data.decode("utf-8", errors="replace").splitlines()
         if first != MARKER:
             raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with --out")
+        if len(names) > MOST_NAMES:
+            raise ValueError(
+                f"{self.marker} lists {len(names):,} files, and {MOST_NAMES:,} are the most that a run writes; "
+                "choose another folder with --out"
+            )
         return names
 
     def own_files(self, names: list[str]) -> list[Path]:
@@ -215,7 +232,7 @@ def open_run(path: str | os.PathLike) -> RunFolder:
       FileNotFoundError: if there is none at `path`.
     """
     run = RunFolder(Path(path))
-    if not run.record.is_file():
+    if not is_regular(run.record):
         raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml); a2tg train --out makes one")
     return run
 
@@ -238,9 +255,10 @@ def read_json(path: Path) -> Any:
     """The content of a JSON file.
 
     Raises:
-      ValueError: if the file is damaged.
+      ValueError: if the file is damaged, or too large for one of this program's.
     """
+    data = read_regular(path, MOST_BYTES)
     try:
-        return parse_json(path.read_bytes(), allow_nan=True)  # The PSNR of equal images is infinite.
+        return parse_json(data, allow_nan=True)  # The PSNR of equal images is infinite.
     except ValueError as error:
         raise ValueError(f"{path}: is not valid JSON: {error}") from error

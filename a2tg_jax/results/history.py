@@ -2,17 +2,22 @@
 
 import csv
 import dataclasses
+import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.training import History
 
 NAMES = tuple(field.name for field in dataclasses.fields(History))
 INTEGERS = ("stage", "iteration", "num_gaussians")
 LARGEST = 1e15
+MOST_BYTES = 1 << 26
+"""Largest file; about a million rows."""
 
 
 def write_history(path: Path, history: History) -> None:
@@ -29,17 +34,26 @@ def read_history(path: Path) -> History:
       ValueError: naming the file, if it has other columns, or a row is not one of numbers, of which only PSNR may be
         infinite.
     """
-    with open(path, newline="", encoding="utf-8") as file:
+    with io.TextIOWrapper(open_regular(path, MOST_BYTES), encoding="utf-8", newline="") as file:
         try:
-            first, *rows = [*csv.reader(file)] or [[]]
+            rows = csv.reader(file)
+            first = next(rows, [])
             if tuple(first) != NAMES:
                 raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are wanted")
-            values = np.asarray([[float(word) for word in row] for row in rows]).reshape(len(rows), len(NAMES))
+            values = np.fromiter(_numbers(rows), np.dtype((np.float64, len(NAMES))))
             if np.isnan(values).any() or (np.abs(values[:, [name != "psnr" for name in NAMES]]) > LARGEST).any():
                 raise ValueError("has numbers that are not finite")
         except (ValueError, csv.Error) as error:
             raise ValueError(f"{path}: {shortened(str(error), 200)}; train the stage again") from error
     return History(**{name: values[:, i].astype(_dtype(name)) for i, name in enumerate(NAMES)})
+
+
+def _numbers(rows: Iterator[list[str]]) -> Iterator[tuple[float, ...]]:
+    """The numbers of each row."""
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(NAMES):
+            raise ValueError(f"row {number} has {len(row)} of {len(NAMES)} columns")
+        yield tuple(map(float, row))
 
 
 def _dtype(name: str) -> type:

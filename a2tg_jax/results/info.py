@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.appearance import Banded
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, read_json
@@ -21,7 +22,7 @@ def describe_run(run: RunFolder) -> str:
       ValueError: if a file of the run is damaged or of another version.
     """
     record = read_record(run)
-    measured = read_psnrs(run.metrics) if run.metrics.is_file() else {}
+    measured = read_psnrs(run.metrics) if is_regular(run.metrics) else {}
     compared = f", compared with {', '.join(record.compare)}" if record.compare else ""
     names = record.plan.names
     width = max(map(len, names))
@@ -59,7 +60,7 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
 
 
 def _describe_stage(run: RunFolder, name: str, measured: dict[str, float] | None) -> str:
-    if not run.model(name).is_file():
+    if not is_regular(run.model(name)):
         return _progress(run.checkpoints(name))
     model = load_model(run.model(name))
     parts = [f"{model.num:,} Gaussians", f"{model.num_bytes / 1e6:.2f} MB"]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.results.summary import ModelResult
@@ -13,7 +14,7 @@ from a2tg_jax.results.summary import ModelResult
 
 def sha256_of(path: Path) -> str:
     """Of a file's bytes."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

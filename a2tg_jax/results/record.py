@@ -15,7 +15,6 @@ A configuration file says the same or less; what it leaves out has the value tha
 import dataclasses
 import os
 import shlex
-import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +23,8 @@ import tomli_w
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.json_text import check_depth
+from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
+from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.results.folder import RunFolder
@@ -36,6 +36,7 @@ SYNTHETIC = "synthetic"
 SYNTHETIC_SIZE = (208, 156)
 """Small enough for two cores to train on in minutes."""
 DEFAULT_SYSTEM = "a2tg"
+LONGEST_REASON = 500
 OnNan = Literal["stop", "restore"]
 """Training ends with an error, or goes on from the newest checkpoint with the views in another order."""
 
@@ -94,7 +95,7 @@ class RunRecord:
         found = {label_of(self.name): self.system}
         for name in self.compare:
             if label_of(name) in found:
-                raise ValueError(f"compare: two systems of the run would be called {label_of(name)!r}")
+                raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
             found[label_of(name)] = compared_system(name, self.system, self.preset)
         return found
 
@@ -186,12 +187,12 @@ def read_run_file(path: Path) -> RunFile:
       FileNotFoundError: if there is none.
       ValueError: if it is no TOML, or a key is unknown or of another type; key and file are named.
     """
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such configuration file")
+    data = read_regular(path, MOST_TOML_BYTES)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-        check_depth(table)
-    except (ValueError, RecursionError) as error:
+        table = parse_toml(data)
+    except ValueError as error:
         raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
     file = config_from_dict(RunFile, {**config_to_dict(RunFile()), **table}, f"{path}:")
     if file.scene is None or file.scene == SYNTHETIC:
@@ -222,13 +223,20 @@ def read_record(run: RunFolder) -> RunRecord:
     """Reads run.toml. The module of a system of one's own is imported.
 
     Raises:
-      ValueError: if it is damaged, its system is not found, or an option is unknown or of another type; it is named.
+      ValueError: if it is damaged, its system is not found, or an option is unknown, of another type or out of range;
+        it is named.
     """
     file = read_run_file(run.record)
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha)
-    return RunRecord(source, file.system, file.chosen(str(run.record)), file.compare, file.preset, file.on_nan)
+    system = file.chosen(str(run.record))
+    record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan)
+    try:
+        record.check()
+    except ValueError as error:
+        raise ValueError(f"{run.record}: {shortened(str(error), LONGEST_REASON)}") from error
+    return record
 
 
 def repeating_command(run: RunFolder) -> str:

@@ -32,8 +32,7 @@ def set_aside(run: RunFolder) -> None:
     if old_run(run) is None:
         moving = RunFolder(run.path / MOVING)
         names = run.written()
-        for name in names:
-            moving.own(moving.path / name)
+        moving.own_all(names)
         _move(run, moving, names)
         os.replace(moving.path, run.path / OLD)
         flush_folder(run.path)
@@ -65,8 +64,7 @@ def undo_unfinished(run: RunFolder) -> None:
 
 def _put_back(old: RunFolder, run: RunFolder) -> None:
     names = old.written()
-    for name in names:
-        run.own(run.path / name)
+    run.own_all(names)
     _move(old, run, names)
     _delete(old)
 

@@ -11,6 +11,8 @@ from urllib.parse import quote
 import numpy as np
 
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import MOST_TOML_BYTES
+from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
@@ -229,7 +231,7 @@ def _configuration(result: RunResult) -> str:
 def _reproduce(run: RunFolder, result: RunResult) -> str:
     rows = [[name, value] for name, value in versions().items()]
     command = f"pip install a2tg-jax=={versions()['a2tg-jax']}\n{repeating_command(run)}"
-    file = run.record.read_text(encoding="utf-8") if run.record.is_file() else ""
+    file = read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else ""
     folded = f"<details><summary>{run.record.name}</summary><pre>{escape(file)}</pre></details>"
     return f"<pre>{escape(command)}</pre>{folded}{table(['what', 'version'], rows)}"
 

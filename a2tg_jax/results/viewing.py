@@ -14,6 +14,7 @@ from PIL import Image
 
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import Scene, View, view_image
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
@@ -81,7 +82,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     record = read_record(run)
     planned = record.plan[record.plan.main[-1] if name is None else name]
     path = run.model(planned.name)
-    if not path.is_file():
+    if not is_regular(path):
         raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
 
     def load_scene() -> Scene | None:

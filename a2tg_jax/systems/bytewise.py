@@ -11,6 +11,7 @@ from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import Event, iterations_at
+from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
@@ -99,11 +100,16 @@ class Bytewise(System):
     def _growth(self) -> tuple[Event, ...]:
         """Gaussians that fill all bytes. Those that show least go while others grow, and in the end for the details."""
         grow = SplitByGradient(self._num_gaussians())
+        last = (Prune(keep=self._num_kept()),) if self._share else ()
+        return Noise(), grow, *self._pruning(), *last
+
+    def _pruning(self) -> tuple[Event, ...]:
+        """Prunes while others grow; never if the share is 0."""
+        if not self.prune.share:
+            return ()
         num, last_growth = self.stage1_iterations, densify_times(self.stage1_iterations).last_time
         at = tuple(fraction for fraction in self.prune.at if round(fraction * num) < last_growth)
-        prune = (Prune(self.prune.share, at=at),) if self.prune.share and at else ()
-        last = (Prune(keep=self._num_kept()),) if self._share else ()
-        return Noise(), grow, *prune, *last
+        return (Prune(self.prune.share, at=at),) if at else ()
 
     @property
     def _share(self) -> float:
@@ -197,10 +203,10 @@ class Bytewise(System):
             if not self.prune.at or self.prune.at[-1] > LAST_PRUNING:
                 raise ValueError(
                     f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
-                    f"what is pruned; got {self.prune.at}: lower the last, or set prune.share to 0"
+                    f"what is pruned; got {shortened(self.prune.at)}: lower the last, or set prune.share to 0"
                 )
         if len(times) == 2 and times["view_dependence.at"][-1] > times["texture.at"][0]:
             raise ValueError(
                 "view_dependence.at must be over when textures begin to take the rest of the bytes, at "
-                f"texture.at {texture.at}; got {view.at}"
+                f"texture.at {shortened(texture.at)}; got {shortened(view.at)}"
             )

@@ -63,6 +63,34 @@ class History:
         return History(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
 
+class HistoryLog:
+    """A history that grows by rows, each in constant time on average."""
+
+    def __init__(self, history: History):
+        """Args:
+        history: the rows so far; its arrays stay as they are.
+        """
+        self._num = len(history.iteration)
+        self._columns = [np.array(getattr(history, field.name)) for field in dataclasses.fields(History)]
+
+    @property
+    def history(self) -> History:
+        """The rows so far. Later rows do not change it."""
+        return History(*(column[: self._num] for column in self._columns))
+
+    def add(self, *point: float) -> None:
+        """Adds a row, its values in the order of the fields."""
+        if self._num == len(self._columns[0]):
+            self._columns = [np.resize(column, 2 * self._num + FIRST_ROWS) for column in self._columns]
+        for column, value in zip(self._columns, point, strict=True):
+            column[self._num] = value
+        self._num += 1
+
+
+FIRST_ROWS = 16
+"""Rows that an empty log has room for."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Checkpoint:
     """A training run stopped between two iterations."""

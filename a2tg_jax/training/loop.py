@@ -19,7 +19,7 @@ from a2tg_jax.host.memory import keep_room_for_programs, return_free_memory
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
-from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.learning import LearningCheck
@@ -93,12 +93,12 @@ class StageRun:
         self.views, self.system, self.index = scene.train, system, index
         self.stage = system.stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
-        self.history, self.earlier_seconds = History.empty(), 0.0
+        self._logged, self.earlier_seconds = HistoryLog(resume.history if resume else History.empty()), 0.0
         if resume is not None:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
             self.state: TrainState = jax.tree.map(jnp.array, resume.state)
-            self.history, self.earlier_seconds = resume.history, resume.history.last_seconds
+            self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
             # Steps take over the buffers they are given: the caller keeps his own.
             model = padded(jax.tree.map(jnp.array, start.live), self.stage, system)
@@ -117,6 +117,11 @@ class StageRun:
         self.capacities: dict[tuple[int, int], int] = {}
         self.started = time.perf_counter()
         self.num_regrown = self.num_refused = 0
+
+    @property
+    def history(self) -> History:
+        """What has been logged so far."""
+        return self._logged.history
 
     @property
     def seconds(self) -> float:
@@ -265,7 +270,7 @@ class StageRun:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
             model = self.state.model
             num_bytes = model.bytes_of(int(info.num_live))
-            self.history = self.history.with_point(
+            self._logged.add(
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
                 num_bytes / 1e6, self.seconds,
             )  # fmt: skip

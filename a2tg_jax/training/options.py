@@ -6,6 +6,7 @@ import typing
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
@@ -160,7 +161,9 @@ class System:
         """
         presets = cls.presets()
         if name not in presets:
-            raise ValueError(f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {name!r}")
+            raise ValueError(
+                f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {shortened(name)!r}"
+            )
         return presets[name]
 
     @classmethod
@@ -201,8 +204,10 @@ class System:
         """Refuses numbers out of the range of the options that every system has, and whatever is not finite."""
         numbers = flatten_config(self)
         for name, value in numbers.items():
-            if isinstance(value, float) and not math.isfinite(value):
-                raise ValueError(f"{name} must be a finite number; got {value}")
+            held = value if isinstance(value, tuple) else (value,)
+            if not all(math.isfinite(number) for number in held if isinstance(number, float)):
+                wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
+                raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
             if name.startswith(("rates.", "loss.", "corrections.")) and value < 0:
                 raise ValueError(f"{name} must be at least 0; got {value}")
         for name, (least, most) in {**RANGES, **self.ranges}.items():

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
@@ -20,6 +21,9 @@ SYSTEMS = {
 """Where the systems of this library are; each is imported where it is asked for."""
 
 
+LONGEST_REASON = 300
+
+
 def find_system(reference: str) -> System:
     """The system of a name, or of package.module:NAME, with its own defaults; the module is imported.
 
@@ -29,17 +33,21 @@ def find_system(reference: str) -> System:
     path, _, attribute = SYSTEMS.get(reference, reference).partition(":")
     if not attribute:
         raise ValueError(
-            f"there is no system {reference!r}; the systems are {', '.join(SYSTEMS)}, "
+            f"there is no system {shortened(reference)!r}; the systems are {', '.join(SYSTEMS)}, "
             "and your own as package.module:NAME"
         )
     try:
         found = getattr(importlib.import_module(path), attribute)
     except Exception as error:  # A module of one's own may fail in any way.
-        raise ValueError(f"the system {reference!r} cannot be imported: {_told(error)}") from error
+        raise ValueError(
+            f"the system {shortened(reference)!r} cannot be imported: {shortened(_told(error), LONGEST_REASON)}"
+        ) from error
     if isinstance(found, type) and issubclass(found, System):
         return _with_defaults(found, reference)
     if not isinstance(found, System):
-        raise ValueError(f"{reference!r} is no system: it must be a subclass or an instance of a2tg_jax.System")
+        raise ValueError(
+            f"{shortened(reference)!r} is no system: it must be a subclass or an instance of a2tg_jax.System"
+        )
     return found
 
 
@@ -52,7 +60,7 @@ def _with_defaults(kind: type[System], reference: str) -> System:
     try:
         return kind()
     except TypeError as error:
-        raise ValueError(f"every option of the system {reference!r} must have a default: {error}") from error
+        raise ValueError(f"every option of the system {shortened(reference)!r} must have a default: {error}") from error
 
 
 def reference_of(system: System) -> str:
@@ -89,7 +97,9 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
         module, _, attribute = str(name).partition(":")
         kind = getattr(sys.modules.get(module), attribute, None)
     if not (isinstance(kind, type) and issubclass(kind, System)):
-        raise ValueError(f"{where}: is of the system {name!r}, which is not known here: import its module first")
+        raise ValueError(
+            f"{where}: is of the system {shortened(name)!r}, which is not known here: import its module first"
+        )
     return config_from_dict(kind, options, f"{where}: options")
 
 

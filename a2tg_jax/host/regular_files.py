@@ -1,0 +1,64 @@
+"""Files of strangers: only regular ones are opened, and none that is larger than its kind can be.
+
+Links are followed, as their owner makes them on purpose. What they lead to must be a regular file: a device never ends,
+and a pipe waits for someone who writes.
+"""
+
+import os
+import stat
+from io import BufferedReader
+from pathlib import Path
+
+MOST_ARRAY_BYTES = 1 << 34
+"""Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
+
+
+def is_regular(path: str | os.PathLike) -> bool:
+    """Whether there is a regular file; False where there is nothing, or a folder.
+
+    Raises:
+      ValueError: naming the path, if a device, a pipe or a socket is there.
+    """
+    path = Path(path)
+    if path.is_file():
+        return True
+    if not path.exists() or path.is_dir():
+        return False
+    raise ValueError(_refusal(path))
+
+
+def open_regular(path: str | os.PathLike, most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
+    """Opens a regular file for reading bytes.
+
+    Args:
+      path: the file.
+      most_bytes: size above which it is refused.
+
+    Raises:
+      OSError: if it cannot be opened.
+      ValueError: naming the path, if it is not a regular file, or is larger.
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise ValueError(_refusal(path))
+    # It may have been replaced by a pipe meanwhile, for whose writer this does not wait.
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    file = open(os.open(path, flags), "rb")  # noqa: SIM115 - the caller closes it
+    status = os.fstat(file.fileno())
+    if stat.S_ISREG(status.st_mode) and status.st_size <= most_bytes:
+        return file
+    file.close()
+    raise ValueError(_too_large(path, status.st_size, most_bytes) if stat.S_ISREG(status.st_mode) else _refusal(path))
+
+
+def read_regular(path: str | os.PathLike, most_bytes: int) -> bytes:
+    """Reads the bytes of a regular file, up to the size that it has when it is opened. Raises as `open_regular`."""
+    with open_regular(path, most_bytes) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
+
+
+def _refusal(path: str | os.PathLike) -> str:
+    return f"{os.fspath(path)}: is not a regular file but a folder, device, pipe or socket; put a file there"
+
+
+def _too_large(path: str | os.PathLike, size: int, most_bytes: int) -> str:
+    return f"{os.fspath(path)}: has {size:,} bytes, and {most_bytes:,} are the most that such a file may have"
