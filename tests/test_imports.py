@@ -105,14 +105,14 @@ def test_no_modules_import_each_other():
 
 
 def test_mathematics_knows_nothing_of_the_host():
-    """Threads of native loops are the exception."""
+    """Threads of native loops are the exception, and the words of errors."""
     rooms = {"core", "texture", "appearance", "rasterize", "render", "model", "events", "adapt", "mcmc", "densify"}
-    found = {
-        str(path.relative_to(PACKAGE))
-        for path in MODULES
-        if component(path) in rooms and "host" in imported_components(path)
+    own = [path for path in MODULES if component(path) in rooms]
+    found = {dotted(path): {name for name in modules_imported(path) if name.startswith("host.")} for path in own}
+    known = {name: hosts - {"host.text"} for name, hosts in found.items()}
+    assert {name: hosts for name, hosts in known.items() if hosts} == {
+        "rasterize.kernels.native.threads": {"host.cores"}
     }
-    assert found == {"rasterize/kernels/native/threads.py"}
 
 
 def test_adaptation_and_mcmc_know_neither_render_nor_each_other():
