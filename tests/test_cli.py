@@ -270,7 +270,7 @@ def test_xla_accepts_the_flags():
 
 CACHED = """
 import logging, jax
-from a2tg_jax import startup
+from a2tg_jax.host import startup
 before = jax.config.values["jax_logging_level"], logging.getLogger("jax").level
 startup.configure_cpu()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
