@@ -18,7 +18,15 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.markup import image, layers, page, slider, table
 from a2tg_jax.results.record import repeating_command
-from a2tg_jax.results.summary import ModelResult, RunResult, learning_lines, minutes, summary_table, versions
+from a2tg_jax.results.summary import (
+    ModelResult,
+    RunResult,
+    bytes_compared,
+    learning_lines,
+    minutes,
+    summary_table,
+    versions,
+)
 
 SECTIONS = (
     ("summary", "Summary"),
@@ -93,7 +101,8 @@ def _summary(result: RunResult) -> str:
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     others = sum(measured.seconds for measured in result.models.values()) - own
     cards = [(f"{split} PSNR", f"{last.shown.psnr:.2f} dB")]
-    cards += [(f"Gain over {name}", f"{gain:+.2f} dB") for name, gain in result.gains.items()]
+    for name, gain in result.gains.items():
+        cards.append((f"Gain over {name}, {bytes_compared(result, name)}", f"{gain:+.2f} dB"))
     cards += [
         ("SSIM", f"{last.shown.ssim:.4f}"),
         ("Gaussians", f"{last.num_gaussians:,}"),

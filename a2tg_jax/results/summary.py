@@ -22,6 +22,8 @@ FIGURES = (
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
 NUM_QUALITIES = 2 * len(QUALITIES)
 """The first figures, of test and training views."""
+EQUAL_BYTES = 0.01
+"""Largest relative difference of two sizes that are called equal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,8 +174,19 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
         lines.append(f"LPIPS with {result.lpips_network}{kept}")
     lines += budget_lines(result)
     lines += learning_lines(result)
-    lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
+    for name, gain in result.gains.items():
+        lines.append(f"{result.main}: {gain:+.2f} dB over {name}, {bytes_compared(result, name)}")
     return "\n".join(lines)
+
+
+def bytes_compared(result: RunResult, name: str) -> str:
+    """Return the bytes of the main model beside those of another, for the line of its gain."""
+    own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
+    if abs(own - other) <= EQUAL_BYTES * other:
+        return f"at equal bytes ({own / 1e6:.2f} MB)"
+    ratio = own / max(other, 1)
+    times = f"{ratio:.1f}" if ratio >= 1.05 else f"{ratio:.2f}"
+    return f"with {times} times its bytes ({own / 1e6:.2f} MB and {other / 1e6:.2f} MB)"
 
 
 def budget_lines(result: RunResult) -> list[str]:
