@@ -330,7 +330,13 @@ def test_gains_are_over_the_compared_systems():
 
 def test_metrics_hold_means_of_the_views():
     metrics = json.loads(json.dumps(metrics_json(some_result())))
-    assert metrics["models"]["a2tg-textures"]["test"] == {"psnr": 24.0, "ssim": 0.6, "lpips": 0.5, "views": 2}
+    assert metrics["models"]["a2tg-textures"]["test"] == {
+        "psnr": 24.0,
+        "ssim": 0.6,
+        "lpips": 0.5,
+        "flat_psnr": 8.0,
+        "views": 2,
+    }
     assert metrics["lpips_network"] == "alex"
     assert metrics["models"]["a2tg-textures"]["num_bytes"] == 28_000
     assert metrics["gains_db"] == {"gaussians-2d-mcmc-continued": 1.0}
