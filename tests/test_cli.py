@@ -19,7 +19,7 @@ from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import compress as compress_module
+from a2tg_jax.results import compression
 from a2tg_jax.results import train_run as train_run_module
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.record import SceneSource, read_record
@@ -444,7 +444,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
 def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
     """By the run's photographs; and without them, by renders."""
     ladder = {"means": (8, 14), "sh_rest": (3, 8)}
-    monkeypatch.setattr(compress_module, "measure_choices", lambda *a: measure_choices(*a, ladder))
+    monkeypatch.setattr(compression, "measure_choices", lambda *a: measure_choices(*a, ladder))
     run, *_ = tiny_run
     assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
     text = capsys.readouterr().out

@@ -20,7 +20,7 @@ from a2tg_jax.data import run_sfm
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import shortened
-from a2tg_jax.results.compress import compress, compression_text
+from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
