@@ -23,9 +23,9 @@ from a2tg_jax.io.rows import check_kind
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.corrected import refined_views
-from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.record import read_record
+from a2tg_jax.results.run_evaluation import settings_of
 from a2tg_jax.results.summary import aligned
 
 SUFFIX = ".a2tgz"

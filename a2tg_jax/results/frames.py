@@ -14,10 +14,10 @@ from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
+from a2tg_jax.results.run_evaluation import settings_of
 
 Route = Literal["test", "smooth"]
 

@@ -21,10 +21,10 @@ from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
-from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.record import read_record
+from a2tg_jax.results.run_evaluation import settings_of
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, photograph_name
 from a2tg_jax.web.server import Route
 

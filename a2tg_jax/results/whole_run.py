@@ -8,14 +8,14 @@ from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
-from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import RunFolder, check_free, create_run
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
 from a2tg_jax.results.record import RunRecord, read_record, write_record
 from a2tg_jax.results.replacement import drop_old
+from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import RunResult
-from a2tg_jax.results.train_run import train_run
 from a2tg_jax.training.loop import Watch, unwatched
 
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
