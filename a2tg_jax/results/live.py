@@ -22,7 +22,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.results.viewing import Photographs
 from a2tg_jax.training.fit import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
-from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, page
+from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, viewer_html
 from a2tg_jax.web.server import Route, served
 
 SECONDS = 3.0
@@ -66,7 +66,7 @@ class LiveView:
         """What the viewer's server answers."""
         photographs = Photographs(origin_of_scene(self._scene), lambda: self._scene)
         return {
-            "/": Route("text/html; charset=utf-8", page().encode()),
+            "/": Route("text/html; charset=utf-8", viewer_html().encode()),
             f"/{SCENE_NAME}": Route("application/octet-stream", lambda: self._scene_bytes),
             f"/{STATUS_NAME}": Route("application/json", self._status_json),
             "/pause": Route("application/json", self._status_json, act=self._paused.set),

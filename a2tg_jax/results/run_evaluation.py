@@ -38,7 +38,7 @@ from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, comparison_html, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.training import System
-from a2tg_jax.web.page import page_with
+from a2tg_jax.web.page import viewer_html_with
 
 REPORTED_VIEWS = 4
 
@@ -92,7 +92,7 @@ def _write_viewer(run: RunFolder, model: Model, title: str) -> None:
     """The page that shows a model in a browser, where browsers can."""
     if is_viewable(model.appearance):
         with replacing(run.own(run.viewer)) as temporary:
-            temporary.write_text(page_with(encode_web_scene(model, title=title)), encoding="utf-8")
+            temporary.write_text(viewer_html_with(encode_web_scene(model, title=title)), encoding="utf-8")
 
 
 def settings_of(system: System) -> RenderSettings:

@@ -25,7 +25,7 @@ from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
-from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, photograph_name
+from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html
 from a2tg_jax.web.server import Route
 
 QUALITY = 90
@@ -161,7 +161,7 @@ class Photographs:
 def routes_of(source: Source) -> dict[str, Route]:
     """What the viewer's server answers."""
     return {
-        "/": Route("text/html; charset=utf-8", page().encode()),
+        "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
         **Photographs(source.model.origin, source.load_scene).routes,
     }

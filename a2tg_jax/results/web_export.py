@@ -14,7 +14,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.viewing import Photographs, Source, middle_of
-from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, page_with, photograph_name
+from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
 """So many views are measured, evenly chosen."""
@@ -51,7 +51,7 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page that is not the viewer's; choose another folder with --web")
     data = source.encoded
-    files = {out: page_with(data).encode()} if single_file else _files_of(source, out, photographs)
+    files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -66,7 +66,7 @@ def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
         files[out / PHOTOGRAPHS_NAME] = json.dumps(sorted(found.views)).encode()
-    return files | {out / "index.html": page().encode()}
+    return files | {out / "index.html": viewer_html().encode()}
 
 
 def exported_text(result: Exported) -> str:
