@@ -22,7 +22,7 @@ from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import Photographs, Source, open_source, routes_of
+from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import Route, application, served
@@ -211,7 +211,7 @@ def test_point_clouds_are_measured_from_cameras_around_them(tmp_path):
 def test_photographs_are_those_of_the_cameras():
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     origin = origin_of_scene(scene)
-    photographs = Photographs(origin, lambda: scene)
+    photographs = ServedPhotographs(origin, lambda: scene)
     assert sorted(photographs.views) == [0, 1, 2, 3] and photographs.jpeg(9) is None
     found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
     by_name = {view.name: view for view in (*scene.train, *scene.test)}

@@ -1,7 +1,11 @@
-"""Compact scene files, *.a2tgz: a model in few bytes, its numbers rounded to as many bits as are chosen.
+"""Compact scene files, *.a2tgz: a model in few bytes, with a chosen number of bits for each group of numbers.
 
-docs/formats.md describes the file. The rows of a model come back in another order, that of a Z curve through the means,
-with quaternions of unit length; what it shows is the same up to rounding.
+docs/formats.md describes the file. Rows come back in the order of a Z curve through the means, with quaternions of unit
+length; the model shows the same up to rounding.
+
+Files for browsers (`io.web_scene`, *.a2tgw) are another format. This one is smaller: it sorts rows by place, codes each
+group of numbers as a whole with LZMA, zstd or WebP, and restores the model with its appearance, origin and float64
+cameras. It must be read to its end before anything can be drawn, and by decoders that browsers do not offer to pages.
 """
 
 import dataclasses

@@ -19,7 +19,7 @@ from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import Photographs
+from a2tg_jax.results.viewing import ServedPhotographs
 from a2tg_jax.training.fit import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, viewer_html
@@ -64,7 +64,7 @@ class LiveView:
     @property
     def routes(self) -> dict[str, Route]:
         """What the viewer's server answers."""
-        photographs = Photographs(origin_of_scene(self._scene), lambda: self._scene)
+        photographs = ServedPhotographs(origin_of_scene(self._scene), lambda: self._scene)
         return {
             "/": Route("text/html; charset=utf-8", viewer_html().encode()),
             f"/{SCENE_NAME}": Route("application/octet-stream", lambda: self._scene_bytes),

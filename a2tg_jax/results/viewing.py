@@ -108,7 +108,7 @@ def _source_of_ply(path: Path) -> Source:
 # Photographs
 
 
-class Photographs:
+class ServedPhotographs:
     """Those of the cameras that a model knows, as JPEG, read when they are asked for."""
 
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None]):
@@ -163,7 +163,7 @@ def routes_of(source: Source) -> dict[str, Route]:
     return {
         "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
-        **Photographs(source.model.origin, source.load_scene).routes,
+        **ServedPhotographs(source.model.origin, source.load_scene).routes,
     }
 
 

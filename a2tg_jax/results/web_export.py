@@ -13,7 +13,7 @@ from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_o
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import Photographs, Source, middle_of
+from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
@@ -61,7 +61,7 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
     files = {out / SCENE_NAME: source.encoded}
     if photographs:
-        found = Photographs(source.model.origin, source.load_scene)
+        found = ServedPhotographs(source.model.origin, source.load_scene)
         if not found.views:
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
