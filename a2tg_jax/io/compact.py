@@ -5,7 +5,7 @@ length; the model shows the same up to rounding.
 
 Files for browsers (`io.web_scene`, *.a2tgw) are another format. This one is smaller: it sorts rows by place, codes each
 group of numbers as a whole with LZMA, zstd or WebP, and restores the model with its appearance, origin and float64
-cameras. It must be read to its end before anything can be drawn, and by decoders that browsers do not offer to pages.
+cameras. It must be read to its end before anything can be drawn, and browsers have no decoder for LZMA.
 """
 
 import dataclasses
