@@ -33,7 +33,7 @@ TITLES = {
 def measure_corrected(
     model: Model, scene: Scene, plan: RunPlan, settings: RenderSettings, lpips_weights: str | os.PathLike | None
 ) -> dict[str, Evaluation]:
-    """The further figures of a model, by split and way, if any system of its run learns exposures or poses.
+    """Return the further figures of a model, by split and way, if any system of its run learns exposures or poses.
 
     All models of a run are scored alike, those of systems that learn neither included.
     """

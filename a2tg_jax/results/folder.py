@@ -52,7 +52,8 @@ class RunFolder:
         return self.path / ".a2tg-run"
 
     def own(self, path: Path) -> Path:
-        """The path, noted in the marker as one that this program writes: nothing else is ever replaced or deleted."""
+        """Return the path, noted in the marker as one that this program writes: nothing else is ever replaced or
+        deleted."""
         self.own_all([path.relative_to(self.path).as_posix()])
         return path
 
@@ -95,7 +96,7 @@ class RunFolder:
         return [p for p in paths if p != self.marker and _is_file(p) and p.resolve().is_relative_to(root)]
 
     def clear(self) -> None:
-        """Deletes what runs wrote into their folder, and the folders that are empty then. The marker stays, empty."""
+        """Delete what runs wrote into their folder, and the folders that are empty then. The marker stays, empty."""
         for path in self.own_files(self.written()):
             path.unlink(missing_ok=True)
             if path.parent != self.path and not any(path.parent.iterdir()):
@@ -157,17 +158,17 @@ class RunFolder:
         return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
 
     def checkpoints(self, name: str) -> list[Path]:
-        """The checkpoints of a stage, oldest first."""
+        """Return the checkpoints of a stage, oldest first."""
         return self._checkpoints(name, "")
 
     def set_damaged_aside(self, checkpoint: Path) -> Path:
-        """Renames a checkpoint that cannot be read, so that it is not one of the newest any more."""
+        """Rename a checkpoint that cannot be read, so that it is not one of the newest any more."""
         aside = checkpoint.with_name(checkpoint.name + DAMAGED)
         os.replace(checkpoint, self.own(aside))
         return aside
 
     def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
-        """Deletes all checkpoints of a stage but the newest `keep`; where none is kept, damaged ones too."""
+        """Delete all checkpoints of a stage but the newest `keep`; where none is kept, damaged ones too."""
         old = self.checkpoints(name)[: -keep or None]
         for path in old if keep else [*old, *self._checkpoints(name, DAMAGED)]:
             path.unlink()
@@ -183,12 +184,12 @@ class RunFolder:
 
 
 def iteration_of(checkpoint: Path) -> int:
-    """The iteration after which a checkpoint was written."""
+    """Return the iteration after which a checkpoint was written."""
     return int(checkpoint.stem.rpartition("-")[2])
 
 
 def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """Refuses a folder that a new run must not be made in, without touching it.
+    """Refuse a folder that a new run must not be made in, without touching it.
 
     Raises:
       FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a
@@ -210,7 +211,7 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
 
 
 def create_run(path: str | os.PathLike) -> RunFolder:
-    """A new run folder, made with its parents.
+    """Return a new run folder, made with its parents.
 
     Args:
       path: where; an existing folder must be empty, or hold no more than the run.toml of a run that never began.
@@ -226,7 +227,7 @@ def create_run(path: str | os.PathLike) -> RunFolder:
 
 
 def open_run(path: str | os.PathLike) -> RunFolder:
-    """An existing run folder.
+    """Return an existing run folder.
 
     Raises:
       FileNotFoundError: if there is none at `path`.
@@ -238,7 +239,7 @@ def open_run(path: str | os.PathLike) -> RunFolder:
 
 
 def _is_file(path: Path) -> bool:
-    """Whether there is such a file; False for what no file can be called, too."""
+    """Return whether there is such a file; False for what no file can be called, too."""
     try:
         return path.is_file()
     except OSError:
@@ -252,7 +253,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file.
+    """Return the content of a JSON file.
 
     Raises:
       ValueError: if the file is damaged, or too large for one of this program's.

@@ -65,7 +65,7 @@ class RunForecast:
         return max(self.phases.items(), key=lambda item: item[1].total)
 
     def told(self, limit: float) -> str:
-        """Lines for a user."""
+        """Return lines for a user."""
         phase, needed = self.peak
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
         lines = [
@@ -82,7 +82,7 @@ class RunForecast:
         return "\n".join(lines)
 
     def check(self, limit: float) -> None:
-        """Refuses what cannot fit.
+        """Refuse what cannot fit.
 
         Args:
           limit: bytes that may be used.
@@ -121,7 +121,7 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
 
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
-    """Bytes of --max-memory, written as a memory budget is.
+    """Return bytes of --max-memory, written as a memory budget is.
 
     Raises:
       ValueError: if it is not.
@@ -131,7 +131,8 @@ def bytes_allowed(max_memory: float | str | None) -> int | None:
 
 
 def allowed_memory(max_memory: int | None) -> int:
-    """Bytes that a run may use: what is asked for, or what the machine, or its accelerator, has available (host)."""
+    """Return bytes that a run may use: what is asked for, or what the machine, or its accelerator, has available
+    (host)."""
     if max_memory is not None:
         return max_memory
     stats = jax.local_devices()[0].memory_stats() or {}
@@ -139,12 +140,12 @@ def allowed_memory(max_memory: int | None) -> int:
 
 
 def room_for_photographs(max_memory: int | None) -> int | None:
-    """Bytes that the photographs may take where a process may take so many; None as in `load_scene`."""
+    """Return bytes that the photographs may take where a process may take so many; None as in `load_scene`."""
     return None if max_memory is None else int(SHARE_OF_MEMORY * max_memory)
 
 
 def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None) -> None:
-    """Prints what a run will take.
+    """Print what a run will take.
 
     Raises:
       ValueError: if that cannot fit, naming the options to change.

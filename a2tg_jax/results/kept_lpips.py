@@ -19,7 +19,8 @@ def sha256_of(path: Path) -> str:
 
 
 def with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
-    """The figures, with the LPIPS of metrics.json for each model whose file is the one that this was measured on."""
+    """Return the figures, with the LPIPS of metrics.json for each model whose file is the one that this was measured
+    on."""
     try:
         metrics, per_view = read_json(run.metrics), read_json(run.per_view)
         network, models = metrics["lpips_network"], metrics["models"]

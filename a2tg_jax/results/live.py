@@ -93,7 +93,7 @@ class LiveView:
             self._status |= found
 
     def _take(self, run: StageRun) -> None:
-        """Copies the state, and lets a thread make a scene of it."""
+        """Copy the state, and lets a thread make a scene of it."""
         began = self._now()
         origin = origin_of_scene(self._scene, BACKGROUNDS[run.system.background])
         model = dataclasses.replace(jax.device_get(run.state.model), origin=origin)
@@ -115,7 +115,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def shown_live(scene: Scene, title: str, on_start: Callable[[str], None]) -> Iterator[LiveView]:
-    """Serves what is seen of a training meanwhile.
+    """Serve what is seen of a training meanwhile.
 
     Args:
       scene: that is trained on.

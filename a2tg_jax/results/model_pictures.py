@@ -31,7 +31,8 @@ FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 
 
 def learned_textures(model: Model) -> np.ndarray | None:
-    """A sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians' colours.
+    """Return a sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians'
+    colours.
 
     They are those that add most to the picture: by the spread of their texels times the area of the Gaussian.
 
@@ -69,7 +70,7 @@ def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
 
 
 def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
-    """Pictures in rows, each at the top left of its place."""
+    """Return pictures in rows, each at the top left of its place."""
     step = TEXTURE_SIDE + TEXTURE_MARGIN
     rows, columns = -(-len(pictures) // TEXTURES_PER_ROW), min(len(pictures), TEXTURES_PER_ROW)
     sheet = np.zeros((rows * step - TEXTURE_MARGIN, columns * step - TEXTURE_MARGIN, 4), np.uint8)
@@ -101,7 +102,8 @@ def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
 
 
 def flight(model: Model, settings: RenderSettings) -> bytes | None:
-    """An animation (WebP) of a smooth flight past the model's cameras, small and short; None with fewer than two."""
+    """Return an animation (WebP) of a smooth flight past the model's cameras, small and short; None with fewer than
+    two."""
     cameras = [] if model.origin is None else list(model.origin.cameras)
     if len(cameras) < 2:
         return None
@@ -111,7 +113,7 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
 
 
 def _small(camera: Camera) -> Camera:
-    """The camera with pictures of `FLIGHT_SIDE` at most."""
+    """Return the camera with pictures of `FLIGHT_SIDE` at most."""
     scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
     return resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height)))
 

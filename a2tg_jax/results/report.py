@@ -58,7 +58,7 @@ class Comparison:
 
 
 def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) -> None:
-    """Writes report.html from the results, the figures that lie in the run folder already, and some comparisons
+    """Write report.html from the results, the figures that lie in the run folder already, and some comparisons
     (`comparison_html`)."""
     curves = "Loss and PSNR of the training views seen, with running means."
     bodies = {
@@ -84,7 +84,7 @@ def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) 
 
 
 def _system_told(result: RunResult) -> str:
-    """The first line of what the system's author says of it."""
+    """Return the first line of what the system's author says of it."""
     return (inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0]
 
 
@@ -137,14 +137,14 @@ def _corrected_told(measured: ModelResult) -> str:
 
 
 def _main_first(result: RunResult, titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-    """The columns of a table with a title for each model, that of the main one first, where a phone shows it."""
+    """Return the columns of a table with a title for each model, that of the main one first, where a phone shows it."""
     main = titles.index(result.main)
     order = [0, main, *(at for at in range(1, len(titles)) if at != main)]
     return [titles[at] for at in order], [[row[at] for at in order] for row in rows]
 
 
 def _best(row: Sequence[str]) -> list[int]:
-    """The cells of a figure's row that hold its best value; none where it has no best, or all are equal."""
+    """Return the cells of a figure's row that hold its best value; none where it has no best, or all are equal."""
     is_higher = any(word in row[0] for word in HIGHER_IS_BETTER)
     if not is_higher and not any(word in row[0] for word in LOWER_IS_BETTER):
         return []
@@ -155,7 +155,7 @@ def _best(row: Sequence[str]) -> list[int]:
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """The pictures of a view for the report."""
+    """Return the pictures of a view for the report."""
     body = layers([jpeg_uri(image) for image in comparison.images], comparison.captions)
     if comparison.crop is not None:
         crops = [jpeg_uri(comparison.crop.of(image), zoom=CROP_ZOOM) for image in comparison.images]
@@ -227,7 +227,7 @@ def _views(result: RunResult) -> str:
 
 
 def _best_psnr(row: Sequence[str]) -> list[int]:
-    """The cells of a view's row that hold its best PSNR; every second one holds an SSIM."""
+    """Return the cells of a view's row that hold its best PSNR; every second one holds an SSIM."""
     return [2 * at - 1 for at in _best(["PSNR", *row[1::2]])]
 
 

@@ -46,7 +46,7 @@ REPORTED_VIEWS = 4
 def evaluate_run(
     run: RunFolder, scene: Scene | None = None, *, lpips_weights: str | os.PathLike | None = None
 ) -> RunResult:
-    """Measures the finished models of a run and writes what stands in its folder beside models and checkpoints.
+    """Measure the finished models of a run and writes what stands in its folder beside models and checkpoints.
 
     Args:
       run: an opened run folder with one finished stage at least.
@@ -180,7 +180,7 @@ def _renderer(model: Model, scene: Scene, system: System) -> Renderer:
 
 
 def _compare(view: View, renderers: Mapping[str, Renderer], background: Color) -> Comparison:
-    """One view: the photograph, what the main model is to be compared with, the main model."""
+    """Return one view: the photograph, what the main model is to be compared with, the main model."""
     truth = to_uint8(view_image(view, background))
     renders = [to_uint8(renderer(view.camera).color) for renderer in renderers.values()]
     crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None

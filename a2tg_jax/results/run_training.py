@@ -41,7 +41,7 @@ def train_run(
     is_stopped: IsStopped = never,
     watch: Watch = unwatched,
 ) -> None:
-    """Trains every stage that the run's record asks for and that is not finished yet.
+    """Train every stage that the run's record asks for and that is not finished yet.
 
     A stage goes on from its newest checkpoint. When it ends, its history and its model are written, and its checkpoints
     deleted.
@@ -117,7 +117,7 @@ class _Training:
         )
 
     def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:
-        """Keeps the state before the step, and says which order of the views is next.
+        """Keep the state before the step, and says which order of the views is next.
 
         Raises:
           ValueError: if the run is to stop then, or has gone back often enough.
@@ -157,7 +157,8 @@ class _Keeper:
 
 
 def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
-    """The newest checkpoint of a stage that can be read, after a check that it was made with the same numbers so far.
+    """Return the newest checkpoint of a stage that can be read, after a check that it was made with the same numbers so
+    far.
 
     Raises:
       ValueError: if there are some, and none can be read.
@@ -182,14 +183,14 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
 
 
 def _warn_of_machine(path: Path, checkpoint: Checkpoint) -> None:
-    """Says where a run that goes on will not have the bits of one that was left alone."""
+    """Tell where a run that goes on will not have the bits of one that was left alone."""
     told = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
     if told:
         warnings.warn(f"{path.name} was made elsewhere, so last bits will differ: {'; '.join(told)}", stacklevel=3)
 
 
 def _check_model(path: Path, planned: PlannedStage) -> None:
-    """Refuses a finished model that was made with other numbers than are wanted now."""
+    """Refuse a finished model that was made with other numbers than are wanted now."""
     try:
         made = read_archive_header(path, format=FORMAT).get("system")
     except ValueError as error:

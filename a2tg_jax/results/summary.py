@@ -103,7 +103,7 @@ class RunResult:
 
 
 def metrics_json(result: RunResult) -> dict[str, Any]:
-    """The content of metrics.json."""
+    """Return the content of metrics.json."""
     return {
         "scene": result.scene,
         "main": result.main,
@@ -115,7 +115,7 @@ def metrics_json(result: RunResult) -> dict[str, Any]:
 
 
 def per_view_json(result: RunResult) -> dict[str, Any]:
-    """The content of per_view.json: model → train or test → view → metrics."""
+    """Return the content of per_view.json: model → train or test → view → metrics."""
     return {
         name: {
             split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
@@ -152,13 +152,13 @@ def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
 
 
 def _corrected_rows(key: str, found: Sequence[Evaluation | None]) -> list[list[str]]:
-    """The rows of a table for figures up to exposure or pose."""
+    """Return the rows of a table for figures up to exposure or pose."""
     cells = zip(*(_qualities(evaluation) for evaluation in found), strict=True)
     return [[f"{corrected_title(key)}: {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
-    """The headline table for a terminal, and the gains.
+    """Return the headline table for a terminal, and the gains.
 
     Args:
       result: the run.
@@ -201,7 +201,8 @@ def budget_lines(result: RunResult) -> list[str]:
 
 
 def learning_lines(result: RunResult) -> list[str]:
-    """A warning for each finished model that is no better on its training views than one flat colour per view."""
+    """Return a warning for each finished model that is no better on its training views than one flat colour per
+    view."""
     trained = {name: measured.train for name, measured in result.models.items()}
     return [
         f"{name} did not learn: {found.psnr:.1f} dB on its training views, where one flat colour per view reaches "
@@ -222,7 +223,7 @@ def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: i
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
-    """The lines of a table: the first column to the left, the others to the right; no line without a figure."""
+    """Return the lines of a table: the first column to the left, the others to the right; no line without a figure."""
     name_width, *widths = (max(map(len, column)) for column in columns)
     lines = []
     for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
@@ -232,7 +233,7 @@ def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def minutes(seconds: float) -> str:
-    """A duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
+    """Return a duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
     whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60} min"
@@ -262,7 +263,7 @@ def _qualities(found: Evaluation | None) -> list[str]:
 
 
 def _figures(measured: ModelResult) -> list[str]:
-    """One model's column of the headline table; empty where there is no figure."""
+    """Return one model's column of the headline table; empty where there is no figure."""
 
     def megabytes(num_bytes: int) -> str:
         return f"{num_bytes / 1e6:.2f}"

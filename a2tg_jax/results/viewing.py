@@ -129,7 +129,7 @@ class ServedPhotographs:
             return self._views
 
     def jpeg(self, index: int) -> bytes | None:
-        """A photograph over the model's background, of its camera's size."""
+        """Return a photograph over the model's background, of its camera's size."""
         view = self.views.get(index)
         if view is None or self._origin is None:
             return None

@@ -35,7 +35,7 @@ class Exported:
 
 
 def export_web(source: Source, out: Path, *, single_file: bool = False, photographs: bool = False) -> Exported:
-    """Writes a page that shows a model: a folder for any web server, or one file that opens from the disk.
+    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk.
 
     Args:
       source: the model.

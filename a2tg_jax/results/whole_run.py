@@ -36,7 +36,7 @@ def begin_run(
     max_memory: int | None = None,
     watched: Watched = unseen,
 ) -> RunResult:
-    """Trains and measures a new run, once all about it has been checked.
+    """Train and measures a new run, once all about it has been checked.
 
     Args:
       record: what is trained.
@@ -69,7 +69,7 @@ def go_on(
     replaced_by: RunRecord | None = None,
     watched: Watched = unseen,
 ) -> RunResult:
-    """Trains what is not trained yet, and measures. Arguments as of `train_run` and `begin_run`, errors as of
+    """Train what is not trained yet, and measures. Arguments as of `train_run` and `begin_run`, errors as of
     `begin_run`."""
     with _advised(run, is_replacing=replaced_by is not None):
         with signals.noted() as is_stopped, watched(scene) as watch:
