@@ -39,7 +39,7 @@ def save_figure(path: Path, figure: Figure, *, is_transparent: bool = False) -> 
 
 
 def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:
-    """Loss, PSNR, Gaussians and memory over the iterations; where a later stage begins, a dashed line.
+    """Plot loss, PSNR, Gaussians and memory over the iterations, with a dashed line where a later stage begins.
 
     Args:
       histories: of the stages, by name.
@@ -71,7 +71,7 @@ def _thinned(column: np.ndarray) -> np.ndarray:
 
 
 def _plot(axes: Axes, x: np.ndarray, y: np.ndarray, name: str, color: str, *, is_noisy: bool) -> None:
-    """One curve; a noisy one pale, with its running mean over it."""
+    """Plot one curve; a noisy one is pale, with its running mean over it."""
     if is_noisy and len(y) >= 2 * RUNNING_MEANS:
         axes.plot(x, y, color=color, alpha=0.2, linewidth=0.8)
         window = len(y) // RUNNING_MEANS

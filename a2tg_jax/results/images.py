@@ -33,12 +33,12 @@ LONGEST_SIDE = 1280
 
 
 def to_uint8(image) -> np.ndarray:
-    """8-bit pixels of a float image, clipped to [0, 1] and rounded."""
+    """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
     return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
 
 
 def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Absolute difference, brightened ERROR_GAIN times."""
+    """Return the absolute difference, brightened ERROR_GAIN times."""
     difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
     return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
 
@@ -95,7 +95,7 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 
 
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
-    """File names of the views' pictures, no two alike, in capitals or not: folders become part of the name.
+    """Return unique file names of the views' pictures, regardless of case; folders become part of the name.
 
     Where that is another's, as of a/b.png and a_b.jpg, a number follows; names count in their sorted order.
     """
@@ -111,7 +111,7 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
 
 
 def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> None:
-    """Write a PNG, whole or not at all."""
+    """Write a PNG atomically."""
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG", optimize=True)

@@ -16,7 +16,7 @@ SPLITS = ("test", "train")
 
 
 def describe_run(run: RunFolder) -> str:
-    """Return the scene, the systems, how far each stage is, its model, and the metrics where there are any.
+    """Return the scene, the systems, the progress of each stage, its model, and the metrics if there are any.
 
     Raises:
       ValueError: if a file of the run is damaged or of another version.

@@ -51,7 +51,7 @@ class LiveView:
         self._status: dict[str, Any] = {"version": 0, "message": "", "stage": ""}
 
     def __call__(self, run: StageRun, is_stopped: IsStopped) -> float:
-        """Notes figures, takes a snapshot where one is due, and waits while the training is paused."""
+        """Record metrics, take a snapshot when one is due, and wait while the training is paused."""
         self._note(run)
         is_free = self._encoder is None or not self._encoder.is_alive()
         if is_free and (self._now() >= self._due or self._paused.is_set()):

@@ -25,7 +25,7 @@ def page(title: str, body: str, *, style: str, script: str) -> str:
 
 
 def _source(text: str) -> str:
-    """What a content security policy calls an inline style or script."""
+    """Return the name of an inline style or script in a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
@@ -50,7 +50,7 @@ def _cell(text: str, is_best: bool) -> str:
 
 
 def image(uri: str, caption: str, kind: str = "") -> str:
-    """Return a picture with a caption, which is plain text.
+    """Return a picture with a plain-text caption.
 
     Args:
       uri: data: with the picture.
@@ -68,8 +68,7 @@ def layers(uris: Sequence[str], captions: Sequence[str], kind: str = "") -> str:
 
 
 def slider(body: str, captions: Sequence[str]) -> str:
-    """Return `layers` with a slider below, which draws each picture over the one before it; the last is shown at
-    first."""
+    """Return `layers` with a slider below that draws each picture over the one before; the last is shown at first."""
     last = len(captions) - 1
     label = escape(f"from {captions[0]} to {captions[-1]}")
     stops = "".join(

@@ -55,7 +55,7 @@ def learned_textures(model: Model) -> np.ndarray | None:
 
 
 def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """uint8 [h, w, 3] of a texture in its own proportions, on a chequered ground.
+    """Return uint8 [h, w, 3] of a texture in its own proportions, on a chequered ground.
 
     Args:
       texels: [Tv, Tu, 4] RGB residual and alpha factor.
@@ -83,7 +83,7 @@ def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
 
 
 def depth_picture(output: RenderOutput) -> np.ndarray:
-    """uint8 [H, W, 3] of the depth, near bright; black where little or nothing is seen."""
+    """Return uint8 [H, W, 3] of the depth, near bright; black where little or nothing is seen."""
     alpha = np.asarray(output.alpha)
     is_seen = alpha > LEAST_ALPHA
     depth = np.asarray(output.depth) / np.where(is_seen, alpha, 1.0)
@@ -102,8 +102,7 @@ def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
 
 
 def flight(model: Model, settings: RenderSettings) -> bytes | None:
-    """Return an animation (WebP) of a smooth flight past the model's cameras, small and short; None with fewer than
-    two."""
+    """Return a small animation (WebP) of a smooth flight past the model's cameras; None with fewer than two."""
     cameras = [] if model.origin is None else list(model.origin.cameras)
     if len(cameras) < 2:
         return None
@@ -119,7 +118,7 @@ def _small(camera: Camera) -> Camera:
 
 
 def animation(images: Iterable[Array]) -> bytes:
-    """Images [H, W, 3] in [0, 1] as an animated WebP that begins anew at its end."""
+    """Return images [H, W, 3] in [0, 1] as an animated WebP that loops."""
     first, *others = (Image.fromarray(to_uint8(jnp.asarray(image))) for image in images)
     buffer = io.BytesIO()
     duration = round(1000 / FLIGHT_PER_SECOND)

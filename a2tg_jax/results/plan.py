@@ -63,13 +63,13 @@ class RunPlan:
         raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
 
     def first_iteration(self, name: str) -> int:
-        """Return how many iterations lie before a stage, in the stages that it follows."""
+        """Return the number of iterations before a stage, in the stages that it follows."""
         start = self[name].start
         return 0 if start is None else self.first_iteration(start) + self[start].stage.iterations
 
 
 def plan_run(systems: Mapping[str, System]) -> RunPlan:
-    """Return the stages of some systems. Two systems share the stages up to the first in which they differ.
+    """Return the stages of some systems. Two systems share their stages up to the first one that differs.
 
     Args:
       systems: by label, the main one first.
@@ -100,12 +100,12 @@ def _is_same(known: PlannedStage, wanted: PlannedStage) -> bool:
 
 
 def is_same_so_far(made: System, wanted: System, index: int) -> bool:
-    """Return whether two systems train their stages up to `index` alike, however they go on."""
+    """Return whether two systems train their stages up to `index` alike, whatever follows."""
     return all(_trains_alike(made, wanted, at) for at in range(index + 1))
 
 
 def _trains_alike(a: System, b: System, index: int) -> bool:
-    """Return whether a stage of two systems makes the same of the same start, bit for bit."""
+    """Return whether a stage of two systems gives the same model from the same start, bit for bit."""
     return _common_options(a) == _common_options(b) and _is_equal(a.stages()[index], b.stages()[index])
 
 
@@ -159,7 +159,7 @@ def _is_absent(field: dataclasses.Field, value: Any) -> bool:
 
 
 def _name_of(value: Any) -> str:
-    """Module and name of a class or function; of this package the name alone, for its modules move."""
+    """Return the module and name of a class or function; the name alone for this package, whose modules may move."""
     name = getattr(value, "__qualname__", "<nameless>")
     if "<" in name and not isinstance(value, type):
         raise ValueError(f"a stage holds {value!r}: make it a function of a module, which has a name of its own")

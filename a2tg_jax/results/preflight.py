@@ -39,13 +39,13 @@ def check_new_run(
 
 
 def check_weights(lpips_weights: Path | None) -> None:
-    """Raise ValueError or FileNotFoundError unless these are weights of LPIPS, or None."""
+    """Raise ValueError or FileNotFoundError unless these are LPIPS weights, or None."""
     if lpips_weights is not None:
         load_lpips(lpips_weights)
 
 
 def check_apart(out: Path, source: Path) -> None:
-    """Raise ValueError where a folder that is to be written lies in one that is to be read, or that in it."""
+    """Raise ValueError if one of two folders, one to read and one to write, lies in the other."""
     written, read = out.resolve(), source.resolve()
     if written.is_relative_to(read) or read.is_relative_to(written):
         raise ValueError(f"{out} and {source} lie in each other: choose a folder besides it for what is written")
@@ -68,7 +68,7 @@ def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
 
 
 def gaussian_bytes(planned: PlannedStage, scene: Scene) -> int:
-    """Of the Gaussians that the first stage of a system leaves at most."""
+    """Return the largest number of bytes of Gaussians that a system's first stage can leave."""
     system, first = planned.system, planned.system.stages()[0]
     num = initial_number(scene, system)
     num = max([num, *(event.num_rows(num, first.iterations) for event in first.events)])

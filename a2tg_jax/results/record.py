@@ -105,7 +105,7 @@ class RunRecord:
         return plan_run(self.systems)
 
     def check(self) -> None:
-        """Refuse what cannot be trained.
+        """Raise if the run cannot be trained.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
@@ -120,7 +120,7 @@ class RunRecord:
         plan_run(self.systems)
 
     def leaves(self) -> dict[str, Any]:
-        """Return every number by the name of its flag, without the dashes."""
+        """Return every option by the name of its flag, without the dashes."""
         scene = {name: value for name, value in flatten_config(self.scene).items() if name != "path"}
         return {"system": self.name, **scene, **flatten_config(self.system)}
 
@@ -149,12 +149,12 @@ class RunFile:
 
 
 def label_of(name: str) -> str:
-    """What a run calls a system: its name, or the NAME of package.module:NAME."""
+    """Return the label of a system in a run: its name, or NAME of package.module:NAME."""
     return name.rpartition(":")[2].replace(".", "-")
 
 
 def chosen_system(name: str, preset: str | None = None) -> System:
-    """Return a system by name, with the numbers of a preset; those that an instance sets itself have precedence.
+    """Return a system by name, with the options of a preset. Options that an instance sets itself take precedence.
 
     Raises:
       ValueError: if there is no such system or preset.
@@ -164,7 +164,8 @@ def chosen_system(name: str, preset: str | None = None) -> System:
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
-    """Return a system by name, with another's options by name; those that an instance sets itself have precedence.
+    """Return a system by name, with another's options of the same names. Options that an instance sets itself take
+    precedence.
 
     Args:
       name: as `find_system` takes it.
@@ -201,7 +202,7 @@ def read_run_file(path: Path) -> RunFile:
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
-    """Write run.toml: every number, so that it means the same whatever a later version's defaults are."""
+    """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
     start = config_to_dict(chosen_system(record.name, record.preset))
     table = {
         "scene": record.scene.path,
@@ -220,7 +221,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
 
 
 def read_record(run: RunFolder) -> RunRecord:
-    """Read run.toml. The module of a system of one's own is imported.
+    """Read run.toml. If the system is a user's own, its module is imported.
 
     Raises:
       ValueError: if it is damaged, its system is not found, or an option is unknown, of another type or out of range;
@@ -245,13 +246,13 @@ def repeating_command(run: RunFolder) -> str:
 
 
 def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
-    """Return names of the numbers in which one record differs from another of the same scene."""
+    """Return the names of the options in which two records of the same scene differ."""
     before = kept.leaves()
     return [name for name, value in asked.leaves().items() if name not in before or value != before[name]]
 
 
 def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no None: such a key is left out, or is "None", as on the command line, where `start` says otherwise."""
+    """Leave out None, which TOML lacks, or write "None", as on the command line, if `start` has another value."""
     told: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, dict):

@@ -18,7 +18,7 @@ MOVING = f"{OLD}.partial"
 
 
 def old_run(run: RunFolder) -> RunFolder | None:
-    """Return the run that this one is about to replace, if there is one."""
+    """Return the run that this one is about to replace, or None."""
     old = RunFolder(run.path / OLD)
     return old if old.path.is_dir() else None
 
@@ -78,7 +78,7 @@ def _delete(old: RunFolder) -> None:
 
 
 def _move(source: RunFolder, target: RunFolder, names: list[str]) -> None:
-    """Move those files that are there; folders that are empty then go."""
+    """Move the files that exist, and remove folders left empty."""
     for path in source.own_files(names):
         moved = target.path / path.relative_to(source.path)
         moved.parent.mkdir(parents=True, exist_ok=True)

@@ -126,7 +126,7 @@ def per_view_json(result: RunResult) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the figures depend on, and the devices."""
+    """Return the versions that the metrics depend on, and the devices."""
     device = jax.devices()[0]
     return {
         "a2tg-jax": version("a2tg-jax"),
@@ -139,7 +139,7 @@ def versions() -> dict[str, str]:
 
 
 def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
-    """Titles and rows of the headline table: a column for each model, a row for each figure that there is."""
+    """Return titles and rows of the headline table: a column for each model, a row for each metric present."""
     models = result.models.values()
     columns = [_figures(measured) for measured in models]
     rows = [[name, *cells] for name, *cells in zip(FIGURES, *columns, strict=True)]
@@ -158,7 +158,7 @@ def _corrected_rows(key: str, found: Sequence[Evaluation | None]) -> list[list[s
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
-    """Return the headline table for a terminal, and the gains.
+    """Return the headline table for a terminal, followed by warnings and gains.
 
     Args:
       result: the run.
@@ -190,7 +190,7 @@ def bytes_compared(result: RunResult, name: str) -> str:
 
 
 def budget_lines(result: RunResult) -> list[str]:
-    """What each finished model of a system with a memory budget takes of it."""
+    """Return how much of its memory budget each finished model takes."""
     lines = []
     for name in dict.fromkeys(chain[-1] for chain in result.plan.chains.values()):
         budget = result.plan[name].system.budget_bytes
@@ -201,8 +201,7 @@ def budget_lines(result: RunResult) -> list[str]:
 
 
 def learning_lines(result: RunResult) -> list[str]:
-    """Return a warning for each finished model that is no better on its training views than one flat colour per
-    view."""
+    """Return a warning for each finished model that does not beat one flat colour per view on its training views."""
     trained = {name: measured.train for name, measured in result.models.items()}
     return [
         f"{name} did not learn: {found.psnr:.1f} dB on its training views, where one flat colour per view reaches "
@@ -213,7 +212,7 @@ def learning_lines(result: RunResult) -> list[str]:
 
 
 def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: int) -> list[list[tuple[str, ...]]]:
-    """Columns in groups, each of which fits beside the names; one column at least."""
+    """Group columns so that each group, of at least one column, fits beside the names."""
     blocks: list[list[tuple[str, ...]]] = [[]]
     for column in columns:
         if blocks[-1] and max(map(len, aligned([names, *blocks[-1], column]))) > width:
@@ -223,7 +222,7 @@ def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: i
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the lines of a table: the first column to the left, the others to the right; no line without a figure."""
+    """Return the lines of a table: first column left-aligned, the others right-aligned; empty rows are left out."""
     name_width, *widths = (max(map(len, column)) for column in columns)
     lines = []
     for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
@@ -256,7 +255,7 @@ def _model_json(measured: ModelResult) -> dict[str, Any]:
 
 
 def _qualities(found: Evaluation | None) -> list[str]:
-    """PSNR, SSIM and LPIPS; empty where there is no figure."""
+    """Return PSNR, SSIM and LPIPS; empty for a missing metric."""
     if found is None:
         return ["", "", ""]
     return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]

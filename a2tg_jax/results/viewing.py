@@ -58,7 +58,7 @@ class Source:
 
 
 def open_source(path: Path, name: str | None = None) -> Source:
-    """What a path leads to.
+    """Open a run folder or a file for viewing.
 
     Args:
       path: a run folder; or a model, *.npz or *.a2tgz; or Gaussians, *.ply.
@@ -159,7 +159,7 @@ class ServedPhotographs:
 
 
 def routes_of(source: Source) -> dict[str, Route]:
-    """What the viewer's server answers."""
+    """Return the routes of the viewer's server."""
     return {
         "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
@@ -168,7 +168,7 @@ def routes_of(source: Source) -> dict[str, Route]:
 
 
 def middle_of(model: Model) -> tuple[np.ndarray, float]:
-    """Where most means lie: [3], and the radius that holds three quarters."""
+    """Return the centre [3] of most means, and the radius that holds three quarters of them."""
     means = np.asarray(model.live.gaussians.means, np.float64)
     centre = np.median(means, axis=0)
     return centre, float(max(np.quantile(np.linalg.norm(means - centre, axis=1), 0.75), 1e-6))

@@ -70,7 +70,7 @@ def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]
 
 
 def exported_text(result: Exported) -> str:
-    """What was written, how large it is, and what it loses."""
+    """Return a summary of the files written, their size and their loss."""
     model, size = result.model, result.num_bytes
     lines = [f"{model.num:,} Gaussians, {model.num_bytes:,} bytes of numbers, {size:,} in the scene's file: "
              f"1/{model.num_bytes / max(size, 1):.1f}"]  # fmt: skip
@@ -79,7 +79,7 @@ def exported_text(result: Exported) -> str:
 
 
 def _losses_of(source: Source) -> dict[str, float]:
-    """What the file loses: on photographs where there are some, else beside renders."""
+    """Return the loss of the file: on photographs if there are any, otherwise beside renders."""
     if not source.model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
@@ -97,7 +97,7 @@ def _losses_of(source: Source) -> dict[str, float]:
 
 
 def _ring(model: Model) -> list[Camera]:
-    """Cameras around a model that knows none, which look at its middle."""
+    """Return cameras around the middle of a model that has none."""
     centre, radius = middle_of(model)
     width, height = RING_SIZE
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])

@@ -12,12 +12,12 @@ STATUS_NAME = "training.json"
 
 
 def viewer_html() -> str:
-    """Return the page, which shows the scene that lies beside it."""
+    """Return the viewer's page, which shows the scene beside it."""
     return resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
 
 
 def viewer_html_with(scene: bytes) -> str:
-    """Return the page with a scene in it: it needs no other file."""
+    """Return the viewer's page with a scene in it; it needs no other file."""
     before, end, after = viewer_html().rpartition("</body>")
     data = base64.b64encode(scene).decode("ascii")
     # Text that no browser runs, so that the page's policy needs to allow nothing more; it stands before the script.
@@ -26,5 +26,5 @@ def viewer_html_with(scene: bytes) -> str:
 
 
 def photograph_name(index: int) -> str:
-    """Where the photograph of a camera lies."""
+    """Return the path of a camera's photograph."""
     return f"photographs/{index}.jpg"
