@@ -19,8 +19,7 @@ from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import compress as compress_module
-from a2tg_jax.results import train_run as train_run_module
+from a2tg_jax.results import compression, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.record import SceneSource, read_record
 from a2tg_jax.results.viewing import open_source, routes_of
@@ -44,7 +43,7 @@ def tiny_run(tmp_path_factory):
     """A run interrupted after the first checkpoint of its textures and resumed, with both exit codes."""
     out = tmp_path_factory.mktemp("cli") / "run"
     arguments = ["train", "synthetic", "--out", str(out)]
-    save = train_run_module.save_checkpoint
+    save = run_training.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
         save(path, checkpoint)
@@ -53,7 +52,7 @@ def tiny_run(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "configure_cpu", lambda: None)
-        patch.setattr(train_run_module, "save_checkpoint", save_and_interrupt)
+        patch.setattr(run_training, "save_checkpoint", save_and_interrupt)
         interrupted = cli.main([*arguments, *TINY])
         patch.undo()
         patch.setattr(cli, "configure_cpu", lambda: None)
@@ -270,7 +269,7 @@ def test_xla_accepts_the_flags():
 
 CACHED = """
 import logging, jax
-from a2tg_jax import startup
+from a2tg_jax.host import startup
 before = jax.config.values["jax_logging_level"], logging.getLogger("jax").level
 startup.configure_cpu()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -335,7 +334,7 @@ def test_interrupted_run_says_how_to_go_on(tiny_run, tmp_path, monkeypatch, caps
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train_run_module, "fit_stage", interrupt)
+    monkeypatch.setattr(run_training, "fit_stage", interrupt)
     assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 130
     error = capsys.readouterr().err
     assert f"a2tg-textures.npz; go on with: a2tg train --out {copy.path} --resume" in error
@@ -444,7 +443,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
 def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
     """By the run's photographs; and without them, by renders."""
     ladder = {"means": (8, 14), "sh_rest": (3, 8)}
-    monkeypatch.setattr(compress_module, "measure_choices", lambda *a: measure_choices(*a, ladder))
+    monkeypatch.setattr(compression, "measure_choices", lambda *a: measure_choices(*a, ladder))
     run, *_ = tiny_run
     assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
     text = capsys.readouterr().out

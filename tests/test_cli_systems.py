@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.results import train_run as train_run_module
+from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import RunFolder
 
 TOY = Path(__file__).with_name("toy_system.py")
@@ -23,7 +23,7 @@ def folder(tmp_path_factory):
     """A folder with a system in my_toy.py, and a run that was interrupted at its first checkpoint and resumed."""
     folder = tmp_path_factory.mktemp("mine")
     shutil.copy(TOY, folder / "my_toy.py")
-    save = train_run_module.save_checkpoint
+    save = run_training.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
         save(path, checkpoint)
@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
         patch.setattr(sys, "path", list(sys.path))
         patch.setattr(cli, "configure_cpu", lambda: None)
         with pytest.MonkeyPatch.context() as interrupting:
-            interrupting.setattr(train_run_module, "save_checkpoint", save_and_interrupt)
+            interrupting.setattr(run_training, "save_checkpoint", save_and_interrupt)
             sizes = ["--downscale", "6", "--initial-gaussians", "60", "--stage1-iterations", "10"]
             codes = [cli.main(["train", "synthetic", *MINE, "--out", "run", *sizes, "--contrast-weight", "0.2"])]
         shutil.copytree("run", "interrupted")

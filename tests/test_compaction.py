@@ -17,7 +17,7 @@ from a2tg_jax.io.compact import CompactChoices, encode_model, load_compact
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.results import compress as compress_module
+from a2tg_jax.results import compression
 
 SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
 SMALL = {"means": (4, 8, 16), "opacities": (2, 10), "sh_0": (3, 8), "sh_rest": (3, 8), "texels": (3, 8)}
@@ -92,7 +92,7 @@ def test_greed_takes_what_saves_most_for_its_loss_and_stays_within():
 
 
 def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(compress_module, "measure_choices", lambda *a: measure_choices(*a, SMALL))
+    monkeypatch.setattr(compression, "measure_choices", lambda *a: measure_choices(*a, SMALL))
     save_model(tmp_path / "scene.npz", a_model())
     assert cli.main(["compress", str(tmp_path / "scene.npz"), "--max-loss", "0.3"]) == 0
     text = capsys.readouterr().out

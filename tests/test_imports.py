@@ -142,6 +142,58 @@ assert not xla_bridge._backends, "a device was started"
     assert done.returncode == 0, done.stderr
 
 
+HEAVY = {"PIL", "matplotlib", "pycolmap", "scipy.ndimage", "skimage"}
+
+
+@pytest.mark.parametrize(
+    ("module", "unwanted"),
+    [("a2tg_jax", HEAVY | {"scipy", "jaxopt", "llvmlite"}), ("a2tg_jax.model", HEAVY), ("a2tg_jax.data", HEAVY)],
+)
+def test_import_loads_no_more_than_it_needs(module, unwanted):
+    """Neither readers of photographs and COLMAP models nor libraries for pictures."""
+    script = f"import sys, {module}; found = {unwanted} & sys.modules.keys(); assert not found, found"
+    script += (
+        "\nloaded = {name for name in sys.modules if name.startswith('a2tg_jax.data.')}; assert not loaded, loaded"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("path", [PACKAGE / "__init__.py", PACKAGE / "data" / "__init__.py"], ids=["top", "data"])
+def test_lazy_names_are_those_that_type_checkers_see(path):
+    """Each from the same module, under its own name, and no other is public."""
+    name = ".".join(path.parent.relative_to(PACKAGE.parent).parts)
+    module = importlib.import_module(name)
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If) and isinstance(node.body[0], ast.ImportFrom)]
+    seen = {}
+    for node in block.body:
+        assert isinstance(node, ast.ImportFrom)
+        for alias in node.names:
+            assert alias.asname == alias.name
+            seen[alias.name] = node.module
+    assert seen == module._MODULE_OF
+    assert module.__all__ == sorted(seen) and set(seen) <= set(dir(module))
+    for public, home in seen.items():
+        assert getattr(module, public) is getattr(importlib.import_module(home), public)
+    with pytest.raises(AttributeError, match="has no attribute 'no_such_name'"):
+        _ = module.no_such_name
+
+
+def test_public_names_in_a_fresh_process():
+    """A star import, a function beside a module of its name, and modules as attributes."""
+    script = """
+import a2tg_jax
+from a2tg_jax.training import fit as function
+assert callable(a2tg_jax.fit) and a2tg_jax.fit is function
+assert a2tg_jax.adapt.Upscale is a2tg_jax.Upscale and a2tg_jax.data.load_scene is a2tg_jax.load_scene
+from a2tg_jax import *
+assert fit is function and Model is a2tg_jax.model.Model
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_first_function_of_a_process_is_traced_once():
     """Nothing that rendering imports on its first use changes the key of what is compiled."""
     script = """

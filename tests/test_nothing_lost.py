@@ -21,16 +21,15 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.machine import this_machine
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.results import evaluate_run, whole_run
 from a2tg_jax.results import preflight as checks
-from a2tg_jax.results import train_run as train_run_module
+from a2tg_jax.results import run_evaluation, run_training, whole_run
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.lock import claimed, opened
 from a2tg_jax.results.preflight import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.replacement import OLD, old_run, set_aside, undo_unfinished
-from a2tg_jax.results.train_run import MOST_RESTORED, train_run
+from a2tg_jax.results.run_training import MOST_RESTORED, train_run
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import DivergedError, find_system, load_checkpoint, save_checkpoint
@@ -160,7 +159,7 @@ def test_a_run_without_a_checkpoint_replaces_nothing(tmp_path, monkeypatch, caps
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(train_run_module, "fit_stage", fail)
+    monkeypatch.setattr(run_training, "fit_stage", fail)
     assert cli.main([*TRAIN, "--out", str(run.path), "--overwrite"]) in (2, 130)
     assert files_of(run) == before
     assert f"the run that was in {run.path} is untouched" in capsys.readouterr().err
@@ -168,7 +167,7 @@ def test_a_run_without_a_checkpoint_replaces_nothing(tmp_path, monkeypatch, caps
 
 def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, monkeypatch, capsys):
     run = filled(tmp_path / "run")
-    save = train_run_module.save_checkpoint
+    save = run_training.save_checkpoint
 
     def save_and_stop(path, checkpoint):
         save(path, checkpoint)
@@ -176,7 +175,7 @@ def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, 
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(train_run_module, "save_checkpoint", save_and_stop)
+        patch.setattr(run_training, "save_checkpoint", save_and_stop)
         assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
     assert f"{NAME}-0000000004.npz; go on with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
     kept = old_run(run)
@@ -238,7 +237,7 @@ def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
 def stopped(scene, tmp_path_factory):
     """A run with two checkpoints, stopped at iteration 8, and what it would have become."""
     folder = tmp_path_factory.mktemp("stopped")
-    save = train_run_module.save_checkpoint
+    save = run_training.save_checkpoint
 
     def save_and_stop(path, checkpoint):
         save(path, checkpoint)
@@ -249,7 +248,7 @@ def stopped(scene, tmp_path_factory):
         run = create_run(folder / name)
         write_record(run, RECORD)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(train_run_module, "save_checkpoint", function)
+            patch.setattr(run_training, "save_checkpoint", function)
             with contextlib.suppress(KeyboardInterrupt):
                 train_run(run, scene, progress=False)
     return RunFolder(folder / "run"), load_model(RunFolder(folder / "whole").model(NAME))
@@ -294,7 +293,7 @@ def test_other_threads_are_said(scene, stopped, tmp_path, monkeypatch):
 def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, monkeypatch):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     train_run(run, scene, progress=False)
-    evaluate_run.evaluate_run(run, scene)
+    run_evaluation.evaluate_run(run, scene)
     metrics, per_view = (json.loads(path.read_text()) for path in (run.metrics, run.per_view))
     assert metrics["models"][NAME]["sha256"] == sha256_of(run.model(NAME))
     metrics["lpips_network"] = "alex"
@@ -303,12 +302,12 @@ def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, m
             view["lpips"] = 0.25
     run.metrics.write_text(json.dumps(metrics))
     run.per_view.write_text(json.dumps(per_view))
-    result = evaluate_run.evaluate_run(run, scene)
+    result = run_evaluation.evaluate_run(run, scene)
     assert result.models[NAME].test.lpips == 0.25 and result.is_lpips_kept and result.lpips_network == "alex"
     assert json.loads(run.metrics.read_text())["models"][NAME]["test"]["lpips"] == 0.25
     with open(run.model(NAME), "ab") as file:
         file.write(b"\0")
-    assert evaluate_run.evaluate_run(run, scene).lpips_network is None
+    assert run_evaluation.evaluate_run(run, scene).lpips_network is None
 
 
 # Divergence
@@ -395,7 +394,7 @@ def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, 
 
     with monkeypatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr(train_run_module, "save_checkpoint", save_and_stop)
+        patch.setattr(run_training, "save_checkpoint", save_and_stop)
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 train_run(other, scene, progress=False)
@@ -475,7 +474,7 @@ def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
     def full(path, checkpoint):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(train_run_module, "save_checkpoint", full)
+    monkeypatch.setattr(run_training, "save_checkpoint", full)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "No space left on device; there is no checkpoint yet; go on with: a2tg train" in error

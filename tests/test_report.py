@@ -81,6 +81,8 @@ def test_the_main_model_comes_first_and_the_best_of_each_figure_is_marked(report
 
 def test_the_models_own_training_time_stands_apart(report):
     cards = dict(re.findall(r'<div class="card">([^<]*)<b>([^<]*)</b>', report))
+    gain = "Gain over gaussians-2d-mcmc-continued, with 1.2 times its bytes (0.03 MB and 0.02 MB)"
+    assert cards[gain] == "+1.00 dB"
     assert cards["Training"] == "2 min 4 s" and cards["Comparisons&#x27; training"] == "1 min 2 s"
 
 

@@ -32,7 +32,15 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.replacement import OLD, drop_old, set_aside
-from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, minutes, per_view_json, summary_text
+from a2tg_jax.results.summary import (
+    ModelResult,
+    RunResult,
+    bytes_compared,
+    metrics_json,
+    minutes,
+    per_view_json,
+    summary_text,
+)
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.bbsplat import BBSplat
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
@@ -322,7 +330,13 @@ def test_gains_are_over_the_compared_systems():
 
 def test_metrics_hold_means_of_the_views():
     metrics = json.loads(json.dumps(metrics_json(some_result())))
-    assert metrics["models"]["a2tg-textures"]["test"] == {"psnr": 24.0, "ssim": 0.6, "lpips": 0.5, "views": 2}
+    assert metrics["models"]["a2tg-textures"]["test"] == {
+        "psnr": 24.0,
+        "ssim": 0.6,
+        "lpips": 0.5,
+        "flat_psnr": 8.0,
+        "views": 2,
+    }
     assert metrics["lpips_network"] == "alex"
     assert metrics["models"]["a2tg-textures"]["num_bytes"] == 28_000
     assert metrics["gains_db"] == {"gaussians-2d-mcmc-continued": 1.0}
@@ -333,7 +347,32 @@ def test_summary_has_a_column_for_each_model():
     lines = summary_text(some_result(), 80).splitlines()
     assert re.split(r"\s{2,}", lines[0])[1:] == NAMES
     assert lines[1].split() == ["test", "PSNR", "(dB)", "21.00", "24.00", "23.00"]
-    assert lines[-1] == "a2tg-textures gains +1.00 dB over gaussians-2d-mcmc-continued"
+    compared = "with 1.2 times its bytes (0.03 MB and 0.02 MB)"
+    assert lines[-1] == f"a2tg-textures: +1.00 dB over gaussians-2d-mcmc-continued, {compared}"
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "expected"),
+    [
+        (330_000, 220_000, "with 1.5 times its bytes (0.33 MB and 0.22 MB)"),
+        (500_000, 1_000_000, "with 0.50 times its bytes (0.50 MB and 1.00 MB)"),
+        (1_020_000, 1_000_000, "with 1.02 times its bytes (1.02 MB and 1.00 MB)"),
+        (1_010_000, 1_000_000, "at equal bytes (1.01 MB)"),
+        (990_000, 1_000_000, "at equal bytes (0.99 MB)"),
+        (0, 0, "at equal bytes (0.00 MB)"),
+    ],
+)
+def test_gains_name_the_bytes_that_they_cost(own, other, expected):
+    result = some_result()
+    sizes = {"a2tg-textures": own, "gaussians-2d-mcmc-continued": other}
+    models = {
+        name: dataclasses.replace(measured, num_bytes=sizes.get(name, 1)) for name, measured in result.models.items()
+    }
+    result = dataclasses.replace(result, models=models)
+    assert bytes_compared(result, "gaussians-2d-mcmc-continued") == expected
+    assert (
+        summary_text(result).splitlines()[-1] == f"a2tg-textures: +1.00 dB over gaussians-2d-mcmc-continued, {expected}"
+    )
 
 
 def test_summary_fits_the_terminal():

@@ -22,9 +22,9 @@ from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import Photographs, Source, open_source, routes_of
+from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
-from a2tg_jax.web.page import page, page_with
+from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import Route, application, served
 
 
@@ -109,7 +109,7 @@ def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys
 
 
 def test_the_policy_allows_the_page_its_own_script_and_style_and_nothing_else():
-    text = page()
+    text = viewer_html()
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)
     assert policy is not None and "default-src 'none'" in policy[1] and "unsafe" not in policy[1]
 
@@ -124,8 +124,8 @@ def test_the_policy_allows_the_page_its_own_script_and_style_and_nothing_else():
 
 
 def test_a_page_holds_a_scene():
-    text = page_with(b"\x00<script>\xff")
-    assert text.count("<script") == page().count("<script") + 1
+    text = viewer_html_with(b"\x00<script>\xff")
+    assert text.count("<script") == viewer_html().count("<script") + 1
     data = re.search(r'<script type="text/plain" id="scene-data">([A-Za-z0-9+/=]*)</script>', text)
     assert data is not None and base64.b64decode(data[1]) == b"\x00<script>\xff"
 
@@ -183,12 +183,12 @@ def test_a_model_that_knows_no_scene_has_no_photographs():
 def test_a_folder_and_a_single_file(tmp_path):
     source = Source(textured(), "a")
     result = export_web(source, tmp_path / "site")
-    assert result.path == tmp_path / "site" / "index.html" and result.path.read_text(encoding="utf-8") == page()
+    assert result.path == tmp_path / "site" / "index.html" and result.path.read_text(encoding="utf-8") == viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
     assert len(scene) == result.num_bytes and decode_web_scene(scene).model.num == source.model.num
     assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in exported_text(result)
     one = export_web(source, tmp_path / "one.html", single_file=True)
-    assert one.path.read_text(encoding="utf-8") == page_with(scene)
+    assert one.path.read_text(encoding="utf-8") == viewer_html_with(scene)
     with pytest.raises(ValueError, match="no photographs"):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out --single-file"):
@@ -211,7 +211,7 @@ def test_point_clouds_are_measured_from_cameras_around_them(tmp_path):
 def test_photographs_are_those_of_the_cameras():
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     origin = origin_of_scene(scene)
-    photographs = Photographs(origin, lambda: scene)
+    photographs = ServedPhotographs(origin, lambda: scene)
     assert sorted(photographs.views) == [0, 1, 2, 3] and photographs.jpeg(9) is None
     found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
     by_name = {view.name: view for view in (*scene.train, *scene.test)}

@@ -17,7 +17,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.io.ply import ATTRIBUTES, SCALES
 from a2tg_jax.results.viewing import Source, open_source
 from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.web.page import page
+from a2tg_jax.web.page import viewer_html
 
 WEB = Path(__file__).resolve().parents[1] / "web"
 CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome")
@@ -88,7 +88,7 @@ def node():
 def test_the_page_is_what_the_sources_build(node, tmp_path):
     run_node("build", "--", "--outDir", str(tmp_path), "--emptyOutDir")
     built = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert built == page(), "the sources give another page: .ci/web --write"
+    assert built == viewer_html(), "the sources give another page: .ci/web --write"
 
 
 def test_the_page_shows_what_the_renderer_shows(node, tmp_path):

@@ -1,4 +1,4 @@
-"""Arguments of a command line as a dataclass, by tyro; whatever is wrong with them becomes one line."""
+"""Command-line arguments parsed into a dataclass by tyro, with every error on one line."""
 
 import contextlib
 import io
@@ -10,17 +10,17 @@ from typing import Any
 import tyro
 
 WIDE = "1000"
-"""Columns in which no line of an error is broken."""
+"""Terminal width at which no error message is wrapped."""
 
 
 def parse(kind: type, program: str, arguments: Sequence[str], **options: Any) -> Any:
-    """What the arguments say, an instance of `kind`. Help is printed, and ends in SystemExit.
+    """Parse arguments into an instance of `kind`. Help is printed and ends in SystemExit.
 
     Args:
       kind: a dataclass.
-      program: what the help calls the command.
+      program: name of the command in the help.
       arguments: without the command's name.
-      options: of `tyro.cli`.
+      options: further arguments of `tyro.cli`.
 
     Raises:
       ValueError: if an argument is missing, unknown or of another type.
@@ -33,11 +33,11 @@ def parse(kind: type, program: str, arguments: Sequence[str], **options: Any) ->
     except SystemExit as end:
         if not end.code:
             raise
-        raise ValueError(f"{one_line(errors.getvalue())} ({program} --help tells what there is)") from None
+        raise ValueError(f"{one_line(errors.getvalue())} (see {program} --help)") from None
 
 
 def one_line(box: str) -> str:
-    """What an error of tyro's says first, and the names that it suggests; without title, frame and colours."""
+    """Return the first message of a tyro error and the flags it suggests, without title, frame and colours."""
     lines = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╰╮╯ ") for line in box.splitlines()]
     parts: list[list[str]] = [[]]
     for line in [line for line in lines if line][1:]:
@@ -54,7 +54,7 @@ def one_line(box: str) -> str:
 
 @contextlib.contextmanager
 def _columns(width: str) -> Iterator[None]:
-    """The environment says a width of the terminal for a while."""
+    """Set the terminal width in the environment for the duration of the block."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = width
     try:

@@ -20,7 +20,7 @@ from a2tg_jax.data import run_sfm
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import shortened
-from a2tg_jax.results.compress import compress, compression_text
+from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
@@ -36,24 +36,26 @@ OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
-  a2tg demo                            a whole run on a built-in scene, about a minute on two cores
-  a2tg sfm photos/ scene/              camera poses for plain photographs, by COLMAP
-  a2tg train scene/ --out runs/scene   train a scene, evaluate, write a report
-  a2tg eval runs/scene                 measure a run again
-  a2tg render runs/scene               frames and a video of a flight, or the test views
-  a2tg view runs/scene                 look at it in a browser; also *.npz, *.a2tgz and *.ply
-  a2tg export runs/scene --web out/    the same for a web server, or as one HTML file
-  a2tg compress runs/scene             a small file of the model that it left
-  a2tg info runs/scene                 what a run folder holds
+  a2tg demo                            train a built-in scene, about a minute on two cores
+  a2tg sfm photos/ scene/              find camera poses for plain photographs with COLMAP
+  a2tg train scene/ --out runs/scene   train a scene, evaluate it, write a report
+  a2tg eval runs/scene                 evaluate a run again
+  a2tg render runs/scene               render frames and a video of a flight, or the test views
+  a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
+  a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
+  a2tg compress runs/scene             write a small file of the trained model
+  a2tg info runs/scene                 print what a run folder holds
 
-a2tg COMMAND --help explains a command, a2tg train --system NAME --help the options of a system; a2tg --version tells
-the version. The systems: {", ".join(SYSTEMS)}.
-With A2TG_DEBUG=1 in the environment an error shows its traceback."""
+Run a2tg COMMAND --help for a command, a2tg train --system NAME --help for the options of a system, and
+a2tg --version for the version. The systems: {", ".join(SYSTEMS)}.
+Set A2TG_DEBUG=1 to see the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Eval:
-    """Measure the finished stages of a run again and rewrite metrics, pictures and report.
+    """Evaluate the finished stages of a run again.
+
+    Rewrites metrics, pictures and report.
 
     Example:
       a2tg eval runs/fox --lpips-weights lpips_alex.npz
@@ -62,8 +64,8 @@ class Eval:
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
     lpips_weights: Path | None = None
-    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it, what stands in metrics.json of the same models is
-    kept."""
+    """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, the LPIPS in metrics.json is kept if the
+    models are the same."""
 
     def run(self) -> None:
         check_weights(self.lpips_weights)
@@ -73,9 +75,9 @@ class Eval:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render frames of a finished run: PNG files and, of a flight and where ffmpeg is installed, a video.
+    """Render frames of a finished run as PNG files.
 
-    The photographs are not needed.
+    A flight also becomes a video if ffmpeg is installed. The photographs are not needed.
 
     Examples:
       a2tg render runs/fox --frames 240
@@ -86,13 +88,13 @@ class Render:
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
     path: Route | Path = "smooth"
-    """A smooth flight past the cameras, the test views, or a flight through the views that a2tg view saved (*.json)."""
+    """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
     frames: int = 120
-    """Length of the flight in frames, 30 a second."""
+    """Number of frames of the flight, at 30 frames per second."""
     out: Path | None = None
-    """Folder for the frames (default: RUN/frames)."""
+    """Output folder (default: RUN/frames)."""
     model: str | None = None
-    """Which model is drawn, by the name that a2tg info tells (default: the last of the run's main system)."""
+    """Name of the model, as a2tg info prints it (default: the last model of the main system)."""
 
     def run(self) -> None:
         run = open_run(self.folder)
@@ -107,10 +109,10 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class Compress:
-    """Write the smallest file of a model whose PSNR on the training views is about that of the model.
+    """Write the smallest file of a model within a given loss of PSNR.
 
-    A table tells what each choice of bits costs. Where the photographs are not there, losses are those of a model of
-    30 dB, as its renders tell them.
+    The loss is measured on the training views. If the photographs are missing, it is estimated from renders, for a
+    model of 30 dB. A table lists the loss and the bytes of each choice of bits.
 
     Examples:
       a2tg compress runs/fox
@@ -118,11 +120,11 @@ class Compress:
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
-    """Run folder, whose last model is taken, or a model, *.npz."""
+    """Model file (*.npz), or run folder, whose last model is taken."""
     out: Path | None = None
-    """The file (default: beside the model, NAME.a2tgz)."""
+    """Output file (default: NAME.a2tgz beside the model)."""
     max_loss: float = 0.05
-    """How many dB of PSNR may be lost."""
+    """Largest loss of PSNR in dB."""
 
     def run(self) -> None:
         result = compress(self.source, self.out, max_loss=self.max_loss)
@@ -132,7 +134,7 @@ class Compress:
 
 @dataclasses.dataclass(frozen=True)
 class Info:
-    """Print what a run folder holds: scene, progress of each stage, models, metrics."""
+    """Print the scene, the progress of each stage, the models and the metrics of a run."""
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
@@ -143,7 +145,9 @@ class Info:
 
 @dataclasses.dataclass(frozen=True)
 class Sfm:
-    """Find camera poses and points for plain photographs with COLMAP's features, matching and mapping.
+    """Find camera poses and sparse points for plain photographs.
+
+    COLMAP extracts features, matches them and maps the scene.
 
     Example:
       a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox
@@ -152,13 +156,13 @@ class Sfm:
     photos: Positional[Path]
     """Folder of photographs of one scene."""
     out: Positional[Path]
-    """Scene folder to make: images and sparse model, ready for a2tg train."""
+    """New scene folder for the images and the sparse model, ready for a2tg train."""
 
     def run(self) -> None:
         check_apart(self.out, self.photos)
         found = run_sfm(self.photos, self.out)
         print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
-        print(f"scene: {self.out}; go on with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
+        print(f"scene: {self.out}; continue with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
 
 
 Command = Demo | Train | Eval | Render | View | Export | Compress | Info | Sfm
@@ -169,14 +173,14 @@ COMMANDS: dict[str, type] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command.
+    """Run one command.
 
     Args:
-      argv: arguments without the program's name; None: those of the process.
+      argv: arguments without the program's name; None takes those of the process.
 
     Returns:
       The exit code: 0, 2 after a user's error (one line on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after
-      SIGHUP, 141 where nobody reads what is printed.
+      SIGHUP, 141 if the pipe that reads the output is closed.
     """
     name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     if name in ("-h", "--help", "--version"):
@@ -189,7 +193,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         return _fail(str(error))
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # Where the modules of one's own systems are.
+        sys.path.append(os.getcwd())  # Users' own systems are modules there.
     try:
         with warnings.catch_warnings(), signals.raised():
             warnings.showwarning = _show_warning
@@ -200,7 +204,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
         return stopped.exit_code
     except BrokenPipeError:
-        # What is left in the buffer is not to be tried again when the process ends.
+        # Python would otherwise flush the buffer again at exit and fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except (ValueError, OSError) as error:
@@ -211,16 +215,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str) -> int:
-    """Prints an error as one line and returns its exit code."""
+    """Print an error as one line and return its exit code."""
     print(f"a2tg: error: {shortened(message, LONGEST_ERROR)}", file=sys.stderr)
     return 2
 
 
 def _parse(name: str, arguments: list[str]) -> Command:
-    """The command that the arguments ask for. System, preset and file are looked at first: they decide the defaults.
+    """Return the command that the arguments ask for. System, preset and file are read first: they set the defaults.
 
     Raises:
-      ValueError, FileNotFoundError: if there is no such system, preset or file, or the file or an argument is wrong.
+      ValueError, FileNotFoundError: if there is no such system, preset or file, or the file or an argument is invalid.
     """
     kind = COMMANDS[name]
     options: dict[str, Any] = {"description": inspect.getdoc(kind)}

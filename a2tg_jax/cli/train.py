@@ -39,14 +39,14 @@ DEMO_SYSTEM = A2tg(
     densify=McmcConfig(cap=1_500),
     texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), rate=1e-2),
 )
-"""Few iterations, so textures grow early and learn fast."""
+"""System of the demo. It has few iterations, so textures grow early and learn fast."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Train the built-in synthetic scene with textures and, for comparison, without.
+    """Train the built-in synthetic scene with and without textures.
 
-    Takes about a minute on two cores and writes a report with pictures: open runs/demo/report.html.
+    Takes about a minute on two cores. Open runs/demo/report.html for the results.
     """
 
     out: Path = Path("runs/demo")
@@ -61,7 +61,7 @@ class Demo:
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a scene with a system, evaluate it and write a report.
+    """Train a scene, evaluate the model and write a report.
 
     Examples:
       a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
@@ -70,44 +70,44 @@ class Train:
       a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
       a2tg train --config runs/fox/run.toml --out runs/again
 
-    A checkpoint is written every tenth of a stage, at least every 500 iterations, and when the program is stopped by
-    Ctrl-C or SIGTERM; the newest two are kept until the stage is finished.
+    Checkpoints are written after every tenth of a stage, at least every 500 iterations, and on Ctrl-C or SIGTERM. The
+    newest two are kept until the stage is finished.
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; --config and --resume know it already."""
+    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; not needed with --config or --resume."""
     out: Path
-    """Run folder: models, checkpoints, metrics, pictures and report.html go there."""
+    """Run folder for models, checkpoints, metrics, pictures and report.html."""
     config: Path | None = None
-    """A TOML file that says any of this, such as the run.toml of a run; flags have precedence."""
+    """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
     system: str = DEFAULT_SYSTEM
-    """One of those that a2tg --help lists, or your own as package.module:NAME; its options stand below."""
+    """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
     preset: str | None = None
-    """Where the numbers below start from: paper (the defaults), quick (minutes on two cores), smoke (half a minute)."""
+    """Preset of the options below: paper (default), quick (minutes on two cores) or smoke (half a minute)."""
     downscale: int = 1
-    """Use the images at 1/k of their size."""
+    """Factor k by which images are downscaled."""
     test_every: int = 8
-    """Every k-th image is kept for testing."""
+    """Hold out every k-th image for testing."""
     alpha: AlphaMeaning = "transparency"
-    """What the alpha channel of images is: the transparency of what they show, or a mask, which leaves pixels out."""
+    """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
     compare: UseAppendAction[tuple[str, ...]] = ()
-    """Also train this system, to compare with: with the options above and below, where it has any of that name."""
+    """System to train for comparison; may be repeated. It takes every option above and below that it has."""
     baseline: bool = False
-    """Short for --compare gaussians-2d-mcmc: the same iterations without textures."""
+    """Compare with gaussians-2d-mcmc, the same iterations without textures."""
     on_nan: OnNan = "stop"
-    """Where a loss or gradient is not finite, or a loss explodes: stop, or restore the newest checkpoint and go on with
-    the views in another order."""
+    """Action if training diverges (a loss or gradient is not finite, or the loss explodes): stop, or restore the newest
+    checkpoint and continue with the views in another order."""
     resume: bool = False
-    """Go on from the newest checkpoint in the run folder."""
+    """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: Path | None = None
-    """Weights of LPIPS with AlexNet or SqueezeNet (.npz); without it LPIPS is left out."""
+    """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
     view: bool = False
-    """Show the training in a browser as it runs, where it can be paused."""
+    """Show the training in a browser, where you can pause it."""
     max_memory: str | None = None
-    """Refuse what would take more memory, of the process or of the GPU, than 8GB, 800MB, … (default: all that there
-    is); of the photographs, those beyond a quarter of it stay on disk. --memory-budget bounds the model instead."""
+    """Memory limit of the process and of the GPU, such as 8GB or 800MB (default: all available). Training refuses to
+    start if it needs more. Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
@@ -120,7 +120,7 @@ class Train:
             tell_result(result, self.out)
             return
         if self.overwrite:
-            raise ValueError("--resume goes on with a run and --overwrite replaces it: give one of them")
+            raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
         check_weights(weights)
         with opened(self.out) as run:
             record = self._resumed(run)
@@ -130,14 +130,14 @@ class Train:
 
     @property
     def record(self) -> RunRecord:
-        """The run that the flags ask for."""
+        """Record of the run that the flags ask for."""
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
         source = SceneSource(path, self.downscale, self.test_every, self.alpha)
         return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset, self.on_nan)
 
     def _resumed(self, run: RunFolder) -> RunRecord:
-        """The record of an existing run, after a check that no flag contradicts it; with what is compared besides."""
+        """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it."""
         kept, asked = read_record(run), self.record
         if asked.scene.path != kept.scene.path:
             raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
@@ -155,7 +155,7 @@ class Train:
 
 
 def train_defaults(arguments: list[str]) -> Train:
-    """What is not said on the command line: from the file; when a run is resumed, from its own."""
+    """Fill unset options from the configuration file, or from run.toml when a run is resumed."""
     path = _value_of("--config", arguments)
     system, preset = _value_of("--system", arguments), _value_of("--preset", arguments)
     out = _value_of("--out", arguments)
@@ -181,7 +181,7 @@ def train_defaults(arguments: list[str]) -> Train:
 
 
 def _value_of(flag: str, arguments: list[str]) -> str:
-    """The value after `flag`, as "--flag value" or "--flag=value"; empty without it."""
+    """Return the value of `flag`, given as "--flag value" or "--flag=value", or an empty string."""
     for word, following in itertools.pairwise([*arguments, ""]):
         if word == flag:
             return following
@@ -191,6 +191,6 @@ def _value_of(flag: str, arguments: list[str]) -> str:
 
 
 def tell_result(result: RunResult, folder: Path) -> None:
-    """The figures, and where the report is."""
+    """Print the metrics and the path of the report."""
     print(summary_text(result))
     print(f"report: {RunFolder(folder).report}")

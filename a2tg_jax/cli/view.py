@@ -1,4 +1,4 @@
-"""What shows scenes in browsers: the commands view and export, and a training that is looked at."""
+"""The commands that show scenes in a browser: `a2tg view`, `a2tg export`, and the view of a training."""
 
 import dataclasses
 import os
@@ -20,10 +20,10 @@ from a2tg_jax.web.server import serve
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Show a scene in a browser, from this machine for this machine alone.
+    """Show a scene in a browser on this machine.
 
-    Of a run its photographs are shown, too. Gaussians of 3DGS (PLY) are shown flat: the thinnest axis of each is left
-    out.
+    Other machines cannot connect. A run is shown with its photographs. Gaussians of 3DGS (PLY) are flattened along
+    their thinnest axis.
 
     Examples:
       a2tg view runs/fox
@@ -33,24 +33,26 @@ class View:
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
     model: str | None = None
-    """Which model of a run, by the name that a2tg info tells (default: the last of the run's main system)."""
+    """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
     port: int = 0
-    """Port on 127.0.0.1; 0 is a free one."""
+    """Port on 127.0.0.1; 0 takes a free one."""
     open: bool = True
-    """Open a browser, where the machine has a screen."""
+    """Open a browser if the machine has a display."""
 
     def run(self) -> None:
         serve(routes_of(open_source(self.source, self.model)), port=self.port, on_start=self._started)
 
     def _started(self, address: str) -> None:
-        print(f"{address} shows {self.source}; Ctrl-C ends it", flush=True)
+        print(f"{address} shows {self.source}; press Ctrl-C to stop", flush=True)
         if self.open:
             _open(address)
 
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a page that shows a scene in any browser: a folder for a web server, or one file.
+    """Write a page that shows a scene in any browser.
+
+    The page is a folder for a web server, or one HTML file that opens from the disk.
 
     Examples:
       a2tg export runs/fox --web site/fox
@@ -60,13 +62,13 @@ class Export:
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
     web: Path
-    """The folder; with --single-file the HTML file."""
+    """Output folder, or output file with --single-file."""
     single_file: bool = False
-    """One HTML file that opens from the disk and needs no other."""
+    """Write one HTML file that needs no other."""
     photographs: bool = False
     """Put the photographs of the run's cameras beside the page."""
     model: str | None = None
-    """Which model of a run, by the name that a2tg info tells (default: the last of the run's main system)."""
+    """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
 
     def run(self) -> None:
         source = open_source(self.source, self.model)
@@ -76,7 +78,7 @@ class Export:
 
 
 def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
-    """Somebody who looks at the training of a scene in a browser."""
+    """Show the training of a scene in a browser."""
 
     def started(address: str) -> None:
         print(f"{address} shows the training", flush=True)
@@ -86,7 +88,7 @@ def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
 
 
 def _open(address: str) -> None:
-    """Opens a browser where one can show itself: on Linux, where there is an X or Wayland display."""
+    """Open a browser if there is a display; on Linux, an X or Wayland display."""
     has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if has_display or sys.platform in ("win32", "darwin"):
         webbrowser.open(address)

@@ -1,14 +1,47 @@
-"""Everything that turns input into a Scene: COLMAP, transforms.json, plain photographs, the built-in scene."""
+"""Readers that turn input into a Scene: COLMAP, transforms.json, plain photographs, the built-in scene.
 
-from a2tg_jax.core.similarity import Similarity as Similarity
-from a2tg_jax.data.load import load_scene as load_scene
-from a2tg_jax.data.masks import Mask as Mask
-from a2tg_jax.data.photo_store import Picture as Picture
-from a2tg_jax.data.scene import Scene as Scene
-from a2tg_jax.data.scene import View as View
-from a2tg_jax.data.scene import counted_pixels as counted_pixels
-from a2tg_jax.data.scene import view_image as view_image
-from a2tg_jax.data.scene import views_by_size as views_by_size
-from a2tg_jax.data.sfm import SfmSummary as SfmSummary
-from a2tg_jax.data.sfm import run_sfm as run_sfm
-from a2tg_jax.data.synthetic import synthetic_scene as synthetic_scene
+Names are imported at their first use: a program that reads no photographs loads neither Pillow nor a COLMAP reader.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from a2tg_jax.core.similarity import Similarity as Similarity
+    from a2tg_jax.data.load import load_scene as load_scene
+    from a2tg_jax.data.masks import Mask as Mask
+    from a2tg_jax.data.photo_store import Picture as Picture
+    from a2tg_jax.data.scene import Scene as Scene
+    from a2tg_jax.data.scene import View as View
+    from a2tg_jax.data.scene import counted_pixels as counted_pixels
+    from a2tg_jax.data.scene import view_image as view_image
+    from a2tg_jax.data.scene import views_by_size as views_by_size
+    from a2tg_jax.data.sfm import SfmSummary as SfmSummary
+    from a2tg_jax.data.sfm import run_sfm as run_sfm
+    from a2tg_jax.data.synthetic import synthetic_scene as synthetic_scene
+
+_NAMES = {
+    "a2tg_jax.core.similarity": ("Similarity",),
+    "a2tg_jax.data.load": ("load_scene",),
+    "a2tg_jax.data.masks": ("Mask",),
+    "a2tg_jax.data.photo_store": ("Picture",),
+    "a2tg_jax.data.scene": ("Scene", "View", "counted_pixels", "view_image", "views_by_size"),
+    "a2tg_jax.data.sfm": ("SfmSummary", "run_sfm"),
+    "a2tg_jax.data.synthetic": ("synthetic_scene",),
+}
+"""Public names by the module that defines them: the imports above, once more."""
+
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = sorted(_MODULE_OF)
+
+if not TYPE_CHECKING:  # Type checkers see the imports above, and that no other name exists.
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name at its first use."""
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+        return value
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

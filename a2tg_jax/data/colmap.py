@@ -29,13 +29,13 @@ logger = logging.getLogger(__name__)
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of the sparse model of a scene folder, or None."""
+    """Return the folder of the sparse model of a scene folder, or None."""
     folders = [path / folder for folder in MODEL_FOLDERS]
     return next((folder for folder in folders if _model_suffix(folder) is not None), None)
 
 
 def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
-    """Reads a COLMAP scene: every registered image as a pinhole view, and the sparse points.
+    """Read a COLMAP scene: every registered image as a pinhole view, and the sparse points.
 
     Args:
       path: the scene folder, or the folder of the model itself. Its folder `images` (or `images_k`) may be
@@ -67,7 +67,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
 
 
 def read_points(reconstruction: Any) -> PointCloud:
-    """The points of a pycolmap.Reconstruction, in the order of their ids."""
+    """Return the points of a pycolmap.Reconstruction, in the order of their ids."""
     points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
     return PointCloud(
         np.array([point.xyz for point in points]).reshape(-1, 3),
@@ -84,7 +84,7 @@ def viewmat_of(image: Any) -> np.ndarray:
 
 
 def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Shelf) -> Shot:
-    """One registered image, undistorted and downscaled."""
+    """Return one registered image, undistorted and downscaled."""
     file, still_to_downscale = locate_image(images_folder, image.name, downscale)
     photograph = read_pixels(file)
     check_aspect(file, photograph, *lens.size)
@@ -106,7 +106,7 @@ def _model_suffix(folder: Path) -> str | None:
 
 
 def _read_model(model: Path) -> Any:
-    """The pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
+    """Return the pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
     suffix = _model_suffix(model) or ".bin"
     for file in (model / f"{kind}{suffix}" for kind in RECORDS):
         if is_regular(file):
@@ -134,7 +134,7 @@ def _with_points_file(model: Path, suffix: str) -> Iterator[Path]:
 
 
 def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
-    """The folder `images` (it need not exist where `images_k` does) of the scene that the model belongs to."""
+    """Return the folder `images` (it need not exist where `images_k` does) of the scene that the model belongs to."""
     model = model.resolve()
     for base in (path.resolve(), model, *model.parents[:2]):
         if (base / "images").is_dir() or (downscale > 1 and (base / f"images_{downscale}").is_dir()):
@@ -143,7 +143,7 @@ def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
 
 
 def _log_unregistered(images_folder: Path, num_registered: int) -> None:
-    """Tells how many files beside the registered images are left aside."""
+    """Tell how many files beside the registered images are left aside."""
     if images_folder.is_dir():
         others = sum(file.is_file() for file in images_folder.rglob("*")) - num_registered
         if others > 0:

@@ -57,7 +57,7 @@ class _Cursor:
 
 
 def check_binary(path: Path) -> None:
-    """Refuses a binary file of a model, one that `RECORDS` knows, unless it ends where its counts say.
+    """Refuse a binary file of a model, one that `RECORDS` knows, unless it ends where its counts say.
 
     Raises:
       ValueError: naming the file, and what of it is wrong.

@@ -4,7 +4,7 @@ from types import ModuleType
 
 
 def pycolmap() -> ModuleType:
-    """The module pycolmap, imported at its first use because that takes a third of a second.
+    """Return the module pycolmap, imported at its first use because that takes a third of a second.
 
     zlib must be loaded before it: otherwise Python's own zlib (np.savez_compressed, gzip, PNG) crashes on its next use
     with "free(): invalid pointer" (pycolmap 4.2.1).

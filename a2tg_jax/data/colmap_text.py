@@ -22,7 +22,7 @@ ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
 
 
 def check_text(path: Path) -> None:
-    """Refuses a text file of a model, one that `LINES` knows, unless all its lines are such.
+    """Refuse a text file of a model, one that `LINES` knows, unless all its lines are such.
 
     Warns where a comment counts other than the file: it may end too early, but other programs copy comments.
 
@@ -47,7 +47,7 @@ def check_text(path: Path) -> None:
 
 
 def _lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """The lines of a file, none of which takes more memory than a line can."""
+    """Yield the lines of a file, none of which takes more memory than a line can."""
     while line := file.readline(LONGEST_LINE + 1):
         if len(line) > LONGEST_LINE:
             raise ValueError(f"{path}: has a line of more than {LONGEST_LINE:,} bytes; export the model again")

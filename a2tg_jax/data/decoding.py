@@ -30,7 +30,7 @@ class PictureRefused(ValueError):
 
 
 def read_pixels(path: str | os.PathLike) -> np.ndarray:
-    """The pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
+    """Return the pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
 
     Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
 
@@ -44,7 +44,7 @@ def read_pixels(path: str | os.PathLike) -> np.ndarray:
 
 
 def check_picture(path: str | os.PathLike) -> tuple[int, int]:
-    """(width, height) of an image file that can be decoded. Raises as `read_pixels` does."""
+    """Return (width, height) of an image file that can be decoded. Raises as `read_pixels` does."""
     with _opened(path) as image:
         image.load()
         return image.size
@@ -58,7 +58,7 @@ def _opened(path: str | os.PathLike) -> Iterator[Image.Image]:
 
 
 def _decoded(path: str | os.PathLike, file: BufferedReader) -> Iterator[Image.Image]:
-    """The image in an open file, once."""
+    """Yield the image in an open file, once."""
     try:
         with Image.open(file, formats=FORMATS) as image:
             _check_size(path, image)

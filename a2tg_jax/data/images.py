@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 
 def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
-    """The file of one image and the factor by which it is still to be downscaled.
+    """Return the file of one image and the factor by which it is still to be downscaled.
 
     Args:
       folder: the folder of the full images; with downscale k, its sibling `<folder>_k` is preferred where it exists.
@@ -49,7 +49,7 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
 
 
 def check_inside(folder: Path, name: str) -> None:
-    """Refuses a name, found in a file of the scene, that leads out of the scene's folder. Links may lead anywhere.
+    """Refuse a name, found in a file of the scene, that leads out of the scene's folder. Links may lead anywhere.
 
     Raises:
       ValueError: naming both, if it is absolute, climbs by "..", or is no name.
@@ -66,7 +66,7 @@ def check_inside(folder: Path, name: str) -> None:
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too).
+    """Return the image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too).
 
     Pillow's box filter would take whole pixels only and so shift details where the ratio is no whole number.
     """
@@ -76,12 +76,12 @@ def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def downscaled_size(width: int, height: int, downscale: int) -> tuple[int, int]:
-    """(width, height) divided by the factor, rounded, at least 1."""
+    """Return (width, height) divided by the factor, rounded, at least 1."""
     return max(1, round(width / downscale)), max(1, round(height / downscale))
 
 
 def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> None:
-    """Raises ValueError if the image cannot be the camera's width × height at another size.
+    """Raise ValueError if the image cannot be the camera's width × height at another size.
 
     Raises:
       ValueError: naming the file and both sizes.
@@ -101,6 +101,7 @@ def scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int])
 
 
 def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """[function(item) for item in items], several at a time; decoding and resizing images leave Python's lock."""
+    """Return [function(item) for item in items], several at a time; decoding and resizing images leave Python's
+    lock."""
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         return list(pool.map(function, items))

@@ -61,7 +61,8 @@ class Lens:
         return K, size
 
     def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
-        """Whether the middle half of what a pinhole K sees lies in the photograph, nearly, and is not turned over.
+        """Return whether the middle half of what a pinhole K sees lies in the photograph, nearly, and is not turned
+        over.
 
         Corners may fold: real calibrations say little about where they saw no feature.
         """
@@ -73,7 +74,7 @@ class Lens:
         return bool(is_inside and is_ordered)
 
     def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """The pinhole image of a photograph, at the photograph's resolution divided by `downscale`.
+        """Return the pinhole image of a photograph, at the photograph's resolution divided by `downscale`.
 
         Args:
           pixels: [h, w, C] uint8, of the calibrated size or that size scaled.
@@ -113,7 +114,7 @@ class Lens:
 
 
 def checked_lens(camera: Any, what: str) -> Lens:
-    """The lens of a pycolmap.Camera whose numbers a camera can have.
+    """Return the lens of a pycolmap.Camera whose numbers a camera can have.
 
     Raises:
       ValueError: calling it `what`, if a number is NaN, infinite, or beyond the bounds of `check_intrinsics` and
@@ -131,7 +132,7 @@ def checked_lens(camera: Any, what: str) -> Lens:
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
-    """[P, 2] → [P, 3] with a last coordinate of 1."""
+    """Return [P, 2] → [P, 3] with a last coordinate of 1."""
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 

@@ -28,7 +28,8 @@ def light(colored: list[tuple[Shape, np.ndarray]], rng: np.random.Generator) -> 
 
 
 def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.random.Generator) -> np.ndarray:
-    """The image [rows, columns, 3] uint8 of one shape: its colours times the light that falls on it, at most 1."""
+    """Return the image [rows, columns, 3] uint8 of one shape: its colours times the light that falls on it, at most
+    1."""
     rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     points, normals = (x.astype(np.float32) for x in shape.place(u.ravel(), v.ravel()))
@@ -62,7 +63,7 @@ def _sky_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng
 
 
 def _unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:
-    """[count, 3] float32 unit vectors spread evenly over the sphere (a Fibonacci lattice, turned at random)."""
+    """Return [count, 3] float32 unit vectors spread evenly over the sphere (a Fibonacci lattice, turned at random)."""
     index = np.arange(count) + 0.5
     z, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index + rng.uniform(0, 2 * np.pi)
     radius = np.sqrt(1 - z * z)

@@ -23,7 +23,7 @@ AlphaMeaning = Literal["transparency", "mask"]
 
 
 def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
-    """The mask of an image and the factor by which it is still to be downscaled; None where there is none.
+    """Return the mask of an image and the factor by which it is still to be downscaled; None where there is none.
 
     Args:
       images: the folder of the full images; masks lie in its sibling `masks`, or `masks_k` for a downscale of k.
@@ -51,7 +51,7 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
 
 
 def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray) -> Mask | None:
-    """The mask of a view, undistorted and downscaled as its photograph was; None for None.
+    """Return the mask of a view, undistorted and downscaled as its photograph was; None for None.
 
     A pixel counts where all that it is made of does.
 
@@ -78,7 +78,7 @@ def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray
 
 
 def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) -> None:
-    """Tells of photographs without a mask where others have one, and refuses masks that leave nothing.
+    """Tell of photographs without a mask where others have one, and refuses masks that leave nothing.
 
     Args:
       shots: all of the scene.
@@ -103,7 +103,7 @@ def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) 
 
 
 def alpha_as_mask(scene: Scene, source: str) -> Scene:
-    """The scene with the alpha of its photographs as masks: what is not opaque does not count.
+    """Return the scene with the alpha of its photographs as masks: what is not opaque does not count.
 
     Raises:
       ValueError: naming a photograph of which nothing is left.

@@ -18,7 +18,7 @@ class Mask:
 
     @staticmethod
     def of(counts: "np.ndarray | Mask") -> "Mask":
-        """The mask of an array [H, W]; a mask is returned as it is.
+        """Return the mask of an array [H, W]; a mask is returned as it is.
 
         Raises:
           ValueError: unless it is bool, [H, W].
@@ -36,6 +36,6 @@ class Mask:
         return self.num == self.shape[0] * self.shape[1]
 
     def read(self) -> np.ndarray:
-        """[H, W] bool."""
+        """Return [H, W] bool."""
         bits = np.frombuffer(zlib.decompress(self.data), np.uint8)
         return np.unpackbits(bits, count=self.shape[0] * self.shape[1]).view(bool).reshape(self.shape)

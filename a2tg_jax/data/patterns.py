@@ -30,14 +30,14 @@ GAP = np.array((0.48, 0.35, 0.25), np.float32)
 
 
 def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """(u, v) of the texel centres, each [rows, columns] float32 in (0, 1); u along the columns."""
+    """Return (u, v) of the texel centres, each [rows, columns] float32 in (0, 1); u along the columns."""
     u = (np.arange(columns, dtype=np.float32) + 0.5) / columns
     v = (np.arange(rows, dtype=np.float32) + 0.5) / rows
     return np.broadcast_to(u, (rows, columns)), np.broadcast_to(v[:, None], (rows, columns))
 
 
 def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(1 - weight)·first + weight·second, [rows, columns, 3]."""
+    """Return (1 - weight)·first + weight·second, [rows, columns, 3]."""
     return first + weight[..., None].astype(np.float32) * (second - first)
 
 
@@ -53,7 +53,7 @@ def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int,
 
 
 def bricks(rng: np.random.Generator, rows: int, columns: int, size: tuple[int, int]) -> np.ndarray:
-    """A brick wall; `size` is (height, width) of a brick with its mortar, in texels."""
+    """Return a brick wall; `size` is (height, width) of a brick with its mortar, in texels."""
     row, column = np.indices((rows, columns))
     course = row // size[0]
     shifted = column + (course % 2) * (size[1] // 2)
@@ -67,7 +67,8 @@ def bricks(rng: np.random.Generator, rows: int, columns: int, size: tuple[int, i
 
 
 def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
-    """A round mosaic: rings of nearly square stones, `ring` texels wide, in bands of zigzags, checks and stripes."""
+    """Return a round mosaic: rings of nearly square stones, `ring` texels wide, in bands of zigzags, checks and
+    stripes."""
     y, x = (np.indices((side, side), np.float32) + 0.5) - side / 2
     radius, angle = np.hypot(x, y) / ring, np.arctan2(y, x) / (2 * np.pi) + 0.5
     index = radius.astype(int)
@@ -96,7 +97,8 @@ def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
 
 
 def globe(rows: int, columns: int, num_checks: int) -> np.ndarray:
-    """A ball in latitude and longitude: wedges of colour at the poles, `num_checks` checks around the equator."""
+    """Return a ball in latitude and longitude: wedges of colour at the poles, `num_checks` checks around the
+    equator."""
     u, v = coordinates(rows, columns)
     wedges = np.stack([CORAL, CREAM, GOLD, CREAM, TEAL, CREAM])[(u * 18).astype(int) % 6]
     checks = ((u * num_checks).astype(int) + (v * num_checks / 2).astype(int)) % 2
@@ -106,13 +108,13 @@ def globe(rows: int, columns: int, num_checks: int) -> np.ndarray:
 
 
 def checks(rows: int, columns: int, first: np.ndarray, second: np.ndarray, *, texels: int) -> np.ndarray:
-    """A checked band of rows × columns squares, each `texels` wide."""
+    """Return a checked band of rows × columns squares, each `texels` wide."""
     row, column = np.indices((rows * texels, columns * texels)) // texels
     return mix(first, second, (row + column) % 2)
 
 
 def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
-    """A column: oblique stripes, wider and steeper in each of three drums, with bands of keys between them."""
+    """Return a column: oblique stripes, wider and steeper in each of three drums, with bands of keys between them."""
     u, v = coordinates(rows, columns)
     frequency = np.select([v < 0.34, v < 0.67], [12, 9], 6)
     stripe = ((u * frequency + v * 9) % 1.0) < 0.5
@@ -124,7 +126,7 @@ def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray
 
 
 def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.ndarray:
-    """A square floor of boards along the columns, `width` × `length` texels each, in two kinds of wood."""
+    """Return a square floor of boards along the columns, `width` × `length` texels each, in two kinds of wood."""
     row, column = np.indices((side, side))
     board = row // width
     shifted = column + (board * 577) % length
@@ -143,7 +145,7 @@ def lettering(text: str, rows: int, columns: int, height: float, ink: np.ndarray
 
 
 def letter_block(letters: Sequence[str], side: int, colors: Sequence[np.ndarray]) -> np.ndarray:
-    """The faces of toy blocks side by side: a framed letter each, the frame checked."""
+    """Return the faces of toy blocks side by side: a framed letter each, the frame checked."""
     faces = []
     for letter, color in zip(letters, colors, strict=True):
         u, v = coordinates(side, side)

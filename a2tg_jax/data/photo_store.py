@@ -65,7 +65,7 @@ class Shelf:
         self._end = 0
 
     def keep(self, pixels: np.ndarray, source: Path | None = None) -> Picture:
-        """A picture of these pixels.
+        """Return a picture of these pixels.
 
         Args:
           pixels: of any shape, uint8.
@@ -110,7 +110,7 @@ class Shelf:
 
 
 def _decoded_again(source: Path, pixels: np.ndarray) -> Picture:
-    """The picture in an image file, which must stay as it is."""
+    """Return the picture in an image file, which must stay as it is."""
     checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
 
     def read() -> np.ndarray:

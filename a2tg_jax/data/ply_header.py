@@ -36,19 +36,19 @@ class VertexHeader:
         return np.dtype([(name, BYTE_ORDERS[self.encoding] + kind) for name, kind in self.fields.items()])
 
     def require(self, names: Iterable[str], wanted: str) -> None:
-        """Raises ValueError unless the vertices have some properties."""
+        """Raise ValueError unless the vertices have some properties."""
         missing = [name for name in names if name not in self.fields]
         if missing:
             raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is wanted")
 
     def read_binary(self, file: BinaryIO) -> np.ndarray:
-        """The vertices [count] of a binary file, structured. ValueError: it is cut off."""
+        """Return the vertices [count] of a binary file, structured. ValueError: it is cut off."""
         dtype = self.dtype
         self.check_room(file, dtype.itemsize)
         return np.frombuffer(file.read(self.count * dtype.itemsize), dtype, self.count)
 
     def check_room(self, file: BinaryIO, num_bytes: int) -> None:
-        """Raises ValueError if the rest of a file is less than that many bytes for each vertex."""
+        """Raise ValueError if the rest of a file is less than that many bytes for each vertex."""
         left = os.fstat(file.fileno()).st_size - file.tell()
         if self.count * num_bytes > left:
             raise ValueError(
@@ -58,7 +58,7 @@ class VertexHeader:
 
 
 def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
-    """The header of a PLY, with the file left at its first vertex.
+    """Return the header of a PLY, with the file left at its first vertex.
 
     Raises:
       ValueError: naming the file, if it is no PLY, its header does not end, vertices are not its first element, or a
@@ -86,7 +86,7 @@ def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
 
 
 def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
-    """The headers of all elements of a PLY, by their names, with the file left at the first of the first.
+    """Return the headers of all elements of a PLY, by their names, with the file left at the first of the first.
 
     Raises:
       ValueError: naming the file, if it is no PLY, its header does not end, or a property cannot be read.
@@ -110,7 +110,7 @@ def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
 
 
 def header_lines(file: BinaryIO, path: Path) -> Iterator[list[str]]:
-    """The words of each line up to end_header."""
+    """Yield the words of each line up to end_header."""
     if file.readline(LONGEST_LINE).strip() != b"ply":
         raise ValueError(f"{path}: is not a PLY file")
     for _ in range(MOST_LINES):

@@ -16,7 +16,8 @@ LEAST_BYTES = 2
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """The points of a PLY file whose first element is `vertex` with x, y, z; mid-grey where it has no red, green, blue.
+    """Return the points of a PLY file whose first element is `vertex` with x, y, z; mid-grey where it has no red,
+    green, blue.
 
     Colours are whole numbers in 0..255, or floats in [0, 1]; those beyond are clipped.
 
@@ -39,7 +40,7 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def _read_ascii(file: BinaryIO, header: VertexHeader) -> np.ndarray:
-    """[count, properties] of the vertices, one a line."""
+    """Return [count, properties] of the vertices, one a line."""
     num = len(header.fields)
     header.check_room(file, LEAST_BYTES * num - 1)
     rows = np.empty((header.count, num))

@@ -99,7 +99,7 @@ class PointCloud:
 
 
 def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
-    """The cameras and the world of a scene, training views first."""
+    """Return the cameras and the world of a scene, training views first."""
     views = [*scene.train, *scene.test]
     return Origin.of_cameras(
         [view.camera for view in views],
@@ -111,7 +111,7 @@ def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
 
 
 def views_by_size(views: Sequence[View]) -> list[list[View]]:
-    """The views of each image size, sizes and views in the order in which they come."""
+    """Return the views of each image size, sizes and views in the order in which they come."""
     groups: dict[tuple[int, int], list[View]] = {}
     for view in views:
         groups.setdefault(view.picture.size, []).append(view)
@@ -119,7 +119,7 @@ def views_by_size(views: Sequence[View]) -> list[list[View]]:
 
 
 def counted_pixels(views: Sequence[View]) -> np.ndarray:
-    """[V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] where all of them do."""
+    """Return [V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] where all of them do."""
     if all(view.mask is None for view in views):
         return np.ones((len(views), 1, 1, 1), bool)
     masks = [np.ones(view.picture.size, bool) if view.mask is None else view.mask.read() for view in views]
@@ -127,7 +127,7 @@ def counted_pixels(views: Sequence[View]) -> np.ndarray:
 
 
 def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """The view's image as floats, over a background where it is transparent.
+    """Return the view's image as floats, over a background where it is transparent.
 
     Args:
       view: one view.
@@ -193,13 +193,13 @@ def assemble_scene(
 
 
 def check_test_every(test_every: int) -> None:
-    """Raises ValueError unless some views are left for training."""
+    """Raise ValueError unless some views are left for training."""
     if test_every < 0 or test_every == 1:
         raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
 
 
 def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
-    """(train, test): shots 0, k, 2k, … of the name-sorted ones are the test; k = 0 keeps none for it."""
+    """Return (train, test): shots 0, k, 2k, … of the name-sorted ones are the test; k = 0 keeps none for it."""
     ordered = sorted(shots, key=lambda shot: shot.name)
     is_test = [test_every > 0 and index % test_every == 0 for index in range(len(ordered))]
     train = [shot for shot, test in zip(ordered, is_test, strict=True) if not test]
@@ -207,13 +207,13 @@ def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[
 
 
 def random_points(center: np.ndarray, half_side: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points [NUM_RANDOM_POINTS, 3] uniform in a cube and mid-grey colours (uint8) of the same shape."""
+    """Return points [NUM_RANDOM_POINTS, 3] uniform in a cube and mid-grey colours (uint8) of the same shape."""
     offsets = np.random.default_rng(seed).uniform(-half_side, half_side, (NUM_RANDOM_POINTS, 3))
     return center + offsets, np.full((NUM_RANDOM_POINTS, 3), 128, np.uint8)
 
 
 def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
-    """The rigid motion nearest to a nearly rigid matrix [4, 4], as poses rounded to a few digits are.
+    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], as poses rounded to a few digits are.
 
     Raises:
       ValueError: naming `what`, if the matrix is not finite or its rotation is not one.
@@ -232,7 +232,7 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
 
 
 def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
-    """Raises ValueError if no scene can be made of the shots, which are sorted by name."""
+    """Raise ValueError if no scene can be made of the shots, which are sorted by name."""
     if len(shots) < 2:
         raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
     if num_train < 1:
@@ -243,7 +243,7 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
 
 
 def _check_distances(shots: Sequence[Shot], source: str) -> None:
-    """Refuses a camera beyond all the others, which would move the origin to nowhere."""
+    """Refuse a camera beyond all the others, which would move the origin to nowhere."""
     centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     farthest = int(np.argmax(distances))
@@ -255,7 +255,7 @@ def _check_distances(shots: Sequence[Shot], source: str) -> None:
 
 
 def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
-    """The points that are somewhere, in both worlds; others are left out with a warning."""
+    """Return the points that are somewhere, in both worlds; others are left out with a warning."""
     is_usable = _are_somewhere(cloud.points)
     is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
     if is_usable.all():
@@ -266,12 +266,12 @@ def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud
 
 
 def _are_somewhere(points: np.ndarray) -> np.ndarray:
-    """[P] whether all coordinates of a point are within bounds."""
+    """Return [P] whether all coordinates of a point are within bounds."""
     return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
 
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:
-    """The shot with its camera in the normalised world."""
+    """Return the shot with its camera in the normalised world."""
     height, width = shot.pixels.shape[:2]
     check_calibration(viewmat, shot.K, width, height, shot.name)
     camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height)

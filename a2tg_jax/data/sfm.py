@@ -77,7 +77,7 @@ def run_sfm(
 
 
 def find_photos(folder: Path) -> list[str]:
-    """Paths of the photographs below a folder, relative to it, sorted.
+    """Return paths of the photographs below a folder, relative to it, sorted.
 
     Raises:
       FileNotFoundError: if there is no such folder.
@@ -111,7 +111,7 @@ def _match(photos: Path, names: list[str], database: Path, seed: int, camera_mod
 
 
 def _map(photos: Path, work: Path, seed: int, bar: tqdm) -> Any:
-    """The largest reconstruction of the matched photographs, or None."""
+    """Return the largest reconstruction of the matched photographs, or None."""
     colmap = pycolmap()
     options = colmap.IncrementalPipelineOptions(
         random_seed=seed, num_threads=1, min_model_size=MIN_REGISTERED, ba_use_gpu=False
@@ -131,7 +131,7 @@ def _map(photos: Path, work: Path, seed: int, bar: tqdm) -> Any:
 
 
 def _check_model(model: Any, num_photos: int, photos: Path) -> None:
-    """Raises ValueError without a usable model, and warns where many photographs have no pose."""
+    """Raise ValueError without a usable model, and warns where many photographs have no pose."""
     num_registered = 0 if model is None else model.num_reg_images()
     advice = "sharp photographs that overlap by two thirds, from different places, work best"
     message = f"{photos}: only {num_registered} of {num_photos} photographs could be placed; {advice}"
@@ -153,7 +153,7 @@ def _write_scene(model: Any, photos: Path, work: Path, out: Path) -> None:
 
 
 def _have_one_size(photos: Path, names: list[str]) -> bool:
-    """Whether all photographs have the same width and height, as those of one camera have.
+    """Return whether all photographs have the same width and height, as those of one camera have.
 
     Raises:
       ValueError: naming the first that this program would not read: COLMAP's own reader knows no bounds.
@@ -163,7 +163,7 @@ def _have_one_size(photos: Path, names: list[str]) -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps COLMAP's log to errors for a while."""
+    """Keep COLMAP's log to errors for a while."""
     logging = pycolmap().logging
     level, logging.minloglevel = logging.minloglevel, logging.ERROR.value
     try:

@@ -23,10 +23,10 @@ class Shape(Protocol):
         """t [P] of the nearest hit beyond NEAR; origins are [3, P] or one for all rays, [3, 1]."""
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(u, v), each [P], of points [3, P] on the surface."""
+        """Return (u, v), each [P], of points [3, P] on the surface."""
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(points, unit normals) [3, P] at (u, v), each [P]; the inverse of `locate`."""
+        """Return (points, unit normals) [3, P] at (u, v), each [P]; the inverse of `locate`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Surface:
 
 
 def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(t, index of the shape), both [P], of the first hit of each ray; t is infinite where all are missed."""
+    """Return (t, index of the shape), both [P], of the first hit of each ray; t is infinite where all are missed."""
     nearest = np.full(directions.shape[1], np.inf, np.float32)
     index = np.zeros(directions.shape[1], np.int8)
     for number, shape in enumerate(shapes):
@@ -195,7 +195,7 @@ def trace(surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarra
 
 
 def look_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The texels [P, 3] nearest to (u, v)."""
+    """Return the texels [P, 3] nearest to (u, v)."""
     rows, columns = image.shape[:2]
     row = np.clip((v * rows).astype(np.int32), 0, rows - 1)
     column = np.clip((u * columns).astype(np.int32), 0, columns - 1)
@@ -203,17 +203,18 @@ def look_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def column(vector: Vector) -> np.ndarray:
-    """[3, 1] float32."""
+    """Return [3, 1] float32."""
     return np.array(vector, np.float32)[:, None]
 
 
 def squares(*components: np.ndarray) -> np.ndarray:
-    """The sum of their squares."""
+    """Return the sum of their squares."""
     return sum(component * component for component in components)
 
 
 def quadratic_roots(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The smaller and the larger root of a·t² + 2·half_b·t + c, a > 0; NaN, which no comparison passes, without any."""
+    """Return the smaller and the larger root of a·t² + 2·half_b·t + c, a > 0; NaN, which no comparison passes, without
+    any."""
     discriminant = half_b * half_b - a * c
     root = np.sqrt(np.where(discriminant > 0, discriminant, np.float32(np.nan)))
     inverse = 1 / np.maximum(a, np.float32(1e-12))

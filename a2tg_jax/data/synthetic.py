@@ -32,7 +32,7 @@ def synthetic_scene(
     downscale: int = 1,
     test_every: int = 8,
 ) -> Scene:
-    """Makes the built-in scene: pinhole views on a closed curve over an arc, and points on the surfaces they see.
+    """Make the built-in scene: pinhole views on a closed curve over an arc, and points on the surfaces they see.
 
     Args:
       seed: of patterns, light and points; the arrangement is always the same.
@@ -115,7 +115,7 @@ def intrinsics(width: int, height: int) -> np.ndarray:
 
 
 def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The image [height, width, 3] uint8 that a camera sees, the mean of a few rays a pixel (SAMPLE_OFFSETS)."""
+    """Return the image [height, width, 3] uint8 that a camera sees, the mean of a few rays a pixel (SAMPLE_OFFSETS)."""
     center = _center(viewmat)
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
     seen = nearest_hits([surface.shape for surface in surfaces], center, _directions(viewmat, K, x, y))[1]
@@ -149,7 +149,7 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
 
 
 def _center(viewmat: np.ndarray) -> np.ndarray:
-    """[3, 1] float32 position of a camera."""
+    """Return [3, 1] float32 position of a camera."""
     return (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
 
 

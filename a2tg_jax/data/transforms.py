@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 
 def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
-    """Reads a nerfstudio or instant-ngp scene.
+    """Read a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide about the split where the file has them (val is
     the test where there is no test list), test_every where it has none.
@@ -66,7 +66,7 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
 
 
 def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
-    """Reads a Blender scene as NeRF's are: transforms_train.json and transforms_test.json, images with alpha.
+    """Read a Blender scene as NeRF's are: transforms_train.json and transforms_test.json, images with alpha.
 
     Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
     test_every-th training view is a test view.
@@ -92,7 +92,8 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    """The JSON object in a file, which has a non-empty list `frames` of objects, and texts where files are named."""
+    """Return the JSON object in a file, which has a non-empty list `frames` of objects, and texts where files are
+    named."""
     data = read_regular(file, MOST_BYTES)
     try:
         meta = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
@@ -109,7 +110,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _check_texts(file: Path, values: dict[str, Any]) -> None:
-    """Raises ValueError unless what names files within the scene is text, or a list of texts."""
+    """Raise ValueError unless what names files within the scene is text, or a list of texts."""
     for key in FILE_KEYS:
         name = values.get(key)
         if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
@@ -122,7 +123,7 @@ def _check_texts(file: Path, values: dict[str, Any]) -> None:
 
 
 def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) -> list[Shot]:
-    """The frames of a transforms file, undistorted and downscaled, in the file's order."""
+    """Return the frames of a transforms file, undistorted and downscaled, in the file's order."""
 
     def shoot(frame: dict[str, Any]) -> Shot:
         return _shot(file, {**meta, **frame}, downscale, shelf)
@@ -133,7 +134,7 @@ def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) 
 
 
 def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Shot:
-    """One frame; `frame` holds the file's global values too, under the frame's own."""
+    """Return one frame; `frame` holds the file's global values too, under the frame's own."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
     path = file.parent / frame["file_path"]
@@ -154,7 +155,7 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Sh
 
 
 def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
-    """The mask that a frame names, or else that of its image in a folder `masks` beside the folder `images`."""
+    """Return the mask that a frame names, or else that of its image in a folder `masks` beside the folder `images`."""
     if frame.get("mask_path"):
         return named_mask(file.parent / frame["mask_path"], downscale)
     images = file.parent / "images"
@@ -175,7 +176,7 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
 
 
 def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str) -> Lens:
-    """The camera of a frame; sizes default to the image's, the principal point to the centre."""
+    """Return the camera of a frame; sizes default to the image's, the principal point to the centre."""
     width, height = _side(frame, "w", pixels.shape[1], what), _side(frame, "h", pixels.shape[0], what)
     fx, fy = _focal_lengths(frame, width, height, what)
     model, distortion = _distortion(frame, what)
@@ -184,7 +185,7 @@ def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str) -> Lens:
 
 
 def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float:
-    """A number of a frame. ValueError: there is something else."""
+    """Return a number of a frame. ValueError: there is something else."""
     value = frame.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{what}: {key} must be a number; got {shortened(value)}")
@@ -192,7 +193,7 @@ def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float
 
 
 def _side(frame: dict[str, Any], key: str, default: int, what: str) -> int:
-    """A side of the image in pixels; 0 and null stand for the image's own."""
+    """Return a side of the image in pixels; 0 and null stand for the image's own."""
     side = _number(frame, key, default, what) if frame.get(key) else default
     if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
         raise ValueError(f"{what}: {key} must lie in 1..{LONGEST_SIDE} pixels; got {side:g}")
@@ -200,7 +201,7 @@ def _side(frame: dict[str, Any], key: str, default: int, what: str) -> int:
 
 
 def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) -> tuple[float, float]:
-    """(fx, fy) in pixels, from fl_x and fl_y or from the angles of view; one stands for both if alone."""
+    """Return (fx, fy) in pixels, from fl_x and fl_y or from the angles of view; one stands for both if alone."""
     lengths = {}
     for axis, size in (("x", width), ("y", height)):
         if f"fl_{axis}" in frame:

@@ -17,7 +17,7 @@ ZERO_SPREAD = 1e-9
 
 
 def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
-    """The similarity to the normalised world.
+    """Return the similarity to the normalised world.
 
     The origin goes to the point nearest, in least squares, to all optical axes (to the mean camera centre where the
     axes are nearly parallel), the mean camera-up to +z (kept as it is where the ups cancel), and the median distance
@@ -55,7 +55,7 @@ def _nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 def _rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation [3, 3] that turns `up` to +z."""
+    """Return the smallest rotation [3, 3] that turns `up` to +z."""
     if np.linalg.norm(up) < MIN_UP_LENGTH:
         return np.eye(3)
     up = up / np.linalg.norm(up)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def group_folders(root: Path, controller: str) -> list[Path]:
-    """The folders of the groups that limit this process in something, its own first, those around it after.
+    """Return the folders of the groups that limit this process in something, its own first, those around it after.
 
     A group's limit holds for all groups in it. In a container the path of the process's group may be that outside,
     whose folders do not exist; then the limit is found at the top.

@@ -13,7 +13,7 @@ _chosen: int | None = None
 
 
 def set_num_threads(num_threads: int | None) -> None:
-    """Sets the number of threads of native loops, from their next call on; XLA's own threads are not affected.
+    """Set the number of threads of native loops, from their next call on; XLA's own threads are not affected.
 
     Results depend on it in the last bits of gradients only; on nothing else, such as timing.
 
@@ -32,7 +32,7 @@ def set_num_threads(num_threads: int | None) -> None:
 
 
 def num_threads() -> int:
-    """The number that was set, or the environment's, or that of the cores that this process may use.
+    """Return the number that was set, or the environment's, or that of the cores that this process may use.
 
     Raises:
       ValueError: if the environment's is not a positive integer.
@@ -48,7 +48,7 @@ def num_threads() -> int:
 
 
 def _usable_cores() -> int:
-    """The cores that the process may run on, or fewer where a control group (a container) gives it less time."""
+    """Return the cores that the process may run on, or fewer where a control group (a container) gives it less time."""
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     return max(1, math.ceil(min(cores, _own_quota())))
@@ -60,7 +60,7 @@ def _own_quota() -> float:
 
 
 def cpu_quota(root: Path) -> float:
-    """The processors' time per time that control groups leave to this process; inf without a limit.
+    """Return the processors' time per time that control groups leave to this process; inf without a limit.
 
     Args:
       root: of the file system, as for `host.control_groups.group_folders`.
@@ -69,7 +69,7 @@ def cpu_quota(root: Path) -> float:
 
 
 def _folder_quota(folder: Path) -> float:
-    """The limit of one group: cpu.max of version 2, or the files of version 1."""
+    """Return the limit of one group: cpu.max of version 2, or the files of version 1."""
     try:
         if (folder / "cpu.max").is_file():
             quota, period = (folder / "cpu.max").read_text().split()

@@ -33,7 +33,7 @@ STEPS[[*b"[{"]], STEPS[[*b"]}"]] = 1, -1
 
 
 def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
-    """The value of a JSON text.
+    """Return the value of a JSON text.
 
     Args:
       text: the text, or UTF-8.
@@ -61,7 +61,7 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
 
 
 def parse_toml(data: bytes) -> dict[str, Any]:
-    """The table of a TOML text.
+    """Return the table of a TOML text.
 
     Args:
       data: UTF-8.
@@ -91,14 +91,14 @@ def _check_size(data: bytes, most: int) -> None:
 
 
 def _outside_strings(data: bytes) -> np.ndarray:
-    """The brackets of a JSON text, and whatever else stands outside its strings, as bytes."""
+    """Return the brackets of a JSON text, and whatever else stands outside its strings, as bytes."""
     letters = np.frombuffer(data.replace(b"\\\\", b"").replace(b'\\"', b""), np.uint8)
     num_quotes = np.cumsum(letters == ord('"'), dtype=np.uint8)  # Wraps, which keeps it even or odd.
     return letters[num_quotes % 2 == 0]
 
 
 def _check_brackets(outside: np.ndarray) -> None:
-    """Raises ValueError unless the brackets among bytes are few enough and nested at most `DEEPEST` deep.
+    """Raise ValueError unless the brackets among bytes are few enough and nested at most `DEEPEST` deep.
 
     Texts whose brackets do not match are refused where they are parsed.
     """
@@ -111,7 +111,7 @@ def _check_brackets(outside: np.ndarray) -> None:
 
 
 def _check_depth(value: Any) -> None:
-    """Raises ValueError if lists and mappings, by brackets or dots, are nested more than `DEEPEST` deep."""
+    """Raise ValueError if lists and mappings, by brackets or dots, are nested more than `DEEPEST` deep."""
     level = [value]
     for _ in range(DEEPEST):
         level = [inner for held in level for inner in _held(held)]
@@ -121,6 +121,6 @@ def _check_depth(value: Any) -> None:
 
 
 def _held(value: Any) -> Any:
-    """The lists and objects in one."""
+    """Return the lists and objects in one."""
     values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return (inner for inner in values if isinstance(inner, dict | list))

@@ -38,7 +38,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """The one that this process runs on; JAX's devices are started."""
+    """Return the one that this process runs on; JAX's devices are started."""
     device = jax.devices()[0]
     kind = f"{device.platform} {device.device_kind}"
     return Machine(jax.__version__, jax.lib.__version__, kind, processor_key(), num_threads())

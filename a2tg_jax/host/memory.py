@@ -17,7 +17,7 @@ LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.us
 
 
 def memory_limit(root: Path = Path("/")) -> int:
-    """Bytes of memory that this process may have in all: what it has and what is free, now (host).
+    """Return bytes of memory that this process may have in all: what it has and what is free, now (host).
 
     Limits of control groups count. What a group keeps of files that can be read again is free.
 
@@ -33,12 +33,12 @@ def memory_limit(root: Path = Path("/")) -> int:
 
 
 def memory_peak(root: Path = Path("/")) -> int:
-    """Bytes of memory that this process had at its peak; 0 where the system does not tell (host)."""
+    """Return bytes of memory that this process had at its peak; 0 where the system does not tell (host)."""
     return _told(root / "proc/self/status").get("VmHWM", 0)
 
 
 def _told(file: Path) -> dict[str, int]:
-    """The bytes of a file of lines "Name: 123 kB"; empty where there is none."""
+    """Return the bytes of a file of lines "Name: 123 kB"; empty where there is none."""
     try:
         lines = [line.replace(":", " ").split() for line in file.read_text().splitlines()]
     except OSError:
@@ -47,7 +47,7 @@ def _told(file: Path) -> dict[str, int]:
 
 
 def _left_in(folder: Path) -> int | None:
-    """Bytes that a control group still has room for; None without a limit."""
+    """Return bytes that a control group still has room for; None without a limit."""
     for limit, usage in LIMITS:
         try:
             room = int((folder / limit).read_text()) - int((folder / usage).read_text())

@@ -22,7 +22,7 @@ LONGEST_REASON = 200
 
 
 def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, np.ndarray]:
-    """The wanted arrays of an .npz, by name.
+    """Return the wanted arrays of an .npz, by name.
 
     Raises:
       OSError: if the file cannot be opened.
@@ -52,7 +52,7 @@ def _read_arrays(archive: zipfile.ZipFile, room: int, is_wanted: Callable[[str],
 
 
 def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
-    """One array, of as many bytes as its entry has left after its header."""
+    """Return one array, of as many bytes as its entry has left after its header."""
     dtype, is_fortran, shape = _read_header(file, name)
     left = size - file.tell()
     if math.prod(shape) * dtype.itemsize != left:
@@ -69,7 +69,7 @@ def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
 
 
 def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int, ...]]:
-    """The dtype of one array, whether its first index runs fastest, and its shape."""
+    """Return the dtype of one array, whether its first index runs fastest, and its shape."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{name} is of the version {version} of .npy, which is not known here")

@@ -14,7 +14,7 @@ MOST_ARRAY_BYTES = 1 << 34
 
 
 def is_regular(path: str | os.PathLike) -> bool:
-    """Whether there is a regular file; False where there is nothing, or a folder.
+    """Return whether there is a regular file; False where there is nothing, or a folder.
 
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.
@@ -28,7 +28,7 @@ def is_regular(path: str | os.PathLike) -> bool:
 
 
 def open_regular(path: str | os.PathLike, most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
-    """Opens a regular file for reading bytes.
+    """Open a regular file for reading bytes.
 
     Args:
       path: the file.
@@ -51,7 +51,7 @@ def open_regular(path: str | os.PathLike, most_bytes: int = MOST_ARRAY_BYTES) ->
 
 
 def read_regular(path: str | os.PathLike, most_bytes: int) -> bytes:
-    """Reads the bytes of a regular file, up to the size that it has when it is opened. Raises as `open_regular`."""
+    """Read the bytes of a regular file, up to the size that it has when it is opened. Raises as `open_regular`."""
     with open_regular(path, most_bytes) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 

@@ -18,7 +18,7 @@ WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 
 
 def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> None:
-    """Makes JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
+    """Make JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
     Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS, of which the user's own settings have
     precedence: while-loops are compiled whole, which compositing by XLA gains from, and vectors are 512 bits wide where
@@ -47,14 +47,14 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
 
 
 def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[str, ...]:
-    """The XLA flags that help on a processor with these features, as far as this JAX is known to have them."""
+    """Return the XLA flags that help on a processor with these features, as far as this JAX is known to have them."""
     if jax_version not in CHECKED_JAX_VERSIONS:
         return ()
     return (WHOLE_LOOPS_FLAG, WIDE_VECTORS_FLAG) if "avx512f" in features else (WHOLE_LOOPS_FLAG,)
 
 
 def silence_xla() -> None:
-    """Lets XLA's C++ code log fatal errors only; what it raises is not affected, nor what JAX itself logs.
+    """Let XLA's C++ code log fatal errors only; what it raises is not affected, nor what JAX itself logs.
 
     With AVX-512, XLA finds two tuning hints of its own missing from the processor's features whenever it reads a
     program from a cache, and says at length that it may crash; it does not (openxla/xla#44565). A user who has asked
@@ -68,19 +68,19 @@ def silence_xla() -> None:
 
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:
-    """Appends flags to the environment's XLA_FLAGS, except those that the user has set already."""
+    """Append flags to the environment's XLA_FLAGS, except those that the user has set already."""
     own = os.environ.get("XLA_FLAGS", "").split()
     taken = {flag.split("=", 1)[0] for flag in own}
     os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
 
 
 def cache_folder() -> Path:
-    """The folder of what can be made again: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
+    """Return the folder of what can be made again: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "a2tg-jax"
 
 
 def compilation_cache_folder() -> Path:
-    """The folder of compiled programs, one per processor and jaxlib: code for one may not run on another.
+    """Return the folder of compiled programs, one per processor and jaxlib: code for one may not run on another.
 
     It lies in `cache_folder()` and may be deleted at any time.
     """
@@ -88,13 +88,13 @@ def compilation_cache_folder() -> Path:
 
 
 def processor_key() -> str:
-    """A short text that processors share for which the same code is made."""
+    """Return a short text that processors share for which the same code is made."""
     processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
     return hashlib.sha256(processor.encode()).hexdigest()[:12]
 
 
 def _processor_features() -> frozenset[str]:
-    """The processor's features as Linux lists them; empty elsewhere."""
+    """Return the processor's features as Linux lists them; empty elsewhere."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -7,7 +7,8 @@ SLACK = 10
 
 
 def shortened(value: Any, most: int = 80) -> str:
-    """A value as an error tells it, on one line of bounded length; texts without quotes, nor what steers a terminal."""
+    """Return a value as an error tells it, on one line of bounded length; texts without quotes, nor what steers a
+    terminal."""
     text = (value if isinstance(value, str) else repr(value))[: SLACK * most]  # Words of it all would take memory.
     text = " ".join(text.split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])

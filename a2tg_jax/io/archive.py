@@ -25,7 +25,7 @@ HEADER = "header"
 def write_archive(
     path: str | os.PathLike, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, format: str = FORMAT
 ) -> None:
-    """Writes an archive; an older file of that name is replaced once the new one is whole.
+    """Write an archive; an older file of that name is replaced once the new one is whole.
 
     Args:
       path: the file, by custom *.npz.
@@ -40,7 +40,7 @@ def write_archive(
 
 
 def read_archive(path: str | os.PathLike, *, format: str = FORMAT) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the arrays that `write_archive` was given.
+    """Return the header and the arrays that `write_archive` was given.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -51,7 +51,7 @@ def read_archive(path: str | os.PathLike, *, format: str = FORMAT) -> tuple[dict
 
 
 def read_archive_header(path: str | os.PathLike, *, format: str = FORMAT) -> dict[str, Any]:
-    """The header alone, without reading the arrays. Raises as `read_archive` does."""
+    """Return the header alone, without reading the arrays. Raises as `read_archive` does."""
     path = Path(path)
     entries = _read_entries(path, format, lambda name: name == HEADER)
     if HEADER not in entries:
@@ -74,7 +74,7 @@ def read_archive_header(path: str | os.PathLike, *, format: str = FORMAT) -> dic
 
 
 def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
-    """The wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
+    """Return the wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such {format}")
     try:

@@ -31,7 +31,7 @@ class CodedError(ValueError):
 
 
 def encode_smallest(planes: np.ndarray) -> tuple[Coder, bytes]:
-    """The coder that makes least of planes [C, n], and what it makes."""
+    """Return the coder that makes least of planes [C, n], and what it makes."""
     fitting: list[Coder] = ["lzma", "zstd", "none"]
     if max(_webp_sides(*planes.shape)) <= LONGEST_WEBP_SIDE:
         fitting.append("webp")
@@ -45,7 +45,7 @@ def encode(coder: Coder, planes: np.ndarray) -> bytes:
 
 
 def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
-    """The planes [num_planes, length] of uint8 that `encode` was given.
+    """Return the planes [num_planes, length] of uint8 that `encode` was given.
 
     Raises:
       CodedError: if the bytes are damaged, or hold more or less than that.
@@ -64,7 +64,7 @@ def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
 
 
 def _encode_zstd(planes: np.ndarray) -> bytes:
-    """One frame; a plane begins a block of its own, with tables of its own."""
+    """Return one frame; a plane begins a block of its own, with tables of its own."""
     stream = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compressobj(size=planes.size)
     pieces = [stream.compress(plane.tobytes()) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for plane in planes]
     return b"".join([*pieces, stream.flush()])

@@ -1,7 +1,11 @@
-"""Compact scene files, *.a2tgz: a model in few bytes, its numbers rounded to as many bits as are chosen.
+"""Compact scene files, *.a2tgz: a model in few bytes, with a chosen number of bits for each group of numbers.
 
-docs/formats.md describes the file. The rows of a model come back in another order, that of a Z curve through the means,
-with quaternions of unit length; what it shows is the same up to rounding.
+docs/formats.md describes the file. Rows come back in the order of a Z curve through the means, with quaternions of unit
+length; the model shows the same up to rounding.
+
+Files for browsers (`io.web_scene`, *.a2tgw) are another format. This one is smaller: it sorts rows by place, codes each
+group of numbers as a whole with LZMA, zstd or WebP, and restores the model with its appearance, origin and float64
+cameras. It must be read to its end before anything can be drawn, and browsers have no decoder for LZMA.
 """
 
 import dataclasses
@@ -78,11 +82,11 @@ class CompactChoices:
     """lzma, of Python's own library; zstd; webp, as lossless images; none; or for each part the smallest of them."""
 
     def keeping(self, others: Mapping[str, Any]) -> Self:
-        """The choices with others, by name."""
+        """Return the choices with others, by name."""
         return dataclasses.replace(self, **dict(others))  # type: ignore[arg-type]
 
     def check(self) -> Self:
-        """Raises ValueError, naming the choice, if one cannot be."""
+        """Raise ValueError, naming the choice, if one cannot be."""
         for field in dataclasses.fields(self):
             if field.name != "coder":
                 check_precision(f"choices.{field.name}", getattr(self, field.name))
@@ -97,7 +101,7 @@ DEFAULT_CHOICES = CompactChoices()
 
 
 def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoices = DEFAULT_CHOICES) -> None:
-    """Writes the rows of a model that exist, with its appearance and its origin, in few bytes.
+    """Write the rows of a model that exist, with its appearance and its origin, in few bytes.
 
     Args:
       path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
@@ -114,7 +118,7 @@ def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoic
 
 
 def load_compact(path: str | os.PathLike) -> Model:
-    """The model of a compact file, float32, its rows in the order of the file.
+    """Return the model of a compact file, float32, its rows in the order of the file.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -127,7 +131,7 @@ def load_compact(path: str | os.PathLike) -> Model:
 
 
 def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> bytes:
-    """The bytes of `save_compact`. Raises as it does."""
+    """Return the bytes of `save_compact`. Raises as it does."""
     choices.check()
     check_gaussians(model.gaussians, "model.gaussians")
     check_kind(model.appearance)
@@ -139,7 +143,7 @@ def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> byt
 
 
 def decode_model(data: bytes, where: str = "the compact scene") -> Model:
-    """The model of the bytes of a file; errors call it `where`. Raises as `load_compact` does."""
+    """Return the model of the bytes of a file; errors call it `where`. Raises as `load_compact` does."""
     try:
         return _decoded(data)
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
@@ -150,7 +154,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
 
 
 def bytes_by_part(data: bytes) -> dict[str, int]:
-    """How many bytes each part of a whole file takes, the header included."""
+    """Return how many bytes each part of a whole file takes, the header included."""
     header, body = _unframed(data)
     return {"header": len(data) - len(body), **header["lengths"]}
 
@@ -159,7 +163,7 @@ def bytes_by_part(data: bytes) -> dict[str, int]:
 
 
 def _encoded(model: Model, choices: CompactChoices) -> tuple[bytes, int]:
-    """The file, and how many bytes it unpacks to."""
+    """Return the file, and how many bytes it unpacks to."""
     writer, rows = Writer(choices.coder), rows_of(model)
     rows = ordered(rows, writer.means("means", rows.means.T, choices.means))
     writer.numbers("log_scales", rows.log_scales.T, choices.log_scales)
@@ -219,7 +223,7 @@ def _decoded(data: bytes) -> Model:
 
 
 def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The header and the body of a whole file."""
+    """Return the header and the body of a whole file."""
     if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
         raise ValueError("is not a compact scene of a2tg-jax")
     _, version, num_coded, num_text, checksum = HEAD.unpack_from(data)
@@ -237,12 +241,12 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _room(data: bytes) -> int:
-    """How many bytes a file may unpack to."""
+    """Return how many bytes a file may unpack to."""
     return FREE_ROOM + LARGEST_RATIO * len(data)
 
 
 def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices) -> Rows:
-    """The tables of a file, of no more rows than it can hold."""
+    """Return the tables of a file, of no more rows than it can hold."""
     num, base, table = header["num"], header["base_degree"], header["degrees"]
     if type(num) is not int or num < 0 or type(base) is not int or not 0 <= base <= MAX_DEGREE:
         raise ValueError(f"must be of a number of rows, and of a base degree in 0..3; got {num!r}, {base!r}")

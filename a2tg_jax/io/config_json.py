@@ -16,14 +16,14 @@ NONE = "None"
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:
-    """A dataclass of numbers, texts, tuples and dataclasses as nested dictionaries; tuples become lists."""
+    """Return a dataclass of numbers, texts, tuples and dataclasses as nested dictionaries; tuples become lists."""
     return {field.name: _to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
 def config_from_dict(
     kind: type[ConfigT], data: Mapping[str, Any], where: str = "config", *, given: Mapping[str, Any] | None = None
 ) -> ConfigT:
-    """The dataclass `kind` that `config_to_dict` was given.
+    """Return the dataclass `kind` that `config_to_dict` was given.
 
     Args:
       kind: the dataclass.
@@ -53,7 +53,7 @@ def config_from_dict(
 
 
 def has_default(field: dataclasses.Field) -> bool:
-    """Whether a field of a dataclass need not be given."""
+    """Return whether a field of a dataclass need not be given."""
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
@@ -68,7 +68,7 @@ def _instead(name: str, names: list[str]) -> str:
 
 
 def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The leaves of a configuration by dotted name, as the command line calls them: {"texture.cap": 4, ...}."""
+    """Return the leaves of a configuration by dotted name, as the command line calls them: {"texture.cap": 4, ...}."""
     leaves: dict[str, Any] = {}
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
@@ -84,7 +84,7 @@ def _to_json(value: Any) -> Any:
 
 
 def _from_json(hint: Any, value: Any, where: str) -> Any:
-    """`value` as the type that the annotation asks for."""
+    """Return `value` as the type that the annotation asks for."""
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
     is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
@@ -98,12 +98,12 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
 
 
 def _told(hint: Any) -> str:
-    """A type as a user reads it."""
+    """Return a type as a user reads it."""
     return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint).replace("typing.", "")
 
 
 def _fits(hint: Any, value: Any) -> bool:
-    """Whether a JSON value is of a plain type; an integer is a good float, a truth value is not a number."""
+    """Return whether a JSON value is of a plain type; an integer is a good float, a truth value is not a number."""
     origin = typing.get_origin(hint)
     if origin is typing.Literal:
         return value in typing.get_args(hint)
@@ -117,14 +117,14 @@ def _fits(hint: Any, value: Any) -> bool:
 
 
 def _converted(hint: Any, value: Any) -> Any:
-    """A value that fits, as the type itself."""
+    """Return a value that fits, as the type itself."""
     if typing.get_origin(hint) is tuple:
         return tuple(map(_converted, _item_hints(hint, value), value))
     return float(value) if hint is float else value
 
 
 def _item_hints(hint: Any, value: list) -> tuple:
-    """The types of the items of a tuple; too few or too many match no list of that length."""
+    """Return the types of the items of a tuple; too few or too many match no list of that length."""
     first, *rest = typing.get_args(hint)
     if rest == [...]:
         return (first,) * len(value)

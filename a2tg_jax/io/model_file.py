@@ -36,7 +36,7 @@ APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
 
 
 def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
-    """Writes the rows of a model that exist, with its appearance and its origin.
+    """Write the rows of a model that exist, with its appearance and its origin.
 
     Args:
       path: the file, by custom *.npz; an older one is replaced once the new one is whole.
@@ -62,7 +62,7 @@ def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] 
 
 
 def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance]] = ()) -> Model:
-    """The model that `save_model` wrote.
+    """Return the model that `save_model` wrote.
 
     A model of version 0.1.0, which knew one kind of textures, gets them with the default options.
 
@@ -130,14 +130,15 @@ def _held_appearances(appearance: Appearance) -> dict[str, Appearance]:
 
 
 def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
-    """The appearance that `appearance_to_dict` was given. ValueError: its class is not known here."""
+    """Return the appearance that `appearance_to_dict` was given. ValueError: its class is not known here."""
     kind = _known_class(data["module"], data["name"], appearances)
     held = {name: appearance_from_dict(inner, appearances) for name, inner in data.get("held", {}).items()}
     return config_from_dict(kind, data["options"], f"options of {kind.__name__}", given=held)
 
 
 def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]) -> type[Appearance]:
-    """The class that a file names: one that was handed over, this package's, or one of a module already imported."""
+    """Return the class that a file names: one that was handed over, this package's, or one of a module already
+    imported."""
     given = [kind for kind in appearances if kind.__qualname__ == name]
     found: Any = given[0] if given else None
     if found is None and module.partition(".")[0] == __name__.partition(".")[0]:
@@ -161,7 +162,7 @@ def origin_to_dict(origin: Origin) -> dict[str, Any]:
 
 
 def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
-    """The numbers of an origin."""
+    """Return the numbers of an origin."""
     world = origin.transform
     return {
         "viewmats": origin.viewmats,
@@ -175,7 +176,8 @@ def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
 
 
 def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
-    """The origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape or a number is wrong."""
+    """Return the origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape or a number is
+    wrong."""
     names, (red, green, blue) = data["names"], data["background"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"origin/names must be texts; got {shortened(names)}")

@@ -21,7 +21,7 @@ ROUNDING = 1e-3
 
 
 def load_views(path: Path) -> list[Camera]:
-    """The cameras of a file, in the world of the model that was looked at, float32.
+    """Return the cameras of a file, in the world of the model that was looked at, float32.
 
     Raises:
       FileNotFoundError: if there is no such file.

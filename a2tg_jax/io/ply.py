@@ -50,7 +50,7 @@ def save_ply(
     *,
     third_scale: bool = False,
 ) -> None:
-    """Writes Gaussians as 2DGS does, normals along the splats' own.
+    """Write Gaussians as 2DGS does, normals along the splats' own.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
@@ -96,7 +96,7 @@ def save_ply(
 
 
 def _as_plain(model: Model) -> Gaussians:
-    """The Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
+    """Return the Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
     shown = model.gaussians, model.params, model.layout
     gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.appearance.sh(*shown)))
     if has_own_opacities(model.appearance):
@@ -106,13 +106,13 @@ def _as_plain(model: Model) -> Gaussians:
 
 
 def has_own_opacities(appearance: Appearance) -> bool:
-    """Whether splats are as opaque as their Gaussians say."""
+    """Return whether splats are as opaque as their Gaussians say."""
     inner = appearance.inner if isinstance(appearance, Banded) else appearance
     return type(inner).opacities is Appearance.opacities
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
-    """Reads Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
+    """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
     They have the SH degree of the file; further attributes are left aside. A 3DGS file (scale_2) holds
     ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning where that is more
@@ -139,7 +139,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
 
 
 def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
-    """The vertices, structured, with the attributes that 2DGS gives them."""
+    """Return the vertices, structured, with the attributes that 2DGS gives them."""
     header = read_vertex_header(file, path)
     if header.encoding != ENCODING:
         raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
@@ -191,7 +191,7 @@ def _without_thinnest_axis(quats: np.ndarray, log_scales: np.ndarray, path: Path
 
 
 def _quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz: the second rotation, and after it the first."""
+    """Return [N, 4] wxyz: the second rotation, and after it the first."""
     w, x, y, z = first.T
     a, b, c, d = second.T
     return np.stack(

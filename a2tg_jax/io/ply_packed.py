@@ -25,7 +25,8 @@ LEAST_OPACITY = 1e-6
 
 
 def is_packed(file: BinaryIO, path: Path) -> bool:
-    """Whether a PLY is packed so; the file is left at its beginning. Raises ValueError where it has no header."""
+    """Return whether a PLY is packed so; the file is left at its beginning. Raises ValueError where it has no
+    header."""
     elements = (words[1] for words in header_lines(file, path) if words[:1] == ["element"] and len(words) > 1)
     first = next(elements, "")
     file.seek(0)
@@ -33,7 +34,7 @@ def is_packed(file: BinaryIO, path: Path) -> bool:
 
 
 def read_packed(file: BinaryIO, path: Path) -> np.ndarray:
-    """The vertices of a packed PLY, structured, with the attribute names of 3DGS; float32.
+    """Return the vertices of a packed PLY, structured, with the attribute names of 3DGS; float32.
 
     Raises:
       ValueError: naming the file, if it is cut off, not binary, or its elements do not fit each other.

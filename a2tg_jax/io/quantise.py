@@ -21,14 +21,14 @@ class Ends(NamedTuple):
 
 
 def check_precision(name: str, precision: Precision) -> None:
-    """Raises ValueError, naming the choice, unless it is a number of bits or a float type."""
+    """Raise ValueError, naming the choice, unless it is a number of bits or a float type."""
     is_bits = isinstance(precision, int) and not isinstance(precision, bool) and 1 <= precision <= MOST_BITS
     if not is_bits and precision not in ("float32", "float16"):
         raise ValueError(f"{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
 
 
 def ends_of(values: np.ndarray, bits: int) -> Ends:
-    """The smallest and the largest of all numbers; 0 and 0 where there are none.
+    """Return the smallest and the largest of all numbers; 0 and 0 where there are none.
 
     Where 0 lies between them, they are moved apart, by a step together, so that a step lies on 0: most of what is added
     to something else is about 0.
@@ -44,12 +44,12 @@ def ends_of(values: np.ndarray, bits: int) -> Ends:
 
 
 def _short(value: np.float32) -> float:
-    """The float of fewest digits that is the same float32."""
+    """Return the float of fewest digits that is the same float32."""
     return float(str(value))
 
 
 def quantised(values: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
-    """The nearest of 2^bits even steps between the ends, as int64; all 0 where both ends are one."""
+    """Return the nearest of 2^bits even steps between the ends, as int64; all 0 where both ends are one."""
     low, high = ends
     if high <= low:
         return np.zeros(values.shape, np.int64)
@@ -59,13 +59,13 @@ def quantised(values: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
 
 
 def dequantised(codes: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
-    """The values of steps, float64: off by half a step at most, (high − low) / (2^bits − 1) / 2."""
+    """Return the values of steps, float64: off by half a step at most, (high − low) / (2^bits − 1) / 2."""
     low, high = ends
     return low + codes * ((high - low) / ((1 << bits) - 1))
 
 
 def num_bytes_of(bits: int) -> int:
-    """Bytes that so many bits take."""
+    """Return bytes that so many bits take."""
     return -(-bits // 8)
 
 
@@ -77,7 +77,7 @@ def to_planes(codes: np.ndarray, bits: int) -> np.ndarray:
 
 
 def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
-    """The codes [num_columns, n] that `to_planes` was given, as int64."""
+    """Return the codes [num_columns, n] that `to_planes` was given, as int64."""
     codes = np.zeros((num_columns, planes.shape[1]), np.int64)
     for index in range(len(planes) // num_columns):
         codes |= planes[index * num_columns : (index + 1) * num_columns].astype(np.int64) << (8 * index)
@@ -93,7 +93,7 @@ def to_byte_planes(values: np.ndarray) -> np.ndarray:
 
 
 def from_byte_planes(planes: np.ndarray, num_columns: int, dtype: np.dtype) -> np.ndarray:
-    """The numbers [num_columns, n] that `to_byte_planes` was given."""
+    """Return the numbers [num_columns, n] that `to_byte_planes` was given."""
     dtype = np.dtype(dtype).newbyteorder("<")
     by_byte = planes.reshape(dtype.itemsize, num_columns, planes.shape[1]).transpose(1, 2, 0)
     return np.ascontiguousarray(by_byte).view(dtype)[..., 0]
@@ -110,7 +110,7 @@ def green_apart(codes: np.ndarray, bits: int) -> np.ndarray:
 
 
 def with_green(codes: np.ndarray, bits: int) -> np.ndarray:
-    """The inverse of `green_apart`."""
+    """Return the inverse of `green_apart`."""
     red, green, blue = codes
     mask = (1 << 8 * num_bytes_of(bits)) - 1
     return np.stack([(red + green) & mask, green, (blue + green) & mask])
@@ -142,7 +142,7 @@ class Contraction(NamedTuple):
 
 
 def morton(codes: np.ndarray, bits: int) -> np.ndarray:
-    """[n] places along the Z curve of codes [3, n] of so many bits: theirs by turns, x lowest; int64."""
+    """Return [n] places along the Z curve of codes [3, n] of so many bits: theirs by turns, x lowest; int64."""
     key = np.zeros(codes.shape[1], np.int64)
     for bit in range(bits):
         for axis in range(3):
@@ -151,7 +151,7 @@ def morton(codes: np.ndarray, bits: int) -> np.ndarray:
 
 
 def from_morton(key: np.ndarray, bits: int) -> np.ndarray:
-    """The inverse of `morton`."""
+    """Return the inverse of `morton`."""
     codes = np.zeros((3, len(key)), np.int64)
     for bit in range(bits):
         for axis in range(3):

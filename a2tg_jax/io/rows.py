@@ -44,7 +44,7 @@ class Rows:
 
 
 def check_kind(appearance: Appearance) -> None:
-    """Raises ValueError unless a compact file can hold what splats show."""
+    """Raise ValueError unless a compact file can hold what splats show."""
     if type(_inner(appearance)) not in (Plain, Textured) or type(appearance) not in (Plain, Textured, Banded):
         raise ValueError(
             f"model shows {type(_inner(appearance)).__name__}: a compact file holds Plain, Textured and Banded of "
@@ -57,7 +57,8 @@ def _inner(appearance: Appearance) -> Appearance:
 
 
 def rows_of(model: Model) -> Rows:
-    """The tables of a model of which all rows exist, in the model's order; finite, or ValueError names the field."""
+    """Return the tables of a model of which all rows exist, in the model's order; finite, or ValueError names the
+    field."""
     gaussians = model.gaussians
     fields = {field.name: np.asarray(getattr(gaussians, field.name)) for field in dataclasses.fields(gaussians)}
     shown = model.appearance.arrays(model.params, model.layout)
@@ -78,7 +79,7 @@ def rows_of(model: Model) -> Rows:
 
 
 def ordered(rows: Rows, order: np.ndarray) -> Rows:
-    """The splats order[0], order[1], …, turned by half where that makes their rotations smaller."""
+    """Return the splats order[0], order[1], …, turned by half where that makes their rotations smaller."""
     quats, axis = nearest_half_turn(rows.quats[order])
     return Rows(
         means=rows.means[order],
@@ -93,7 +94,7 @@ def ordered(rows: Rows, order: np.ndarray) -> Rows:
 
 
 def _owned(degrees: np.ndarray, order: np.ndarray, degree: int) -> np.ndarray:
-    """The rows of a band, in the order of their splats."""
+    """Return the rows of a band, in the order of their splats."""
     places = np.cumsum(degrees >= degree) - 1
     return places[order[degrees[order] >= degree]]
 
@@ -112,7 +113,7 @@ def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarra
 
 
 def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None) -> Model:
-    """The model of tables, float32.
+    """Return the model of tables, float32.
 
     Args:
       rows: the tables.

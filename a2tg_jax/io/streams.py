@@ -140,13 +140,13 @@ class Reader:
             raise ValueError(f"the part {name} {error}") from error
 
     def take_room(self, name: str, num_bytes: int) -> None:
-        """Raises ValueError where so many bytes more than a file of this size may unpack to."""
+        """Raise ValueError where so many bytes more than a file of this size may unpack to."""
         if num_bytes > self.room:
             raise ValueError(f"{name} would take {num_bytes} bytes, which the file is too small for")
         self.room -= num_bytes
 
     def end(self) -> None:
-        """Raises ValueError unless all parts were read."""
+        """Raise ValueError unless all parts were read."""
         if self._names:
             raise ValueError(f"the part {self._names[0]} is not known")
 

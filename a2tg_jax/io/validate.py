@@ -25,7 +25,7 @@ LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
 
 
 def check_model(model: Model) -> None:
-    """Raises ValueError, naming the field, unless a model can be rendered and trained.
+    """Raise ValueError, naming the field, unless a model can be rendered and trained.
 
     All fields have their shapes and one dtype, all numbers are finite, what is shown has a row for each Gaussian, and
     rows of textures and of coefficients lie within their tables.
@@ -49,7 +49,7 @@ def check_model(model: Model) -> None:
 
 
 def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaussians) -> None:
-    """Raises ValueError unless floats are shown, by as many rows as there are Gaussians, with bands above their own."""
+    """Raise ValueError unless floats are shown, by as many rows as there are Gaussians, with bands above their own."""
     num, kind = gaussians.num, type(appearance).__name__
     if isinstance(appearance, Banded):
         own, base = gaussians.sh_degree, layout.bands.base_degree
@@ -72,7 +72,7 @@ def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaus
 
 
 def check_places(textures: Textures, layout: AtlasLayout) -> None:
-    """Raises ValueError unless each texture has a row of its own that its bucket has."""
+    """Raise ValueError unless each texture has a row of its own that its bucket has."""
     bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
     if bucket.size and not 0 <= bucket.min() <= bucket.max() < len(textures.buckets):
         raise ValueError(f"layout.bucket must lie below {len(textures.buckets)}; got {bucket.min()}..{bucket.max()}")
@@ -85,7 +85,7 @@ def check_places(textures: Textures, layout: AtlasLayout) -> None:
 
 
 def check_origin(origin: Origin) -> None:
-    """Raises ValueError, naming the field, unless all cameras and the world of an origin are such."""
+    """Raise ValueError, naming the field, unless all cameras and the world of an origin are such."""
     cameras = zip(origin.names, origin.viewmats, origin.Ks, origin.sizes.tolist(), strict=True)
     for name, viewmat, K, (width, height) in cameras:
         check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
@@ -98,7 +98,7 @@ def check_origin(origin: Origin) -> None:
 
 
 def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
-    """Raises ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
+    """Raise ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         values = np.asarray(leaf)
         if not np.issubdtype(values.dtype, np.floating):
@@ -109,7 +109,7 @@ def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
 
 
 def check_bounded(name: str, tree: Any) -> None:
-    """Raises ValueError, naming the leaf and the number, if a float is not finite or too large."""
+    """Raise ValueError, naming the leaf and the number, if a float is not finite or too large."""
     check_finite(name, tree)
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         values = np.asarray(leaf)
@@ -122,14 +122,14 @@ def check_bounded(name: str, tree: Any) -> None:
 
 
 def check_count(name: str, value: Any, most: int) -> None:
-    """Raises ValueError unless a value is one integer in 0..most."""
+    """Raise ValueError unless a value is one integer in 0..most."""
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "iu" or not 0 <= int(number) <= most:
         raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(value)}")
 
 
 def check_like(name: str, tree: Any, wanted: Any) -> None:
-    """Raises ValueError, naming the leaf, unless two pytrees of one structure have the same shapes and dtypes."""
+    """Raise ValueError, naming the leaf, unless two pytrees of one structure have the same shapes and dtypes."""
     pairs: Iterable = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
     for (path, leaf), like in pairs:
         label = f"{name}{jax.tree_util.keystr(path)}"

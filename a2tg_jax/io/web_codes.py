@@ -44,7 +44,7 @@ class Codes:
     """For the header."""
 
     def chunk(self, start: int, stop: int) -> Iterator[bytes]:
-        """The pieces of one chunk."""
+        """Yield the pieces of one chunk."""
         rows = slice(start, stop)
         yield quantise.to_planes(self.means[:, rows], MEANS_BITS).tobytes()
         yield self.columns[:, rows].astype(np.uint8).tobytes()
@@ -98,7 +98,7 @@ def codes_of(rows: Rows) -> Codes:
 
 
 def rows_of_body(header: Mapping[str, Any], body: bytes) -> Rows:
-    """The tables of a whole file."""
+    """Return the tables of a whole file."""
     reader, num, num_bands = Reader(header, body), header["num"], header["num_bands"]
     chunks = [reader.chunk(min(header["chunk"], num - start)) for start in range(0, num, header["chunk"])]
     reader.end()
@@ -141,7 +141,7 @@ def signed_root(x: np.ndarray) -> np.ndarray:
 
 
 def signed_square(x: np.ndarray) -> np.ndarray:
-    """The inverse of `signed_root`."""
+    """Return the inverse of `signed_root`."""
     return x * np.abs(x)
 
 
@@ -152,7 +152,7 @@ class Reader:
         self._header, self._body, self._place = header, body, 0
 
     def chunk(self, num: int) -> dict[str, np.ndarray]:
-        """The codes of the next `num` rows."""
+        """Return the codes of the next `num` rows."""
         found = {
             "means": quantise.from_planes(self._take(6, num), 3),
             "columns": self._take(9, num).astype(np.int64),
@@ -176,7 +176,7 @@ class Reader:
         return found
 
     def end(self) -> None:
-        """Raises ValueError unless all has been read."""
+        """Raise ValueError unless all has been read."""
         if self._place != len(self._body):
             raise ValueError(f"holds {len(self._body) - self._place} bytes more than its rows")
 

@@ -33,7 +33,7 @@ TITLES = {
 def measure_corrected(
     model: Model, scene: Scene, plan: RunPlan, settings: RenderSettings, lpips_weights: str | os.PathLike | None
 ) -> dict[str, Evaluation]:
-    """The further figures of a model, by split and way, if any system of its run learns exposures or poses.
+    """Return the further figures of a model, by split and way, if any system of its run learns exposures or poses.
 
     All models of a run are scored alike, those of systems that learn neither included.
     """
@@ -55,7 +55,7 @@ def measure_corrected(
 
 
 def refined_views(views: tuple[View, ...], model: Model) -> tuple[View, ...]:
-    """Training views with the cameras that the model was trained with at last."""
+    """Return training views with the cameras learned in training."""
     origin = model.origin
     if origin is None:
         return views
@@ -69,12 +69,12 @@ def refined_views(views: tuple[View, ...], model: Model) -> tuple[View, ...]:
 
 
 def write_corrections(run: RunFolder, name: str, model: Model) -> None:
-    """corrections/NAME.json, where something was learned: view → exposure [3, 4] = [A | b], pose [6]."""
+    """Write corrections/NAME.json if corrections were learned: view → exposure [3, 4] = [A | b], pose [6]."""
     if model.origin is not None and model.origin.corrections:
         write_json(run.own(run.corrections(name)), learned(model.origin))
 
 
 def corrected_title(key: str) -> str:
-    """What a table calls figures of this name in `metrics.json`."""
+    """Return the table title of a key of corrected metrics in `metrics.json`."""
     split, _, way = key.partition("_")
     return f"{split}, {TITLES[way]}"

@@ -32,14 +32,14 @@ CURVES = (
 
 
 def save_figure(path: Path, figure: Figure, *, is_transparent: bool = False) -> None:
-    """Writes a PNG, whole or not at all; on white, unless it is transparent."""
+    """Write a PNG, whole or not at all; on white, unless it is transparent."""
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110, transparent=is_transparent)
 
 
 def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:
-    """Loss, PSNR, Gaussians and memory over the iterations; where a later stage begins, a dashed line.
+    """Plot loss, PSNR, Gaussians and memory over the iterations, with a dashed line where a later stage begins.
 
     Args:
       histories: of the stages, by name.
@@ -64,13 +64,14 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
 
 
 def _thinned(column: np.ndarray) -> np.ndarray:
-    """A column of at most `MOST_POINTS` numbers, each the mean of as many rows; what is left over at the end goes."""
+    """Return a column of at most `MOST_POINTS` numbers, each the mean of as many rows; what is left over at the end
+    goes."""
     rows = -(-len(column) // MOST_POINTS)
     return column if rows < 2 else column[: len(column) // rows * rows].reshape(-1, rows).mean(axis=1)
 
 
 def _plot(axes: Axes, x: np.ndarray, y: np.ndarray, name: str, color: str, *, is_noisy: bool) -> None:
-    """One curve; a noisy one pale, with its running mean over it."""
+    """Plot one curve; a noisy one is pale, with its running mean over it."""
     if is_noisy and len(y) >= 2 * RUNNING_MEANS:
         axes.plot(x, y, color=color, alpha=0.2, linewidth=0.8)
         window = len(y) // RUNNING_MEANS
@@ -80,7 +81,7 @@ def _plot(axes: Axes, x: np.ndarray, y: np.ndarray, name: str, color: str, *, is
 
 
 def sizes_figure(sizes: np.ndarray) -> Figure:
-    """How many Gaussians have a texture of each resolution, as a map of Tv × Tu.
+    """Return how many Gaussians have a texture of each resolution, as a map of Tv × Tu.
 
     Args:
       sizes: [N, 2] integers (Tv, Tu).
@@ -105,7 +106,7 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
 
 
 def resolutions_figure(picture: np.ndarray, num_levels: int) -> Figure:
-    """A view whose Gaussians are coloured by their number of texels, with a legend; for any ground.
+    """Return a view whose Gaussians are coloured by their number of texels, with a legend; for any ground.
 
     Args:
       picture: uint8 [H, W, 3] render of the coloured model.

@@ -52,7 +52,7 @@ class RunFolder:
         return self.path / ".a2tg-run"
 
     def own(self, path: Path) -> Path:
-        """The path, noted in the marker as one that this program writes: nothing else is ever replaced or deleted."""
+        """Return the path after noting it in the marker. Only noted paths are ever replaced or deleted."""
         self.own_all([path.relative_to(self.path).as_posix()])
         return path
 
@@ -69,7 +69,7 @@ class RunFolder:
             os.fsync(file.fileno())
 
     def written(self) -> list[str]:
-        """What the marker lists, relative to the folder; nothing where there is no marker.
+        """Return the paths listed in the marker, relative to the folder; none without a marker.
 
         Raises:
           ValueError: if the marker is not this program's, or lists more than `MOST_NAMES` files.
@@ -88,14 +88,14 @@ class RunFolder:
         return names
 
     def own_files(self, names: list[str]) -> list[Path]:
-        """Those of the names that are files within the folder, besides the marker."""
+        """Return the names that are files within the folder, except the marker."""
         paths = [self.path / name for name in dict.fromkeys(names)]
         root = self.path.resolve()
         # A line that a crash has cut off may name a folder.
         return [p for p in paths if p != self.marker and _is_file(p) and p.resolve().is_relative_to(root)]
 
     def clear(self) -> None:
-        """Deletes what runs wrote into their folder, and the folders that are empty then. The marker stays, empty."""
+        """Delete what runs wrote into their folder, and folders left empty. The marker stays, empty."""
         for path in self.own_files(self.written()):
             path.unlink(missing_ok=True)
             if path.parent != self.path and not any(path.parent.iterdir()):
@@ -157,17 +157,17 @@ class RunFolder:
         return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
 
     def checkpoints(self, name: str) -> list[Path]:
-        """The checkpoints of a stage, oldest first."""
+        """Return the checkpoints of a stage, oldest first."""
         return self._checkpoints(name, "")
 
     def set_damaged_aside(self, checkpoint: Path) -> Path:
-        """Renames a checkpoint that cannot be read, so that it is not one of the newest any more."""
+        """Rename an unreadable checkpoint, so that it no longer counts as one."""
         aside = checkpoint.with_name(checkpoint.name + DAMAGED)
         os.replace(checkpoint, self.own(aside))
         return aside
 
     def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
-        """Deletes all checkpoints of a stage but the newest `keep`; where none is kept, damaged ones too."""
+        """Delete all checkpoints of a stage but the newest `keep`; with keep=0, damaged ones too."""
         old = self.checkpoints(name)[: -keep or None]
         for path in old if keep else [*old, *self._checkpoints(name, DAMAGED)]:
             path.unlink()
@@ -183,12 +183,12 @@ class RunFolder:
 
 
 def iteration_of(checkpoint: Path) -> int:
-    """The iteration after which a checkpoint was written."""
+    """Return the iteration after which a checkpoint was written."""
     return int(checkpoint.stem.rpartition("-")[2])
 
 
 def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """Refuses a folder that a new run must not be made in, without touching it.
+    """Raise if a new run must not be made in a folder. The folder is not touched.
 
     Raises:
       FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a
@@ -210,7 +210,7 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
 
 
 def create_run(path: str | os.PathLike) -> RunFolder:
-    """A new run folder, made with its parents.
+    """Make a new run folder, with its parents.
 
     Args:
       path: where; an existing folder must be empty, or hold no more than the run.toml of a run that never began.
@@ -226,7 +226,7 @@ def create_run(path: str | os.PathLike) -> RunFolder:
 
 
 def open_run(path: str | os.PathLike) -> RunFolder:
-    """An existing run folder.
+    """Return an existing run folder.
 
     Raises:
       FileNotFoundError: if there is none at `path`.
@@ -238,7 +238,7 @@ def open_run(path: str | os.PathLike) -> RunFolder:
 
 
 def _is_file(path: Path) -> bool:
-    """Whether there is such a file; False for what no file can be called, too."""
+    """Return whether the file exists; False for names that no file can have."""
     try:
         return path.is_file()
     except OSError:
@@ -246,13 +246,13 @@ def _is_file(path: Path) -> bool:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Indented JSON, whole or not at all."""
+    """Write indented JSON atomically."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file.
+    """Return the content of a JSON file.
 
     Raises:
       ValueError: if the file is damaged, or too large for one of this program's.

@@ -65,7 +65,7 @@ class RunForecast:
         return max(self.phases.items(), key=lambda item: item[1].total)
 
     def told(self, limit: float) -> str:
-        """Lines for a user."""
+        """Return the forecast as lines of text."""
         phase, needed = self.peak
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
         lines = [
@@ -82,7 +82,7 @@ class RunForecast:
         return "\n".join(lines)
 
     def check(self, limit: float) -> None:
-        """Refuses what cannot fit.
+        """Raise if the run cannot fit.
 
         Args:
           limit: bytes that may be used.
@@ -102,7 +102,7 @@ class RunForecast:
 
 
 def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
-    """What the run will take (host; nothing is compiled)."""
+    """Return a forecast of what the run will take (host; nothing is compiled)."""
     is_host = jax.default_backend() == "cpu"
     stages = _stages(scene, plan)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
@@ -121,7 +121,7 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
 
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
-    """Bytes of --max-memory, written as a memory budget is.
+    """Return the bytes of --max-memory, written like a memory budget.
 
     Raises:
       ValueError: if it is not.
@@ -131,7 +131,8 @@ def bytes_allowed(max_memory: float | str | None) -> int | None:
 
 
 def allowed_memory(max_memory: int | None) -> int:
-    """Bytes that a run may use: what is asked for, or what the machine, or its accelerator, has available (host)."""
+    """Return the bytes a run may use: the limit asked for, or what the machine or its accelerator has available
+    (host)."""
     if max_memory is not None:
         return max_memory
     stats = jax.local_devices()[0].memory_stats() or {}
@@ -139,12 +140,12 @@ def allowed_memory(max_memory: int | None) -> int:
 
 
 def room_for_photographs(max_memory: int | None) -> int | None:
-    """Bytes that the photographs may take where a process may take so many; None as in `load_scene`."""
+    """Return the bytes photographs may take of a memory limit; None as in `load_scene`."""
     return None if max_memory is None else int(SHARE_OF_MEMORY * max_memory)
 
 
 def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None) -> None:
-    """Prints what a run will take.
+    """Print the forecast of a run.
 
     Raises:
       ValueError: if that cannot fit, naming the options to change.
@@ -155,7 +156,7 @@ def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None) -> None:
 
 
 def _stages(scene: Scene, plan: RunPlan) -> dict[str, StageForecast]:
-    """Of every stage that is trained, by name."""
+    """Return the forecast of every stage that is trained, by name."""
     systems: dict[int, tuple[System, list[StageForecast]]] = {}
     for planned in plan.stages:
         if id(planned.system) not in systems:
@@ -164,7 +165,7 @@ def _stages(scene: Scene, plan: RunPlan) -> dict[str, StageForecast]:
 
 
 def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) -> float:
-    """Of checkpoints, models, and pictures of the test views."""
+    """Return the bytes of checkpoints, models, and pictures of the test views."""
     views = scene.test or scene.train
     pixels = sum(view.camera.width * view.camera.height for view in views)
     num_pictures = 3 + max(1, len(plan.chains) - 1)

@@ -14,10 +14,10 @@ from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
+from a2tg_jax.results.run_evaluation import settings_of
 
 Route = Literal["test", "smooth"]
 
@@ -25,7 +25,7 @@ Route = Literal["test", "smooth"]
 def render_frames(
     run: RunFolder, out: Path, *, route: Route | Path = "smooth", num_frames: int = 120, name: str | None = None
 ) -> list[Path]:
-    """Writes one PNG per frame and returns their paths. The photographs are not needed: a model knows its cameras.
+    """Write one PNG per frame and return their paths. The photographs are not needed: a model knows its cameras.
 
     Args:
       run: an opened run folder.
@@ -57,7 +57,7 @@ def render_frames(
 
 
 def write_video(folder: Path, path: Path, *, frames_per_second: int = 30) -> bool:
-    """Makes an mp4 of frame_0000.png … with ffmpeg; False where that program is not installed.
+    """Make an mp4 of frame_0000.png … with ffmpeg; return False if ffmpeg is not installed.
 
     Raises:
       ValueError: if ffmpeg fails.
@@ -75,7 +75,7 @@ def write_video(folder: Path, path: Path, *, frames_per_second: int = 30) -> boo
 
 
 def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:
-    """File names and cameras of the frames."""
+    """Return file names and cameras of the frames."""
     if isinstance(route, Path):
         yield from _numbered(path_through(load_views(route), num_frames))
         return
@@ -93,5 +93,5 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
 
 
 def _numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
-    """The cameras of a flight by the names that `write_video` looks for."""
+    """Return the cameras of a flight by the names that `write_video` looks for."""
     return ((f"frame_{index:04d}.png", camera) for index, camera in enumerate(path))

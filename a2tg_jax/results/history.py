@@ -21,14 +21,14 @@ MOST_BYTES = 1 << 26
 
 
 def write_history(path: Path, history: History) -> None:
-    """Writes the columns of a history, named in the first line."""
+    """Write the columns of a history, named in the first line."""
     columns = [np.asarray(getattr(history, name)).tolist() for name in NAMES]
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([NAMES, *zip(*columns, strict=True)])
 
 
 def read_history(path: Path) -> History:
-    """The history that `write_history` wrote.
+    """Return the history that `write_history` wrote.
 
     Raises:
       ValueError: naming the file, if it has other columns, or a row is not one of numbers, of which only PSNR may be
@@ -49,7 +49,7 @@ def read_history(path: Path) -> History:
 
 
 def _numbers(rows: Iterator[list[str]]) -> Iterator[tuple[float, ...]]:
-    """The numbers of each row."""
+    """Yield the numbers of each row."""
     for number, row in enumerate(rows, 1):
         if len(row) != len(NAMES):
             raise ValueError(f"row {number} has {len(row)} of {len(NAMES)} columns")

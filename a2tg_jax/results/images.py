@@ -33,12 +33,12 @@ LONGEST_SIDE = 1280
 
 
 def to_uint8(image) -> np.ndarray:
-    """8-bit pixels of a float image, clipped to [0, 1] and rounded."""
+    """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
     return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
 
 
 def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Absolute difference, brightened ERROR_GAIN times."""
+    """Return the absolute difference, brightened ERROR_GAIN times."""
     difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
     return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
 
@@ -56,7 +56,7 @@ class Crop:
 
 
 def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> Crop:
-    """The square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`.
+    """Return the square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`.
 
     Squares whose error is above the picture's mean afterwards are left out, unless all are: there, both fail.
     """
@@ -81,7 +81,7 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
-    """One sheet of images in a row, each under its caption, which is cut off where the image ends."""
+    """Return one sheet of images in a row, each under its caption, which is cut off where the image ends."""
     height, width = images[0].shape[:2]
     sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
     font = ImageFont.truetype(FONT, size=13)
@@ -95,7 +95,7 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 
 
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
-    """File names of the views' pictures, no two alike, in capitals or not: folders become part of the name.
+    """Return unique file names of the views' pictures, regardless of case; folders become part of the name.
 
     Where that is another's, as of a/b.png and a_b.jpg, a number follows; names count in their sorted order.
     """
@@ -111,14 +111,14 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
 
 
 def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> None:
-    """Writes a PNG, whole or not at all."""
+    """Write a PNG atomically."""
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG", optimize=True)
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
-    """An image as a data: URI, enlarged `zoom` times without smoothing, or reduced if it is very large."""
+    """Return an image as a data: URI, enlarged `zoom` times without smoothing, or reduced if it is very large."""
     picture = Image.fromarray(np.ascontiguousarray(image))
     picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
     picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
@@ -128,22 +128,22 @@ def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
 
 
 def file_uri(path: Path) -> str:
-    """An image file, by its suffix, as a data: URI."""
+    """Return an image file, by its suffix, as a data: URI."""
     return f"data:image/{path.suffix[1:]};base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def resolution_colors(num_levels: int) -> np.ndarray:
-    """[num_levels, 3] colours of textures with 2⁰, 2¹, … texels, dark to bright."""
+    """Return [num_levels, 3] colours of textures with 2⁰, 2¹, … texels, dark to bright."""
     return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
 
 
 def texel_levels(layout: AtlasLayout) -> np.ndarray:
-    """[N] integers log₂(Tu·Tv), rounded; 0 where a texture is empty."""
+    """Return [N] integers log₂(Tu·Tv), rounded; 0 where a texture is empty."""
     return np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
 
 
 def colored_by_resolution(model: Model) -> Model:
-    """A model with textures, every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
+    """Return a model with textures, every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
 
     Alpha textures stay, RGB residuals and view dependence go.
     """
@@ -156,7 +156,7 @@ def colored_by_resolution(model: Model) -> Model:
 
 
 def with_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
-    """A model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
+    """Return a model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
     sh = np.where(is_chosen[:, None, None], 0, model.appearance.sh(model.gaussians, model.params, model.layout))
     sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
     own = jnp.asarray(sh[:, : model.gaussians.sh.shape[1]], model.gaussians.sh.dtype)

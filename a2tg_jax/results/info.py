@@ -16,7 +16,7 @@ SPLITS = ("test", "train")
 
 
 def describe_run(run: RunFolder) -> str:
-    """The scene, the systems, how far each stage is, its model, and the metrics where there are any.
+    """Return the scene, the systems, the progress of each stage, its model, and the metrics if there are any.
 
     Raises:
       ValueError: if a file of the run is damaged or of another version.
@@ -40,7 +40,7 @@ def describe_run(run: RunFolder) -> str:
 
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
-    """The PSNR in a metrics.json: model → test or train → dB.
+    """Return the PSNR in a metrics.json: model → test or train → dB.
 
     Raises:
       ValueError: if there is anything else where they should be.

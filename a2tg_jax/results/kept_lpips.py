@@ -13,13 +13,13 @@ from a2tg_jax.results.summary import ModelResult
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file's bytes."""
+    """Return the SHA-256 of a file."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
-    """The figures, with the LPIPS of metrics.json for each model whose file is the one that this was measured on."""
+    """Return the metrics with the LPIPS of metrics.json for every model file that has not changed since."""
     try:
         metrics, per_view = read_json(run.metrics), read_json(run.per_view)
         network, models = metrics["lpips_network"], metrics["models"]

@@ -19,10 +19,10 @@ from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import Photographs
+from a2tg_jax.results.viewing import ServedPhotographs
 from a2tg_jax.training.fit import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
-from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, page
+from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, viewer_html
 from a2tg_jax.web.server import Route, served
 
 SECONDS = 3.0
@@ -51,7 +51,7 @@ class LiveView:
         self._status: dict[str, Any] = {"version": 0, "message": "", "stage": ""}
 
     def __call__(self, run: StageRun, is_stopped: IsStopped) -> float:
-        """Notes figures, takes a snapshot where one is due, and waits while the training is paused."""
+        """Record metrics, take a snapshot when one is due, and wait while the training is paused."""
         self._note(run)
         is_free = self._encoder is None or not self._encoder.is_alive()
         if is_free and (self._now() >= self._due or self._paused.is_set()):
@@ -64,9 +64,9 @@ class LiveView:
     @property
     def routes(self) -> dict[str, Route]:
         """What the viewer's server answers."""
-        photographs = Photographs(origin_of_scene(self._scene), lambda: self._scene)
+        photographs = ServedPhotographs(origin_of_scene(self._scene), lambda: self._scene)
         return {
-            "/": Route("text/html; charset=utf-8", page().encode()),
+            "/": Route("text/html; charset=utf-8", viewer_html().encode()),
             f"/{SCENE_NAME}": Route("application/octet-stream", lambda: self._scene_bytes),
             f"/{STATUS_NAME}": Route("application/json", self._status_json),
             "/pause": Route("application/json", self._status_json, act=self._paused.set),
@@ -93,7 +93,7 @@ class LiveView:
             self._status |= found
 
     def _take(self, run: StageRun) -> None:
-        """Copies the state, and lets a thread make a scene of it."""
+        """Copy the state, and lets a thread make a scene of it."""
         began = self._now()
         origin = origin_of_scene(self._scene, BACKGROUNDS[run.system.background])
         model = dataclasses.replace(jax.device_get(run.state.model), origin=origin)
@@ -115,7 +115,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def shown_live(scene: Scene, title: str, on_start: Callable[[str], None]) -> Iterator[LiveView]:
-    """Serves what is seen of a training meanwhile.
+    """Serve what is seen of a training meanwhile.
 
     Args:
       scene: that is trained on.

@@ -17,7 +17,7 @@ except ImportError:  # Windows
 
 @contextlib.contextmanager
 def claimed(run: RunFolder) -> Iterator[None]:
-    """Keeps other processes from training and measuring in a run folder, which is made if it is not there.
+    """Keep other processes from training and measuring in a run folder. The folder is made if it does not exist.
 
     The lock is the operating system's, on the marker: it ends with the process, however that ends. On Windows, and
     where the file system knows no locks, there is none. What a killed process left half written is removed, and a run
@@ -39,7 +39,7 @@ def claimed(run: RunFolder) -> Iterator[None]:
 
 @contextlib.contextmanager
 def opened(path: str | os.PathLike) -> Iterator[RunFolder]:
-    """An existing run folder, claimed.
+    """Claim an existing run folder.
 
     Raises:
       FileNotFoundError: if there is none at `path`.
@@ -53,7 +53,7 @@ def opened(path: str | os.PathLike) -> Iterator[RunFolder]:
 
 
 def remove_left_over(run: RunFolder) -> None:
-    """Removes what was being written when a process of the run was killed."""
+    """Remove partial files of a killed process of this run."""
     own = {run.path / name for name in run.written()}
     for folder in {path.parent for path in own}:
         for partial, path in left_over(folder).items():

@@ -7,7 +7,7 @@ from html import escape
 
 
 def page(title: str, body: str, *, style: str, script: str) -> str:
-    """A whole document.
+    """Return a whole document.
 
     Args:
       title: as plain text.
@@ -25,12 +25,12 @@ def page(title: str, body: str, *, style: str, script: str) -> str:
 
 
 def _source(text: str) -> str:
-    """What a content security policy calls an inline style or script."""
+    """Return the name of an inline style or script in a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]], best: Collection[tuple[int, int]] = ()) -> str:
-    """A table of plain texts.
+    """Return a table of plain texts.
 
     Args:
       titles: of the columns.
@@ -50,7 +50,7 @@ def _cell(text: str, is_best: bool) -> str:
 
 
 def image(uri: str, caption: str, kind: str = "") -> str:
-    """A picture with a caption, which is plain text.
+    """Return a picture with a plain-text caption.
 
     Args:
       uri: data: with the picture.
@@ -62,13 +62,13 @@ def image(uri: str, caption: str, kind: str = "") -> str:
 
 
 def layers(uris: Sequence[str], captions: Sequence[str], kind: str = "") -> str:
-    """Pictures of one size that lie on each other; side by side where no script runs."""
+    """Return pictures of one size that lie on each other; side by side where no script runs."""
     pairs = zip(uris, captions, strict=True)
     return f'<div class="layers {kind}">{"".join(image(uri, caption) for uri, caption in pairs)}</div>'
 
 
 def slider(body: str, captions: Sequence[str]) -> str:
-    """`layers` with a slider below, which draws each picture over the one before it; the last is shown at first."""
+    """Return `layers` with a slider below that draws each picture over the one before; the last is shown at first."""
     last = len(captions) - 1
     label = escape(f"from {captions[0]} to {captions[-1]}")
     stops = "".join(

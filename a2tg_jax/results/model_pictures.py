@@ -31,7 +31,8 @@ FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 
 
 def learned_textures(model: Model) -> np.ndarray | None:
-    """A sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians' colours.
+    """Return a sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians'
+    colours.
 
     They are those that add most to the picture: by the spread of their texels times the area of the Gaussian.
 
@@ -54,7 +55,7 @@ def learned_textures(model: Model) -> np.ndarray | None:
 
 
 def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """uint8 [h, w, 3] of a texture in its own proportions, on a chequered ground.
+    """Return uint8 [h, w, 3] of a texture in its own proportions, on a chequered ground.
 
     Args:
       texels: [Tv, Tu, 4] RGB residual and alpha factor.
@@ -69,7 +70,7 @@ def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
 
 
 def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
-    """Pictures in rows, each at the top left of its place."""
+    """Return pictures in rows, each at the top left of its place."""
     step = TEXTURE_SIDE + TEXTURE_MARGIN
     rows, columns = -(-len(pictures) // TEXTURES_PER_ROW), min(len(pictures), TEXTURES_PER_ROW)
     sheet = np.zeros((rows * step - TEXTURE_MARGIN, columns * step - TEXTURE_MARGIN, 4), np.uint8)
@@ -82,7 +83,7 @@ def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
 
 
 def depth_picture(output: RenderOutput) -> np.ndarray:
-    """uint8 [H, W, 3] of the depth, near bright; black where little or nothing is seen."""
+    """Return uint8 [H, W, 3] of the depth, near bright; black where little or nothing is seen."""
     alpha = np.asarray(output.alpha)
     is_seen = alpha > LEAST_ALPHA
     depth = np.asarray(output.depth) / np.where(is_seen, alpha, 1.0)
@@ -101,7 +102,7 @@ def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
 
 
 def flight(model: Model, settings: RenderSettings) -> bytes | None:
-    """An animation (WebP) of a smooth flight past the model's cameras, small and short; None with fewer than two."""
+    """Return a small animation (WebP) of a smooth flight past the model's cameras; None with fewer than two."""
     cameras = [] if model.origin is None else list(model.origin.cameras)
     if len(cameras) < 2:
         return None
@@ -111,13 +112,13 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
 
 
 def _small(camera: Camera) -> Camera:
-    """The camera with pictures of `FLIGHT_SIDE` at most."""
+    """Return the camera with pictures of `FLIGHT_SIDE` at most."""
     scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
     return resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height)))
 
 
 def animation(images: Iterable[Array]) -> bytes:
-    """Images [H, W, 3] in [0, 1] as an animated WebP that begins anew at its end."""
+    """Return images [H, W, 3] in [0, 1] as an animated WebP that loops."""
     first, *others = (Image.fromarray(to_uint8(jnp.asarray(image))) for image in images)
     buffer = io.BytesIO()
     duration = round(1000 / FLIGHT_PER_SECOND)

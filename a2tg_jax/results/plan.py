@@ -52,7 +52,7 @@ class RunPlan:
         return next(iter(self.chains.values()))
 
     def __getitem__(self, name: str) -> PlannedStage:
-        """The stage of a name.
+        """Return the stage of a name.
 
         Raises:
           ValueError: if the run has no such stage.
@@ -63,13 +63,13 @@ class RunPlan:
         raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
 
     def first_iteration(self, name: str) -> int:
-        """How many iterations lie before a stage, in the stages that it follows."""
+        """Return the number of iterations before a stage, in the stages that it follows."""
         start = self[name].start
         return 0 if start is None else self.first_iteration(start) + self[start].stage.iterations
 
 
 def plan_run(systems: Mapping[str, System]) -> RunPlan:
-    """The stages of some systems. Two systems share the stages up to the first in which they differ.
+    """Return the stages of some systems. Two systems share their stages up to the first one that differs.
 
     Args:
       systems: by label, the main one first.
@@ -94,28 +94,28 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
 
 
 def _is_same(known: PlannedStage, wanted: PlannedStage) -> bool:
-    """Whether training both would give the same model, bit for bit."""
+    """Return whether training both would give the same model, bit for bit."""
     same_place = (known.index, known.start) == (wanted.index, wanted.start)
     return same_place and _trains_alike(known.system, wanted.system, wanted.index)
 
 
 def is_same_so_far(made: System, wanted: System, index: int) -> bool:
-    """Whether two systems train their stages up to `index` alike, however they go on."""
+    """Return whether two systems train their stages up to `index` alike, whatever follows."""
     return all(_trains_alike(made, wanted, at) for at in range(index + 1))
 
 
 def _trains_alike(a: System, b: System, index: int) -> bool:
-    """Whether a stage of two systems makes the same of the same start, bit for bit."""
+    """Return whether a stage of two systems gives the same model from the same start, bit for bit."""
     return _common_options(a) == _common_options(b) and _is_equal(a.stages()[index], b.stages()[index])
 
 
 def _common_options(system: System) -> list:
-    """The options that training reads from the system itself."""
+    """Return the options that training reads from the system itself."""
     return [getattr(system, field.name) for field in dataclasses.fields(System) if field.name not in STAGE_OPTIONS]
 
 
 def _is_equal(a: Stage, b: Stage) -> bool:
-    """Whether two stages are equal in everything, arrays and classes included."""
+    """Return whether two stages are equal in everything, arrays and classes included."""
     (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
     if structure != other or classes_of(a) != classes_of(b):  # type: ignore[operator]
         return False
@@ -123,7 +123,7 @@ def _is_equal(a: Stage, b: Stage) -> bool:
 
 
 def fingerprint(system: System, index: int) -> str:
-    """A text that two systems share where they make the same of a stage's start, in this process or another.
+    """Return a text that two systems share where they make the same of a stage's start, in this process or another.
 
     It tells classes and functions apart by module and name, and is another one for another version's options.
 
@@ -134,7 +134,7 @@ def fingerprint(system: System, index: int) -> str:
 
 
 def _described(value: Any) -> Any:
-    """A value of a stage as numbers, texts and tuples, the same in every process."""
+    """Return a value of a stage as numbers, texts and tuples, the same in every process."""
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -154,12 +154,12 @@ def _described(value: Any) -> Any:
 
 
 def _is_absent(field: dataclasses.Field, value: Any) -> bool:
-    """Whether it is a tuple that is empty, as it is by default."""
+    """Return whether it is a tuple that is empty, as it is by default."""
     return isinstance(value, tuple) and not value and field.default == ()
 
 
 def _name_of(value: Any) -> str:
-    """Module and name of a class or function; of this package the name alone, for its modules move."""
+    """Return the module and name of a class or function; the name alone for this package, whose modules may move."""
     name = getattr(value, "__qualname__", "<nameless>")
     if "<" in name and not isinstance(value, type):
         raise ValueError(f"a stage holds {value!r}: make it a function of a module, which has a name of its own")

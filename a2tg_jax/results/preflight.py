@@ -20,7 +20,7 @@ STATE_SIZE = 3
 def check_new_run(
     record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None, max_memory: int | None = None
 ) -> Scene:
-    """The scene of a run that can be trained in a folder. What the run will need is printed.
+    """Return the scene of a run that can be trained in a folder. What the run will need is printed.
 
     Raises:
       ValueError, OSError: naming what is wrong: an option, the weights, the folder, the scene, the disk, the memory.
@@ -39,20 +39,20 @@ def check_new_run(
 
 
 def check_weights(lpips_weights: Path | None) -> None:
-    """Raises ValueError or FileNotFoundError unless these are weights of LPIPS, or None."""
+    """Raise ValueError or FileNotFoundError unless these are LPIPS weights, or None."""
     if lpips_weights is not None:
         load_lpips(lpips_weights)
 
 
 def check_apart(out: Path, source: Path) -> None:
-    """Raises ValueError where a folder that is to be written lies in one that is to be read, or that in it."""
+    """Raise ValueError if one of two folders, one to read and one to write, lies in the other."""
     written, read = out.resolve(), source.resolve()
     if written.is_relative_to(read) or read.is_relative_to(written):
         raise ValueError(f"{out} and {source} lie in each other: choose a folder besides it for what is written")
 
 
 def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
-    """Raises ValueError unless the disk has room for what will surely be written.
+    """Raise ValueError unless the disk has room for what will surely be written.
 
     Models and checkpoints of the Gaussians that there will be, without what they show besides.
     """
@@ -68,7 +68,7 @@ def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
 
 
 def gaussian_bytes(planned: PlannedStage, scene: Scene) -> int:
-    """Of the Gaussians that the first stage of a system leaves at most."""
+    """Return the largest number of bytes of Gaussians that a system's first stage can leave."""
     system, first = planned.system, planned.system.stages()[0]
     num = initial_number(scene, system)
     num = max([num, *(event.num_rows(num, first.iterations) for event in first.events)])
@@ -78,6 +78,6 @@ def gaussian_bytes(planned: PlannedStage, scene: Scene) -> int:
 
 
 def _existing(path: Path) -> Path:
-    """The folder, or the nearest above it that there is."""
+    """Return the folder, or the nearest above it that there is."""
     path = Path(os.path.abspath(path))
     return next(folder for folder in (path, *path.parents) if folder.is_dir())

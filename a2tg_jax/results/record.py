@@ -55,7 +55,7 @@ class SceneSource:
     """What the alpha channel of photographs is: the transparency of what they show, or a mask."""
 
     def load(self, room: int | None = None) -> Scene:
-        """The scene in its normalised world.
+        """Return the scene in its normalised world.
 
         Args:
           room: bytes of memory for photographs that are read from files, as in `load_scene`.
@@ -105,7 +105,7 @@ class RunRecord:
         return plan_run(self.systems)
 
     def check(self) -> None:
-        """Refuses what cannot be trained.
+        """Raise if the run cannot be trained.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
@@ -120,7 +120,7 @@ class RunRecord:
         plan_run(self.systems)
 
     def leaves(self) -> dict[str, Any]:
-        """Every number by the name of its flag, without the dashes."""
+        """Return every option by the name of its flag, without the dashes."""
         scene = {name: value for name, value in flatten_config(self.scene).items() if name != "path"}
         return {"system": self.name, **scene, **flatten_config(self.system)}
 
@@ -140,7 +140,7 @@ class RunFile:
     options: dict = dataclasses.field(default_factory=dict)
 
     def chosen(self, where: str) -> System:
-        """The system with the file's preset and options.
+        """Return the system with the file's preset and options.
 
         Raises:
           ValueError: if there is no such system or preset, or an option is unknown or of another type.
@@ -149,12 +149,12 @@ class RunFile:
 
 
 def label_of(name: str) -> str:
-    """What a run calls a system: its name, or the NAME of package.module:NAME."""
+    """Return the label of a system in a run: its name, or NAME of package.module:NAME."""
     return name.rpartition(":")[2].replace(".", "-")
 
 
 def chosen_system(name: str, preset: str | None = None) -> System:
-    """A system by name, with the numbers of a preset; those that an instance sets itself have precedence.
+    """Return a system by name, with the options of a preset. Options that an instance sets itself take precedence.
 
     Raises:
       ValueError: if there is no such system or preset.
@@ -164,7 +164,8 @@ def chosen_system(name: str, preset: str | None = None) -> System:
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
-    """A system by name, with another's options by name; those that an instance sets itself have precedence.
+    """Return a system by name, with another's options of the same names. Options that an instance sets itself take
+    precedence.
 
     Args:
       name: as `find_system` takes it.
@@ -181,7 +182,7 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
 
 
 def read_run_file(path: Path) -> RunFile:
-    """Reads a configuration file.
+    """Read a configuration file.
 
     Raises:
       FileNotFoundError: if there is none.
@@ -201,7 +202,7 @@ def read_run_file(path: Path) -> RunFile:
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
-    """Writes run.toml: every number, so that it means the same whatever a later version's defaults are."""
+    """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
     start = config_to_dict(chosen_system(record.name, record.preset))
     table = {
         "scene": record.scene.path,
@@ -220,7 +221,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
 
 
 def read_record(run: RunFolder) -> RunRecord:
-    """Reads run.toml. The module of a system of one's own is imported.
+    """Read run.toml. If the system is a user's own, its module is imported.
 
     Raises:
       ValueError: if it is damaged, its system is not found, or an option is unknown, of another type or out of range;
@@ -240,18 +241,18 @@ def read_record(run: RunFolder) -> RunRecord:
 
 
 def repeating_command(run: RunFolder) -> str:
-    """The command line that repeats a run."""
+    """Return the command line that repeats a run."""
     return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", f"{run.path}-again"])
 
 
 def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
-    """Names of the numbers in which one record differs from another of the same scene."""
+    """Return the names of the options in which two records of the same scene differ."""
     before = kept.leaves()
     return [name for name, value in asked.leaves().items() if name not in before or value != before[name]]
 
 
 def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no None: such a key is left out, or is "None", as on the command line, where `start` says otherwise."""
+    """Leave out None, which TOML lacks, or write "None", as on the command line, if `start` has another value."""
     told: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, dict):

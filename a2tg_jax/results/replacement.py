@@ -18,13 +18,13 @@ MOVING = f"{OLD}.partial"
 
 
 def old_run(run: RunFolder) -> RunFolder | None:
-    """The run that this one is about to replace, if there is one."""
+    """Return the run that this one is about to replace, or None."""
     old = RunFolder(run.path / OLD)
     return old if old.path.is_dir() else None
 
 
 def set_aside(run: RunFolder) -> None:
-    """Moves what runs wrote into a folder, as its marker lists it, to RUN/.a2tg-old.
+    """Move what runs wrote into a folder, as its marker lists it, to RUN/.a2tg-old.
 
     Where a finished run lies there already, because the one that was to replace it never ended, that one is kept, and
     this one deleted.
@@ -40,20 +40,20 @@ def set_aside(run: RunFolder) -> None:
 
 
 def drop_old(run: RunFolder) -> None:
-    """Deletes the run that was set aside, if there is one."""
+    """Delete the run that was set aside, if there is one."""
     old = old_run(run)
     if old is not None:
         _delete(old)
 
 
 def is_unfinished(run: RunFolder) -> bool:
-    """Whether a process was killed while it set a run aside."""
+    """Return whether a process was killed while it set a run aside."""
     is_recorded = run.record.is_file()
     return (run.path / MOVING).is_dir() or (old_run(run) is not None and not is_recorded)
 
 
 def undo_unfinished(run: RunFolder) -> None:
-    """Puts back a run that was being set aside when its process was killed."""
+    """Put back a run that was being set aside when its process was killed."""
     moving, old = RunFolder(run.path / MOVING), old_run(run)
     if moving.path.is_dir():
         _put_back(moving, run)
@@ -70,7 +70,7 @@ def _put_back(old: RunFolder, run: RunFolder) -> None:
 
 
 def _delete(old: RunFolder) -> None:
-    """Deletes a run and its folder, if there is nothing else in it."""
+    """Delete a run and its folder, if there is nothing else in it."""
     old.clear()
     old.marker.unlink(missing_ok=True)
     if not any(old.path.iterdir()):
@@ -78,7 +78,7 @@ def _delete(old: RunFolder) -> None:
 
 
 def _move(source: RunFolder, target: RunFolder, names: list[str]) -> None:
-    """Moves those files that are there; folders that are empty then go."""
+    """Move the files that exist, and remove folders left empty."""
     for path in source.own_files(names):
         moved = target.path / path.relative_to(source.path)
         moved.parent.mkdir(parents=True, exist_ok=True)
@@ -87,6 +87,6 @@ def _move(source: RunFolder, target: RunFolder, names: list[str]) -> None:
 
 
 def remove_if_empty(folder: Path, root: Path) -> None:
-    """Removes a folder below another, if it is empty."""
+    """Remove a folder below another, if it is empty."""
     if folder != root and folder.is_dir() and not any(folder.iterdir()):
         folder.rmdir()

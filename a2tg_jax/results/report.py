@@ -18,7 +18,15 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.markup import image, layers, page, slider, table
 from a2tg_jax.results.record import repeating_command
-from a2tg_jax.results.summary import ModelResult, RunResult, learning_lines, minutes, summary_table, versions
+from a2tg_jax.results.summary import (
+    ModelResult,
+    RunResult,
+    bytes_compared,
+    learning_lines,
+    minutes,
+    summary_table,
+    versions,
+)
 
 SECTIONS = (
     ("summary", "Summary"),
@@ -50,8 +58,7 @@ class Comparison:
 
 
 def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) -> None:
-    """Writes report.html from the results, the figures that lie in the run folder already, and some comparisons
-    (`comparison_html`)."""
+    """Write report.html from the results, the figures in the run folder, and some comparisons (`comparison_html`)."""
     curves = "Loss and PSNR of the training views seen, with running means."
     bodies = {
         "summary": _summary(result),
@@ -76,7 +83,7 @@ def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) 
 
 
 def _system_told(result: RunResult) -> str:
-    """The first line of what the system's author says of it."""
+    """Return the first line of the system's docstring."""
     return (inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0]
 
 
@@ -93,7 +100,8 @@ def _summary(result: RunResult) -> str:
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     others = sum(measured.seconds for measured in result.models.values()) - own
     cards = [(f"{split} PSNR", f"{last.shown.psnr:.2f} dB")]
-    cards += [(f"Gain over {name}", f"{gain:+.2f} dB") for name, gain in result.gains.items()]
+    for name, gain in result.gains.items():
+        cards.append((f"Gain over {name}, {bytes_compared(result, name)}", f"{gain:+.2f} dB"))
     cards += [
         ("SSIM", f"{last.shown.ssim:.4f}"),
         ("Gaussians", f"{last.num_gaussians:,}"),
@@ -117,7 +125,7 @@ def _summary(result: RunResult) -> str:
 
 
 def _corrected_told(measured: ModelResult) -> str:
-    """What further figures mean, where there are any."""
+    """Return what the further metrics mean, if there are any."""
     ways = {key.partition("_")[2] for key in measured.corrected}
     fitted = " Colours fitted: each render's colours mapped to the photograph's by the affine map of least squares."
     aligned = (
@@ -128,14 +136,14 @@ def _corrected_told(measured: ModelResult) -> str:
 
 
 def _main_first(result: RunResult, titles: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-    """The columns of a table with a title for each model, that of the main one first, where a phone shows it."""
+    """Return the columns of a table with that of the main model first, where a phone shows it."""
     main = titles.index(result.main)
     order = [0, main, *(at for at in range(1, len(titles)) if at != main)]
     return [titles[at] for at in order], [[row[at] for at in order] for row in rows]
 
 
 def _best(row: Sequence[str]) -> list[int]:
-    """The cells of a figure's row that hold its best value; none where it has no best, or all are equal."""
+    """Return the cells that hold a metric's best value; none if it has no best, or all are equal."""
     is_higher = any(word in row[0] for word in HIGHER_IS_BETTER)
     if not is_higher and not any(word in row[0] for word in LOWER_IS_BETTER):
         return []
@@ -146,7 +154,7 @@ def _best(row: Sequence[str]) -> list[int]:
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """The pictures of a view for the report."""
+    """Return the pictures of a view for the report."""
     body = layers([jpeg_uri(image) for image in comparison.images], comparison.captions)
     if comparison.crop is not None:
         crops = [jpeg_uri(comparison.crop.of(image), zoom=CROP_ZOOM) for image in comparison.images]
@@ -180,7 +188,7 @@ def _geometry(run: RunFolder) -> str:
 
 
 def _files(run: RunFolder, result: RunResult) -> str:
-    """Links to what lies beside the page."""
+    """Return links to the files beside the page."""
     told = {
         run.viewer: "the scene in a browser, to turn and to fly through; one file that opens from the disk",
         run.model(result.main): "the model, for a2tg and for load_model",
@@ -218,7 +226,7 @@ def _views(result: RunResult) -> str:
 
 
 def _best_psnr(row: Sequence[str]) -> list[int]:
-    """The cells of a view's row that hold its best PSNR; every second one holds an SSIM."""
+    """Return the cells of a view's row that hold its best PSNR; every second cell holds an SSIM."""
     return [2 * at - 1 for at in _best(["PSNR", *row[1::2]])]
 
 

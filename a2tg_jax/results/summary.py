@@ -22,6 +22,8 @@ FIGURES = (
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
 NUM_QUALITIES = 2 * len(QUALITIES)
 """The first figures, of test and training views."""
+EQUAL_BYTES = 0.01
+"""Largest relative difference of two sizes that are called equal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +103,7 @@ class RunResult:
 
 
 def metrics_json(result: RunResult) -> dict[str, Any]:
-    """The content of metrics.json."""
+    """Return the content of metrics.json."""
     return {
         "scene": result.scene,
         "main": result.main,
@@ -113,7 +115,7 @@ def metrics_json(result: RunResult) -> dict[str, Any]:
 
 
 def per_view_json(result: RunResult) -> dict[str, Any]:
-    """The content of per_view.json: model → train or test → view → metrics."""
+    """Return the content of per_view.json: model → train or test → view → metrics."""
     return {
         name: {
             split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
@@ -124,7 +126,7 @@ def per_view_json(result: RunResult) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the figures depend on, and the devices."""
+    """Return the versions that the metrics depend on, and the devices."""
     device = jax.devices()[0]
     return {
         "a2tg-jax": version("a2tg-jax"),
@@ -137,7 +139,7 @@ def versions() -> dict[str, str]:
 
 
 def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
-    """Titles and rows of the headline table: a column for each model, a row for each figure that there is."""
+    """Return titles and rows of the headline table: a column for each model, a row for each metric present."""
     models = result.models.values()
     columns = [_figures(measured) for measured in models]
     rows = [[name, *cells] for name, *cells in zip(FIGURES, *columns, strict=True)]
@@ -150,13 +152,13 @@ def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
 
 
 def _corrected_rows(key: str, found: Sequence[Evaluation | None]) -> list[list[str]]:
-    """The rows of a table for figures up to exposure or pose."""
+    """Return the rows of a table for figures up to exposure or pose."""
     cells = zip(*(_qualities(evaluation) for evaluation in found), strict=True)
     return [[f"{corrected_title(key)}: {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
-    """The headline table for a terminal, and the gains.
+    """Return the headline table for a terminal, followed by warnings and gains.
 
     Args:
       result: the run.
@@ -172,12 +174,23 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
         lines.append(f"LPIPS with {result.lpips_network}{kept}")
     lines += budget_lines(result)
     lines += learning_lines(result)
-    lines += [f"{result.main} gains {gain:+.2f} dB over {name}" for name, gain in result.gains.items()]
+    for name, gain in result.gains.items():
+        lines.append(f"{result.main}: {gain:+.2f} dB over {name}, {bytes_compared(result, name)}")
     return "\n".join(lines)
 
 
+def bytes_compared(result: RunResult, name: str) -> str:
+    """Return the bytes of the main model beside those of another, for the line of its gain."""
+    own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
+    if abs(own - other) <= EQUAL_BYTES * other:
+        return f"at equal bytes ({own / 1e6:.2f} MB)"
+    ratio = own / max(other, 1)
+    times = f"{ratio:.1f}" if ratio >= 1.05 else f"{ratio:.2f}"
+    return f"with {times} times its bytes ({own / 1e6:.2f} MB and {other / 1e6:.2f} MB)"
+
+
 def budget_lines(result: RunResult) -> list[str]:
-    """What each finished model of a system with a memory budget takes of it."""
+    """Return how much of its memory budget each finished model takes."""
     lines = []
     for name in dict.fromkeys(chain[-1] for chain in result.plan.chains.values()):
         budget = result.plan[name].system.budget_bytes
@@ -188,7 +201,7 @@ def budget_lines(result: RunResult) -> list[str]:
 
 
 def learning_lines(result: RunResult) -> list[str]:
-    """A warning for each finished model that is no better on its training views than one flat colour per view."""
+    """Return a warning for each finished model that does not beat one flat colour per view on its training views."""
     trained = {name: measured.train for name, measured in result.models.items()}
     return [
         f"{name} did not learn: {found.psnr:.1f} dB on its training views, where one flat colour per view reaches "
@@ -199,7 +212,7 @@ def learning_lines(result: RunResult) -> list[str]:
 
 
 def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: int) -> list[list[tuple[str, ...]]]:
-    """Columns in groups, each of which fits beside the names; one column at least."""
+    """Group columns so that each group, of at least one column, fits beside the names."""
     blocks: list[list[tuple[str, ...]]] = [[]]
     for column in columns:
         if blocks[-1] and max(map(len, aligned([names, *blocks[-1], column]))) > width:
@@ -209,7 +222,7 @@ def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: i
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
-    """The lines of a table: the first column to the left, the others to the right; no line without a figure."""
+    """Return the lines of a table: first column left-aligned, the others right-aligned; empty rows are left out."""
     name_width, *widths = (max(map(len, column)) for column in columns)
     lines = []
     for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
@@ -219,7 +232,7 @@ def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def minutes(seconds: float) -> str:
-    """A duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
+    """Return a duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
     whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60} min"
@@ -242,14 +255,14 @@ def _model_json(measured: ModelResult) -> dict[str, Any]:
 
 
 def _qualities(found: Evaluation | None) -> list[str]:
-    """PSNR, SSIM and LPIPS; empty where there is no figure."""
+    """Return PSNR, SSIM and LPIPS; empty for a missing metric."""
     if found is None:
         return ["", "", ""]
     return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
 
 
 def _figures(measured: ModelResult) -> list[str]:
-    """One model's column of the headline table; empty where there is no figure."""
+    """Return one model's column of the headline table; empty where there is no figure."""
 
     def megabytes(num_bytes: int) -> str:
         return f"{num_bytes / 1e6:.2f}"

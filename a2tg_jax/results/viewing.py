@@ -21,11 +21,11 @@ from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
-from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.record import read_record
-from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, photograph_name
+from a2tg_jax.results.run_evaluation import settings_of
+from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html
 from a2tg_jax.web.server import Route
 
 QUALITY = 90
@@ -58,7 +58,7 @@ class Source:
 
 
 def open_source(path: Path, name: str | None = None) -> Source:
-    """What a path leads to.
+    """Open a run folder or a file for viewing.
 
     Args:
       path: a run folder; or a model, *.npz or *.a2tgz; or Gaussians, *.ply.
@@ -108,7 +108,7 @@ def _source_of_ply(path: Path) -> Source:
 # Photographs
 
 
-class Photographs:
+class ServedPhotographs:
     """Those of the cameras that a model knows, as JPEG, read when they are asked for."""
 
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None]):
@@ -129,7 +129,7 @@ class Photographs:
             return self._views
 
     def jpeg(self, index: int) -> bytes | None:
-        """A photograph over the model's background, of its camera's size."""
+        """Return a photograph over the model's background, of its camera's size."""
         view = self.views.get(index)
         if view is None or self._origin is None:
             return None
@@ -159,16 +159,16 @@ class Photographs:
 
 
 def routes_of(source: Source) -> dict[str, Route]:
-    """What the viewer's server answers."""
+    """Return the routes of the viewer's server."""
     return {
-        "/": Route("text/html; charset=utf-8", page().encode()),
+        "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
-        **Photographs(source.model.origin, source.load_scene).routes,
+        **ServedPhotographs(source.model.origin, source.load_scene).routes,
     }
 
 
 def middle_of(model: Model) -> tuple[np.ndarray, float]:
-    """Where most means lie: [3], and the radius that holds three quarters."""
+    """Return the centre [3] of most means, and the radius that holds three quarters of them."""
     means = np.asarray(model.live.gaussians.means, np.float64)
     centre = np.median(means, axis=0)
     return centre, float(max(np.quantile(np.linalg.norm(means - centre, axis=1), 0.75), 1e-6))

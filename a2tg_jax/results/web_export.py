@@ -13,8 +13,8 @@ from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_o
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import Photographs, Source, middle_of
-from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, page, page_with, photograph_name
+from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of
+from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
 """So many views are measured, evenly chosen."""
@@ -35,7 +35,7 @@ class Exported:
 
 
 def export_web(source: Source, out: Path, *, single_file: bool = False, photographs: bool = False) -> Exported:
-    """Writes a page that shows a model: a folder for any web server, or one file that opens from the disk.
+    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk.
 
     Args:
       source: the model.
@@ -51,7 +51,7 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page that is not the viewer's; choose another folder with --web")
     data = source.encoded
-    files = {out: page_with(data).encode()} if single_file else _files_of(source, out, photographs)
+    files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -61,16 +61,16 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
     files = {out / SCENE_NAME: source.encoded}
     if photographs:
-        found = Photographs(source.model.origin, source.load_scene)
+        found = ServedPhotographs(source.model.origin, source.load_scene)
         if not found.views:
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
         files[out / PHOTOGRAPHS_NAME] = json.dumps(sorted(found.views)).encode()
-    return files | {out / "index.html": page().encode()}
+    return files | {out / "index.html": viewer_html().encode()}
 
 
 def exported_text(result: Exported) -> str:
-    """What was written, how large it is, and what it loses."""
+    """Return a summary of the files written, their size and their loss."""
     model, size = result.model, result.num_bytes
     lines = [f"{model.num:,} Gaussians, {model.num_bytes:,} bytes of numbers, {size:,} in the scene's file: "
              f"1/{model.num_bytes / max(size, 1):.1f}"]  # fmt: skip
@@ -79,7 +79,7 @@ def exported_text(result: Exported) -> str:
 
 
 def _losses_of(source: Source) -> dict[str, float]:
-    """What the file loses: on photographs where there are some, else beside renders."""
+    """Return the loss of the file: on photographs if there are any, otherwise beside renders."""
     if not source.model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
@@ -97,7 +97,7 @@ def _losses_of(source: Source) -> dict[str, float]:
 
 
 def _ring(model: Model) -> list[Camera]:
-    """Cameras around a model that knows none, which look at its middle."""
+    """Return cameras around the middle of a model that has none."""
     centre, radius = middle_of(model)
     width, height = RING_SIZE
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
-from a2tg_jax.results.evaluate_run import evaluate_run
 from a2tg_jax.results.folder import RunFolder, check_free, create_run
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
 from a2tg_jax.results.record import RunRecord, read_record, write_record
 from a2tg_jax.results.replacement import drop_old
+from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import RunResult
-from a2tg_jax.results.train_run import train_run
 from a2tg_jax.training.loop import Watch, unwatched
 
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
@@ -23,7 +23,7 @@ Watched = Callable[[Scene], AbstractContextManager[Watch]]
 
 
 def unseen(scene: Scene) -> AbstractContextManager[Watch]:
-    """Nobody looks."""
+    """Watch nothing."""
     return contextlib.nullcontext(unwatched)
 
 
@@ -36,7 +36,7 @@ def begin_run(
     max_memory: int | None = None,
     watched: Watched = unseen,
 ) -> RunResult:
-    """Trains and measures a new run, once all about it has been checked.
+    """Train and measure a new run, after checking everything about it.
 
     Args:
       record: what is trained.
@@ -69,8 +69,8 @@ def go_on(
     replaced_by: RunRecord | None = None,
     watched: Watched = unseen,
 ) -> RunResult:
-    """Trains what is not trained yet, and measures. Arguments as of `train_run` and `begin_run`, errors as of
-    `begin_run`."""
+    """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
+    errors those of `begin_run`."""
     with _advised(run, is_replacing=replaced_by is not None):
         with signals.noted() as is_stopped, watched(scene) as watch:
             train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped, watch=watch)
@@ -78,7 +78,7 @@ def go_on(
 
 
 def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
-    """As `evaluate_run`; where all is trained, a run that this one replaces goes."""
+    """Call `evaluate_run`, and delete a replaced run once all stages are trained."""
     result = evaluate_run(run, scene, lpips_weights=lpips_weights)
     if len(result.models) == len(result.plan.names):
         drop_old(run)
@@ -87,7 +87,7 @@ def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path |
 
 @contextlib.contextmanager
 def _advised(run: RunFolder, *, is_replacing: bool) -> Iterator[None]:
-    """Whatever ends the training, how to go on is said."""
+    """Add to whatever ends the training how to continue it."""
     before = _identity(run.record) if is_replacing else None
 
     def advice() -> str:
@@ -104,13 +104,13 @@ def _advised(run: RunFolder, *, is_replacing: bool) -> Iterator[None]:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """What another file in its place would not have."""
+    """Return numbers that another file in this place would not share."""
     status = path.stat()
     return status.st_ino, status.st_mtime_ns
 
 
 def how_to_go_on(run: RunFolder) -> str:
-    """Where the newest checkpoint is, and how to resume."""
+    """Return the path of the newest checkpoint, and the command that resumes."""
     names = read_record(run).plan.names
     checkpoints = [path for name in names for path in run.checkpoints(name)]
     finished = [run.model(name) for name in names if run.model(name).is_file()]

@@ -11,14 +11,14 @@ STATUS_NAME = "training.json"
 """What is told of a training that runs; the page asks again and again while it is there."""
 
 
-def page() -> str:
-    """The page, which shows the scene that lies beside it."""
+def viewer_html() -> str:
+    """Return the viewer's page, which shows the scene beside it."""
     return resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
 
 
-def page_with(scene: bytes) -> str:
-    """The page with a scene in it: it needs no other file."""
-    before, end, after = page().rpartition("</body>")
+def viewer_html_with(scene: bytes) -> str:
+    """Return the viewer's page with a scene in it; it needs no other file."""
+    before, end, after = viewer_html().rpartition("</body>")
     data = base64.b64encode(scene).decode("ascii")
     # Text that no browser runs, so that the page's policy needs to allow nothing more; it stands before the script.
     head, script, rest = before.partition('<script type="module">')
@@ -26,5 +26,5 @@ def page_with(scene: bytes) -> str:
 
 
 def photograph_name(index: int) -> str:
-    """Where the photograph of a camera lies."""
+    """Return the path of a camera's photograph."""
     return f"photographs/{index}.jpg"

@@ -38,7 +38,7 @@ class Route:
 
 
 def application(routes: Mapping[str, Route], port: int) -> Application:
-    """Answers GET and HEAD, or POST, at the paths of `routes`, such as "/", and nothing else.
+    """Answer GET and HEAD, or POST, at the paths of `routes`, such as "/", and nothing else.
 
     A request must name this machine as the host it asks: a page from elsewhere, whose name is made to lead here, cannot
     read the scene.
@@ -70,7 +70,7 @@ def application(routes: Mapping[str, Route], port: int) -> Application:
 
 
 def serve(routes: Mapping[str, Route], *, port: int = 0, on_start: Callable[[str], None] = print) -> None:
-    """Serves until the process is interrupted.
+    """Serve until the process is interrupted.
 
     Args:
       routes: what is answered, by path.
@@ -87,7 +87,7 @@ def serve(routes: Mapping[str, Route], *, port: int = 0, on_start: Callable[[str
 
 @contextlib.contextmanager
 def served(routes: Mapping[str, Route], *, port: int = 0) -> Iterator[str]:
-    """Serves meanwhile, in a thread; yields the address. Arguments and errors as of `serve`."""
+    """Serve meanwhile, in a thread; yields the address. Arguments and errors as of `serve`."""
     connections: dict[int, Any] = {}
     server = _opened(routes, port, connections)
     thread = threading.Thread(target=server.run, daemon=True)
@@ -102,7 +102,8 @@ def served(routes: Mapping[str, Route], *, port: int = 0) -> Iterator[str]:
 
 
 def _opened(routes: Mapping[str, Route], port: int, connections: dict[int, Any]) -> Any:
-    """A server of waitress that listens, and answers once it is run; it keeps what it holds open in `connections`."""
+    """Return a server of waitress that listens, and answers once it is run; it keeps what it holds open in
+    `connections`."""
     try:
         waitress: Any = importlib.import_module("waitress")
     except ImportError as error:
@@ -113,7 +114,7 @@ def _opened(routes: Mapping[str, Route], port: int, connections: dict[int, Any])
 
 
 def _listening(port: int) -> socket.socket:
-    """A socket bound to a port of the loopback."""
+    """Return a socket bound to a port of the loopback."""
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         if sys.platform != "win32":  # There it would let two programs share the port.

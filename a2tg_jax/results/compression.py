@@ -23,9 +23,9 @@ from a2tg_jax.io.rows import check_kind
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.corrected import refined_views
-from a2tg_jax.results.evaluate_run import settings_of
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.record import read_record
+from a2tg_jax.results.run_evaluation import settings_of
 from a2tg_jax.results.summary import aligned
 
 SUFFIX = ".a2tgz"
@@ -48,7 +48,7 @@ class Compressed:
 
 
 def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -> Compressed:
-    """Writes the smallest compact file of a model that loses so much at most.
+    """Write the smallest compact file of a model within a given loss.
 
     Losses are those of PSNR on the training views of a run. Where the photographs are not there, or a model's file is
     given, they are guessed from renders, for a model that would have `ASSUMED_PSNR`.
@@ -82,7 +82,7 @@ def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -
 
 
 def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
-    """Of the main system, and how it is rendered."""
+    """Return the path and render settings of the main system's last model."""
     plan = read_record(run).plan
     planned = plan[plan.main[-1]]
     path = run.model(planned.name)
@@ -92,7 +92,7 @@ def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
 
 
 def _scene_of(run: RunFolder) -> Scene | None:
-    """None where the photographs are gone."""
+    """Return the scene, or None if its photographs are missing."""
     try:
         return read_record(run).scene.load()
     except FileNotFoundError:
@@ -100,7 +100,7 @@ def _scene_of(run: RunFolder) -> Scene | None:
 
 
 def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
-    """Measures by name; the first decides."""
+    """Return loss measures by name; the first decides."""
     if scene is not None:
         train = refined_views(scene.train[:: -(-len(scene.train) // MOST_VIEWS)], model)
         losses = {"training views": loss_on_views(model, train, settings=settings)}
@@ -117,7 +117,7 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
 
 
 def compression_text(result: Compressed) -> str:
-    """A table of all that was tried, and what was written."""
+    """Return a table of all choices tried, and a summary of the file."""
     chosen, model = result.chosen, result.model
     groups = dict.fromkeys(trial.group for trial in result.trials)
     rows = [[f"{trial.group} {trial.precision}", *_figures(trial)] for trial in result.trials]

@@ -38,7 +38,7 @@ from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, comparison_html, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.training import System
-from a2tg_jax.web.page import page_with
+from a2tg_jax.web.page import viewer_html_with
 
 REPORTED_VIEWS = 4
 
@@ -46,7 +46,7 @@ REPORTED_VIEWS = 4
 def evaluate_run(
     run: RunFolder, scene: Scene | None = None, *, lpips_weights: str | os.PathLike | None = None
 ) -> RunResult:
-    """Measures the finished models of a run and writes what stands in its folder beside models and checkpoints.
+    """Measure the finished models of a run, and write the run folder's metrics, pictures and report.
 
     Args:
       run: an opened run folder with one finished stage at least.
@@ -89,19 +89,19 @@ def evaluate_run(
 
 
 def _write_viewer(run: RunFolder, model: Model, title: str) -> None:
-    """The page that shows a model in a browser, where browsers can."""
+    """Write viewer.html, if browsers can show the model."""
     if is_viewable(model.appearance):
         with replacing(run.own(run.viewer)) as temporary:
-            temporary.write_text(page_with(encode_web_scene(model, title=title)), encoding="utf-8")
+            temporary.write_text(viewer_html_with(encode_web_scene(model, title=title)), encoding="utf-8")
 
 
 def settings_of(system: System) -> RenderSettings:
-    """How the models of a system are rendered."""
+    """Return the render settings of a system's models."""
     return RenderSettings(tile_size=system.tile_size)
 
 
 def _seconds(run: RunFolder, name: str) -> float:
-    """Training time of a stage."""
+    """Return the training time of a stage."""
     return read_history(run.history(name)).last_seconds
 
 
@@ -122,14 +122,14 @@ def _measure(model: Model, scene: Scene, plan: RunPlan, system: System, seconds:
 
 
 def _write_curves(run: RunFolder, plan: RunPlan, names: list[str]) -> None:
-    """figures/curves.png: each stage after those that it follows."""
+    """Write figures/curves.png, with each stage after those that it follows."""
     histories = {name: read_history(run.history(name)) for name in names}
     starts = {name: plan.first_iteration(name) for name in names}
     save_figure(run.own(run.figures / "curves.png"), curves_figure(histories, starts))
 
 
 def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
-    """figures/sizes.png, textures.png, and resolutions.png, of the first view."""
+    """Write figures/sizes.png, textures.png, and resolutions.png of the first view."""
     assert model.textures is not None
     _, layout = model.textures
     learned = learned_textures(model)
@@ -144,7 +144,7 @@ def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: 
 
 
 def _write_surface(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
-    """figures/depth.png and normals.png, of the first view."""
+    """Write figures/depth.png and normals.png of the first view."""
     camera = (*scene.test, *scene.train)[0].camera
     output = Renderer(model, settings=settings_of(system))(camera)
     save_picture(run.own(run.figures / "depth.png"), depth_picture(output))
@@ -152,7 +152,7 @@ def _write_surface(run: RunFolder, model: Model, system: System, scene: Scene) -
 
 
 def _write_flight(run: RunFolder, model: Model, system: System) -> None:
-    """figures/flight.webp, where there are cameras to fly past."""
+    """Write figures/flight.webp, if there are cameras to fly past."""
     moving = flight(model, settings_of(system))
     if moving is not None:
         with replacing(run.own(run.figures / "flight.webp")) as temporary:
@@ -160,7 +160,7 @@ def _write_flight(run: RunFolder, model: Model, system: System) -> None:
 
 
 def _write_pictures(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> None:
-    """A sheet of each view, and the report with some of them. One view's pictures are in memory at a time."""
+    """Write a sheet of each view, and the report with some of them. Memory holds the pictures of one view at a time."""
     views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
     renderers = {name: _renderer(models[name], scene, result.plan[name].system) for name in names}
     files = picture_names(view.name for view in views)
@@ -174,13 +174,13 @@ def _write_pictures(run: RunFolder, result: RunResult, models: Mapping[str, Mode
 
 
 def _renderer(model: Model, scene: Scene, system: System) -> Renderer:
-    """What `evaluate` draws with: nothing is compiled anew."""
+    """Return the renderer that `evaluate` uses, so that nothing is compiled anew."""
     cameras = [view.camera for view in (*scene.test, *scene.train)]
     return Renderer(model, cameras=cameras, settings=settings_of(system), has_geometry=False)
 
 
 def _compare(view: View, renderers: Mapping[str, Renderer], background: Color) -> Comparison:
-    """One view: the photograph, what the main model is to be compared with, the main model."""
+    """Return one view as photographed, as rendered by the models to compare with, and by the main model."""
     truth = to_uint8(view_image(view, background))
     renders = [to_uint8(renderer(view.camera).color) for renderer in renderers.values()]
     crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
@@ -188,7 +188,7 @@ def _compare(view: View, renderers: Mapping[str, Renderer], background: Color) -
 
 
 def _write_sheet(path: Path, run: RunFolder, comparison: Comparison) -> None:
-    """Photograph, renders, error of the last render."""
+    """Write the photograph, the renders and the error of the last render side by side."""
     error = error_picture(comparison.images[-1], comparison.images[0])
     sheet = side_by_side([*comparison.images, error], [*comparison.captions, f"error, {ERROR_GAIN} times"])
     save_picture(run.own(path), sheet)

@@ -41,7 +41,7 @@ def train_run(
     is_stopped: IsStopped = never,
     watch: Watch = unwatched,
 ) -> None:
-    """Trains every stage that the run's record asks for and that is not finished yet.
+    """Train every stage of the run's record that is not finished yet.
 
     A stage goes on from its newest checkpoint. When it ends, its history and its model are written, and its checkpoints
     deleted.
@@ -88,7 +88,8 @@ class _Training:
     watch: Watch
 
     def train(self, replaced_by: RunRecord | None = None) -> StageResult:
-        """From its newest checkpoint, or from its beginning; again from there where it diverges and may."""
+        """Train the stage from its newest checkpoint or from its beginning; after a divergence, restore if that is
+        allowed."""
         keep = _Keeper(self.run, self.planned.name, replaced_by)
         num_restored = None
         while True:
@@ -117,7 +118,7 @@ class _Training:
         )
 
     def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:
-        """Keeps the state before the step, and says which order of the views is next.
+        """Save the state before the diverged step, and return the number of the next order of views.
 
         Raises:
           ValueError: if the run is to stop then, or has gone back often enough.
@@ -157,7 +158,7 @@ class _Keeper:
 
 
 def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
-    """The newest checkpoint of a stage that can be read, after a check that it was made with the same numbers so far.
+    """Return the newest readable checkpoint of a stage, made with the same options so far; None without one.
 
     Raises:
       ValueError: if there are some, and none can be read.
@@ -182,14 +183,14 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
 
 
 def _warn_of_machine(path: Path, checkpoint: Checkpoint) -> None:
-    """Says where a run that goes on will not have the bits of one that was left alone."""
+    """Warn if a resumed run will differ in its last bits, because another machine wrote the checkpoint."""
     told = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
     if told:
         warnings.warn(f"{path.name} was made elsewhere, so last bits will differ: {'; '.join(told)}", stacklevel=3)
 
 
 def _check_model(path: Path, planned: PlannedStage) -> None:
-    """Refuses a finished model that was made with other numbers than are wanted now."""
+    """Raise if a finished model was made with other options than those of the record."""
     try:
         made = read_archive_header(path, format=FORMAT).get("system")
     except ValueError as error:
