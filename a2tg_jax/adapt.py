@@ -85,7 +85,7 @@ class Upscale(HostEvent):
             interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
-        return iterations_at(fractions, num_iterations, "texture.upscale_at")
+        return iterations_at(fractions, num_iterations, of=self)
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         if self.select == "budget":

@@ -7,7 +7,8 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 """
 
 import dataclasses
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, dataclass_transform
 
 import jax
@@ -116,6 +117,23 @@ class Change(NamedTuple):
     Model, moments and state are those of the new order; what other events have gathered then follows."""
 
 
+def with_names(message: str, name_of: Callable[[str], str]) -> str:
+    """Return a message in which `name_of` names each field that stands in braces, such as "{cap}"."""
+    return re.sub(r"\{(\w+)\}", lambda match: name_of(match[1]), message)
+
+
+class FieldError(ValueError):
+    """Mistake in a field of an event. `System.naming_options` replaces the field's name by that of its option."""
+
+    def __init__(self, event: "Event", message: str):
+        """Args:
+        event: whose fields they are.
+        message: one line with the fields' names in braces.
+        """
+        super().__init__(with_names(message, lambda name: name))
+        self.event, self.message = event, message
+
+
 class Event:
     """What both kinds of event have in common."""
 
@@ -182,7 +200,9 @@ class StepEvent(Event):
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
     impossible: ClassVar[str] = ""
-    """Why training cannot go on where `EventInfo.is_possible` is False, and what to do."""
+    """Reason why training cannot go on if `EventInfo.is_possible` is False; the event's fields stand in braces."""
+    refused: ClassVar[str] = ""
+    """Advice if `EventInfo.num_refused` is not 0, such as "raise {cap}"; the event's fields stand in braces."""
 
     def times(self, num_iterations: int) -> Times:
         """When it happens in a stage of so many iterations (host)."""
@@ -209,14 +229,23 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 
-def iterations_at(fractions: tuple[float, ...], num_iterations: int, name: str = "at") -> tuple[int, ...]:
-    """The iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
+def iterations_at(
+    fractions: tuple[float, ...], num_iterations: int, name: str = "at", of: Event | None = None
+) -> tuple[int, ...]:
+    """Return the iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
+
+    Args:
+      fractions: ascending, between 0 and 1.
+      num_iterations: length of the stage.
+      name: name of the fractions in the error.
+      of: event that has the fractions as its field `name`; None if `name` is an option.
 
     Raises:
-      ValueError: calling them `name`, unless they are ascending and between 0 and 1.
+      ValueError: if the fractions are not ascending or not between 0 and 1; a `FieldError` if `of` is given.
     """
     if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
-        raise ValueError(f"{name} must be ascending fractions between 0 and 1; got {fractions}")
+        wrong = f"must be ascending fractions between 0 and 1; got {fractions}"
+        raise ValueError(f"{name} {wrong}") if of is None else FieldError(of, f"{{{name}}} {wrong}")
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 

@@ -20,7 +20,18 @@ from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, event, gather_rows, static
+from a2tg_jax.events import (
+    Change,
+    EventInfo,
+    FieldError,
+    Now,
+    StepEvent,
+    Times,
+    clear_moments,
+    event,
+    gather_rows,
+    static,
+)
 from a2tg_jax.model import Model
 from a2tg_jax.texture import bucket_capacity
 
@@ -291,10 +302,8 @@ class Mcmc(StepEvent):
     """Largest number of Gaussians."""
 
     num_keys: ClassVar[int] = 2
-    impossible: ClassVar[str] = (
-        "no Gaussian above the death opacity is left: check the cameras and points of the scene, or lower "
-        "rates.logit_opacities"
-    )
+    impossible: ClassVar[str] = "no Gaussian above the death opacity is left"
+    refused: ClassVar[str] = "raise {cap}"
 
     def times(self, num_iterations: int) -> Times:
         return densify_times(num_iterations)
@@ -344,9 +353,10 @@ class FillingMcmc(Mcmc):
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations).num_times:
-            raise ValueError(
-                f"in {num_iterations} iterations there is no growth from {num:,} Gaussians to the {self.cap:,} that "
-                "there shall be: raise stage1_iterations or initial_gaussians"
+            raise FieldError(
+                self,
+                f"{{cap}} has room for {self.cap:,} Gaussians, but in {num_iterations} iterations there is no growth "
+                f"from {num:,}",
             )
         return max(num, self.cap)
 

@@ -266,6 +266,20 @@ def test_gaussians_that_find_no_room_are_counted_and_said(scene):
         a2tg.fit(scene, system, progress=False)
 
 
+@pytest.mark.parametrize(
+    "name, reason",
+    [
+        ("gaussians-2d-mcmc", "no Gaussian above the death opacity is left"),
+        ("gaussians-2d", "adaptive density control would prune every Gaussian: lower densify.least_opacity"),
+    ],
+)
+def test_a_training_without_gaussians_left_tells_what_to_change(scene, name, reason):
+    system = tiny(name, initial_opacity=0.001, rates={"logit_opacities": 0.0})
+    advice = "check the cameras and points of the scene, or lower rates.logit_opacities"
+    with pytest.raises(ValueError, match=rf"^training cannot go on at iteration \d+ .*: {reason}; {advice}$"):
+        a2tg.fit(scene, system, progress=False)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_options_as_values_of_files_and_back(name):
     system = type(a2tg.find_system(name)).preset("smoke")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.adapt import Upscale
@@ -13,6 +14,7 @@ from a2tg_jax.systems.stage1 import (
     ANY_RATE,
     FLOATS_PER_TEXEL,
     LOOKUP_RANGES,
+    MCMC_OPTIONS,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -126,6 +128,11 @@ class A2tg(System):
         "texture.single_rate": ANY_RATE,
         **LOOKUP_RANGES,
     }
+    event_options: ClassVar[Mapping[str, str]] = {
+        **MCMC_OPTIONS,
+        **{f"Upscale.{field.name}": f"texture.{field.name}" for field in dataclasses.fields(Upscale)},
+        "Upscale.at": "texture.upscale_at",
+    }
 
     def stages(self) -> tuple[Stage, ...]:
         lookup, upscale = self.texture.lookup, self._texture().event()
@@ -147,7 +154,8 @@ class A2tg(System):
 
     def _budget_texels(self, upscale: Upscale) -> float:
         """Texels a Gaussian that the number of Gaussians leaves room for: at most half of what there can be."""
-        can_grow = bool(upscale.iterations(self.stage2_iterations))
+        with self.naming_options():
+            can_grow = bool(upscale.iterations(self.stage2_iterations))
         return min(BUDGET_TEXELS, (1 + upscale.cap**2) / 2) if can_grow else 1
 
     @classmethod

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
@@ -12,7 +13,7 @@ from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.mcmc import Noise, densify_times
-from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import LOOKUP_RANGES, MCMC_OPTIONS, QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
@@ -85,6 +86,16 @@ class Bytewise(System):
 
     name: ClassVar[str] = "bytewise"
     ranges: ClassVar[Ranges] = LOOKUP_RANGES
+    event_options: ClassVar[Mapping[str, str]] = {
+        **MCMC_OPTIONS,
+        "Prune.share": "prune.share",
+        "Prune.at": "prune.at",
+        "AdaptDegrees.at": "view_dependence.at",
+        "AdaptDegrees.idle": "view_dependence.idle",
+        "AdaptDegrees.highest": "sh_degree",
+        "Upscale.at": "texture.at",
+        "Upscale.cap": "texture.cap",
+    }
 
     @property
     def initial_sh_degree(self) -> int:

@@ -26,6 +26,14 @@ SMOKE_CAP = 1_000
 FLOATS_PER_TEXEL = 4
 ANY_RATE = (0, math.inf)
 LOOKUP_RANGES: Ranges = {"texture.lookup.max_alpha": (1e-3, 0.9999), "texture.lookup.initial_rgb": (-1.0, 1.0)}
+MCMC_OPTIONS = {"Mcmc.cap": "densify.cap"}
+DENSITY_OPTIONS = {
+    "CloneSplitPrune.cap": "densify.cap",
+    "CloneSplitPrune.threshold": "densify.threshold",
+    "CloneSplitPrune.least_opacity": "densify.least_opacity",
+    "OpacityReset.most": "densify.reset_opacity",
+}
+"""Options by the field of an event that they set (`System.event_options`)."""
 DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0, 0.99)}
 
 

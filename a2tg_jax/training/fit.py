@@ -146,8 +146,9 @@ def fit_stage(
     check_views(scene.train)
     if start is None and resume is None:
         start = initial_model(scene, system)
-    run = StageRun(scene, system, index, start, resume, num_restored)
-    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
+    with system.naming_options():
+        run = StageRun(scene, system, index, start, resume, num_restored)
+        run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
     origin = origin_of_scene(scene, BACKGROUNDS[system.background])
     origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
     model = dataclasses.replace(run.model, origin=origin)
@@ -166,6 +167,6 @@ def warn_of_budget(system: System, model: Model) -> None:
     elif used + used / model.num > budget:
         advice = f"there is no room for another Gaussian of {used / model.num:,.0f} bytes: raise memory_budget"
     else:
-        advice = "raise stage1_iterations or initial_gaussians"
+        advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
     warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=3)

@@ -180,11 +180,17 @@ class StageRun:
                 if is_stopped() and iteration < end:
                     raise KeyboardInterrupt
         if self.num_refused:
+            advice = "; or ".join(self._told_by_events("refused"))
             warnings.warn(
                 f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
-                f"have been added, all {self.state.model.gaussians.num:,} rows being taken: raise densify.cap",
+                f"have been added, all {self.state.model.gaussians.num:,} rows being taken{advice and f': {advice}'}",
                 stacklevel=2,
             )
+
+    def _told_by_events(self, name: str) -> list[str]:
+        """Return the messages of step events in an attribute, with the options' names for the events' fields."""
+        events = [event for event in self.stage.events if isinstance(event, StepEvent)]
+        return [self.system.told(event, message) for event in events if (message := getattr(event, name))]
 
     def _next_stop(self, iteration: int, checkpoint_every: int | None) -> int:
         """The iteration after which the host has something to do."""
@@ -248,8 +254,11 @@ class StageRun:
         if info.status in (NOT_FINITE, EXPLODED):
             raise self._diverged(iteration, where, info)
         assert info.status == IMPOSSIBLE
-        reasons = [event.impossible for event in self.stage.events if isinstance(event, StepEvent) and event.impossible]
-        raise ValueError(f"training cannot go on {where}: {'; or '.join(reasons)}")
+        reasons = "; or ".join(self._told_by_events("impossible"))
+        raise ValueError(
+            f"training cannot go on {where}: {reasons}; check the cameras and points of the scene, or lower "
+            "rates.logit_opacities"
+        )
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
         """The error that tells what was not finite, or too large."""

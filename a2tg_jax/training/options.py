@@ -1,11 +1,14 @@
 """Options that every system has: views, initial Gaussians, loss, learning rates, the seed."""
 
+import contextlib
 import dataclasses
 import math
 import typing
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
+from a2tg_jax.events import Event, FieldError, with_names
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
@@ -91,7 +94,9 @@ class System:
     name: ClassVar[str] = ""
     """What the command line calls the system."""
     ranges: ClassVar[Ranges] = {}
-    """Of options of its own."""
+    """Ranges of the system's own options."""
+    event_options: ClassVar[Mapping[str, str]] = {}
+    """Options by the field of an event that they set, such as {"Mcmc.cap": "densify.cap"}: messages name them."""
 
     def __post_init__(self) -> None:
         """A budget is kept as a number of MB, however it was written."""
@@ -175,6 +180,10 @@ class System:
           ValueError: naming the option, what was wanted and what came.
         """
         self._check_numbers()
+        with self.naming_options():
+            self._check_stages()
+
+    def _check_stages(self) -> None:
         stages = self.stages()
         if not stages:
             raise ValueError(f"{type(self).__name__} has no stages")
@@ -189,6 +198,33 @@ class System:
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
+
+    def option_of(self, event: Event, field: str) -> str | None:
+        """Return the name of the option that sets a field of an event; None if the system does not tell."""
+        classes = (f"{kind.__name__}.{field}" for kind in type(event).__mro__)
+        name = next((self.event_options[known] for known in classes if known in self.event_options), None)
+        return "memory_budget" if self.memory_budget is not None and name in BUDGET_OPTIONS else name
+
+    def told(self, event: Event, message: str) -> str:
+        """Return an event's message with the options' names in place of its fields, which stand in braces."""
+        return with_names(message, lambda field: self.option_of(event, field) or f"{field} of {type(event).__name__}")
+
+    @contextlib.contextmanager
+    def naming_options(self) -> Iterator[None]:
+        """Name the option in place of the field in errors of events.
+
+        Raises:
+          ValueError: in place of a `FieldError`.
+        """
+        try:
+            yield
+        except FieldError as error:
+            raise ValueError(self.told(error.event, error.message)) from error
+
+    def more_growth(self) -> str:
+        """Return the names of the options that make more Gaussians, for advice."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
     def check_number(self, num: int) -> None:
         """Refuses what cannot be trained from so many Gaussians.
@@ -217,6 +253,8 @@ class System:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
 
+BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
+"""Options whose place a memory budget takes."""
 RANGES = {
     "batch_size": (1, math.inf),
     "initial_gaussians": (2, math.inf),
