@@ -4,6 +4,7 @@ The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select`
 `reallocate`. All but the statistic runs on the host, on whole arrays.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -43,28 +44,34 @@ _compiled_shapes: set[Shape] = set()
 """Shapes that steps of this process have been compiled for. They change padding only, never a result."""
 
 
-@event
-class Upscale(HostEvent):
-    """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
+@dataclasses.dataclass(frozen=True)
+class UpscaleChoices:
+    """Choices that `Upscale` and the options of a system share."""
 
     select: Literal["fraction", "threshold", "budget"] = static(default="fraction")
-    """How the Gaussians to upscale are chosen (`select`)."""
+    """Rule that chooses the Gaussians to upscale."""
     fraction: float = 0.25
     """Share of the Gaussians upscaled at each event."""
     threshold: float | None = None
-    """Smallest average gradient that is upscaled (k_G)."""
+    """Smallest average gradient that is upscaled (k_G); needed by select="threshold"."""
     budget_mb: float | None = None
-    """Reported memory never exceeds this many MB (10^6 bytes)."""
+    """Largest reported memory in MB (10^6 bytes); needed by select="budget"."""
     anisotropic: bool = static(default=True)
     """Double one axis only on thin Gaussians; off: always both."""
     axes: Literal["paper", "authors"] = static(default="paper")
-    """Which axis of a thin Gaussian doubles (`next_sizes`)."""
+    """Axis that a thin Gaussian doubles: the long one, or the short one as in the authors' program."""
     k_a: float = 4.0
     """Aspect ratio above which a Gaussian counts as elongated."""
     k_s: float = 0.01
     """Shorter scale, in units of the normalised world, below which an elongated Gaussian counts as thin."""
     cap: int = static(default=4)
     """Largest texture side in texels (at most 16)."""
+
+
+@event
+class Upscale(UpscaleChoices, HostEvent):
+    """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
+
     at: tuple[float, ...] | None = static(default=None)
     """Fractions of the stage after which textures grow; None: so often that the cap can be reached, every 1/60 of the
     stage as in the paper, under 30,000 iterations every 0.15."""

@@ -9,7 +9,7 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 import dataclasses
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, dataclass_transform
+from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -258,6 +258,22 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
 def event(cls):
     """Decorator: a frozen dataclass that is a pytree of its numbers."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+T = TypeVar("T")
+
+
+def from_options(kind: type[T], options: Any, **others: Any) -> T:
+    """Build an event from options.
+
+    Args:
+      kind: class of the event.
+      options: dataclass; its fields of the same names set fields of the event.
+      others: further fields of the event, which take precedence.
+    """
+    fields = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    shared = fields & {field.name for field in dataclasses.fields(options)} - set(others)
+    return kind(**{name: getattr(options, name) for name in shared}, **others)
 
 
 def gather_rows(model: Model, rows: Array) -> Model:

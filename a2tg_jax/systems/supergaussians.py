@@ -35,9 +35,9 @@ class KernelConfig:
     sharpness: float = 1.25e-3
 
     def rates(self) -> MovableKernelParams:
-        """One for each field of the kernels."""
-        fields: Any = (self.centers, self.sharpness, self.logit_opacities, self.colors)
-        return MovableKernelParams(*fields)
+        """Return one rate for each field of the kernels."""
+        rates: dict[str, Any] = dataclasses.asdict(self)
+        return MovableKernelParams(**rates)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

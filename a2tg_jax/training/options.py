@@ -23,7 +23,7 @@ Ranges = dict[str, tuple[float, float]]
 class LossConfig:
     """Weights of the photometric loss and of the optional terms (0 is off, the paper's setting)."""
 
-    ssim_weight: float = 0.2
+    ssim_weight: float = Photometric.ssim_weight
     """w in (1 - w)·L1 + w·(1 - SSIM)."""
     normal_weight: float = 0.0
     """Normal consistency of 2DGS: rendered normals against the normals of the rendered depth."""
@@ -50,11 +50,11 @@ class LossConfig:
 class CorrectionConfig:
     """How fast what `exposure` and `refine_poses` ask for is learned."""
 
-    exposure_rate: float = 1e-2
+    exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
-    pose_rate: float = 1e-3
+    pose_rate: float = PoseRefinement.rate
     """That of the motions, in radians and in units of the normalised world."""
-    final_factor: float = 0.1
+    final_factor: float = Exposure.final_factor
     """Both rates at the end of the first stage, and in later ones, over those at its start."""
 
 
@@ -144,8 +144,8 @@ class System:
         """
         rates, last = self.corrections, self.corrections.final_factor
         start, end = (1.0, last) if stage == 0 else (last, 1.0)
-        poses = (PoseRefinement(rates.pose_rate * start, end),) if self.refine_poses else ()
-        exposures = (Exposure(rates.exposure_rate * start, end),) if self.exposure else ()
+        poses = (PoseRefinement(rate=rates.pose_rate * start, final_factor=end),) if self.refine_poses else ()
+        exposures = (Exposure(rate=rates.exposure_rate * start, final_factor=end),) if self.exposure else ()
         return (*poses, *exposures)
 
     def stages(self) -> tuple[Stage, ...]:
