@@ -26,7 +26,7 @@ from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
 from a2tg_jax.results.plan import fingerprint, plan_run
 from a2tg_jax.results.summary import budget_lines
-from a2tg_jax.training.fit import warn_of_budget
+from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict, with_changes
 from a2tg_jax.training.start import check_start
 

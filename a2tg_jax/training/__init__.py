@@ -5,10 +5,10 @@ from a2tg_jax.training.checkpoint import History as History
 from a2tg_jax.training.checkpoint import load_checkpoint as load_checkpoint
 from a2tg_jax.training.checkpoint import save_checkpoint as save_checkpoint
 from a2tg_jax.training.divergence import DivergedError as DivergedError
-from a2tg_jax.training.fit import FitResult as FitResult
-from a2tg_jax.training.fit import StageResult as StageResult
-from a2tg_jax.training.fit import fit as fit
-from a2tg_jax.training.fit import fit_stage as fit_stage
+from a2tg_jax.training.fitting import FitResult as FitResult
+from a2tg_jax.training.fitting import StageResult as StageResult
+from a2tg_jax.training.fitting import fit as fit
+from a2tg_jax.training.fitting import fit_stage as fit_stage
 from a2tg_jax.training.options import LossConfig as LossConfig
 from a2tg_jax.training.options import System as System
 from a2tg_jax.training.options import like as like
