@@ -289,8 +289,7 @@ class Noise(StepEvent):
     """Exploration noise on the means, after every iteration (`perturb`)."""
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
-        num_live = model.gaussians.num if model.num_live is None else model.num_live
-        gaussians = perturb(now.keys[0], model.gaussians, num_live, now.rate_of_means)
+        gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means)
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
@@ -327,7 +326,7 @@ class Mcmc(StepEvent):
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
-        least, cap = self.least(now, num_rows_live(model)), min(self.cap, model.gaussians.num)
+        least, cap = self.least(now, model.live_count), min(self.cap, model.gaussians.num)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
@@ -339,7 +338,7 @@ class Mcmc(StepEvent):
     @staticmethod
     def _move(model: Model, moments: AdamState, plan) -> tuple[Model, AdamState, MoveInfo]:
         appearance, layout = model.appearance, model.layout
-        num_live = num_rows_live(model)
+        num_live = model.live_count
         moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)
         gaussians, params = appearance.share(model.gaussians, model.params, layout, moves.num_shares)
         num_live = num_live + moves.info.num_added
@@ -363,8 +362,3 @@ class FillingMcmc(Mcmc):
     def least(self, now: Now, num_live: Array) -> Array | int:
         assert now.times is not None
         return number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
-
-
-def num_rows_live(model: Model) -> Array:
-    """How many rows exist, int32."""
-    return jnp.asarray(model.gaussians.num if model.num_live is None else model.num_live, jnp.int32)

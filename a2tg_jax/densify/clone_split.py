@@ -158,8 +158,7 @@ class FillingDensity(CloneSplitPrune):
 
 def is_live(model: Model) -> Array:
     """[N] which rows exist."""
-    num = model.gaussians.num
-    return jnp.arange(num, dtype=jnp.int32) < (num if model.num_live is None else model.num_live)
+    return jnp.arange(model.gaussians.num, dtype=jnp.int32) < model.live_count
 
 
 def _sizes(model: Model) -> Array:
