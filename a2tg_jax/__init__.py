@@ -102,6 +102,7 @@ from a2tg_jax.training import FitResult as FitResult
 from a2tg_jax.training import History as History
 from a2tg_jax.training import LearningRates as LearningRates
 from a2tg_jax.training import LossConfig as LossConfig
+from a2tg_jax.training import Session as Session
 from a2tg_jax.training import Stage as Stage
 from a2tg_jax.training import StageResult as StageResult
 from a2tg_jax.training import System as System

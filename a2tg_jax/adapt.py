@@ -40,10 +40,6 @@ class ReallocateResult(NamedTuple):
     """As given, its textures rebuilt as the texels were."""
 
 
-_compiled_shapes: set[Shape] = set()
-"""Shapes that steps of this process have been compiled for. They change padding only, never a result."""
-
-
 @dataclasses.dataclass(frozen=True)
 class UpscaleChoices:
     """Choices that `Upscale` and the options of a system share."""
@@ -128,8 +124,8 @@ class Upscale(UpscaleChoices, HostEvent):
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
-        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
-        _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
+        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(due.shapes), kept)
+        due.shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
         model = model.with_textures(rebuilt.textures, rebuilt.layout)
         return Change(model, rebuilt.moments, self.init(model))
 

@@ -21,6 +21,7 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
+from a2tg_jax.texture import Shape
 
 
 class Times(NamedTuple):
@@ -92,7 +93,9 @@ class Due:
     count: int = 1
     """How many times it has."""
     views: Sequence[View] = ()
-    """Those that are trained on, with the cameras that the scene gives."""
+    """Training views, with the cameras that the scene gives."""
+    shapes: set[Shape] = dataclasses.field(default_factory=set)
+    """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
 
 
 class EventInfo(NamedTuple):
