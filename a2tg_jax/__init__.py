@@ -109,12 +109,14 @@ if TYPE_CHECKING:
     from a2tg_jax.training import History as History
     from a2tg_jax.training import LearningRates as LearningRates
     from a2tg_jax.training import LossConfig as LossConfig
+    from a2tg_jax.training import Session as Session
     from a2tg_jax.training import Stage as Stage
     from a2tg_jax.training import StageResult as StageResult
     from a2tg_jax.training import System as System
     from a2tg_jax.training import Target as Target
     from a2tg_jax.training import Term as Term
     from a2tg_jax.training import find_system as find_system
+    from a2tg_jax.training import fit as fit
     from a2tg_jax.training import fit_stage as fit_stage
     from a2tg_jax.training import like as like
     from a2tg_jax.training import load_checkpoint as load_checkpoint
@@ -122,7 +124,6 @@ if TYPE_CHECKING:
     from a2tg_jax.training.corrections import Correction as Correction
     from a2tg_jax.training.corrections import Exposure as Exposure
     from a2tg_jax.training.corrections import PoseRefinement as PoseRefinement
-    from a2tg_jax.training.fit import fit as fit
     from a2tg_jax.training.gradients import ViewGradients as ViewGradients
     from a2tg_jax.training.gradients import view_gradients as view_gradients
     from a2tg_jax.training.losses import normal_consistency as normal_consistency
@@ -184,19 +185,20 @@ _NAMES = {
         "History",
         "LearningRates",
         "LossConfig",
+        "Session",
         "Stage",
         "StageResult",
         "System",
         "Target",
         "Term",
         "find_system",
+        "fit",
         "fit_stage",
         "like",
         "load_checkpoint",
         "save_checkpoint",
     ),
     "a2tg_jax.training.corrections": ("Correction", "Exposure", "PoseRefinement"),
-    "a2tg_jax.training.fit": ("fit",),
     "a2tg_jax.training.gradients": ("ViewGradients", "view_gradients"),
     "a2tg_jax.training.losses": ("normal_consistency", "photometric_loss"),
 }

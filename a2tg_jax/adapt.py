@@ -4,6 +4,7 @@ The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select`
 `reallocate`. All but the statistic runs on the host, on whole arrays.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -39,32 +40,34 @@ class ReallocateResult(NamedTuple):
     """As given, its textures rebuilt as the texels were."""
 
 
-_compiled_shapes: set[Shape] = set()
-"""Shapes that steps of this process have been compiled for. They change padding only, never a result."""
-
-
-@event
-class Upscale(HostEvent):
-    """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
+@dataclasses.dataclass(frozen=True)
+class UpscaleChoices:
+    """Choices that `Upscale` and the options of a system share."""
 
     select: Literal["fraction", "threshold", "budget"] = static(default="fraction")
-    """How the Gaussians to upscale are chosen (`select`)."""
+    """Rule that chooses the Gaussians to upscale."""
     fraction: float = 0.25
     """Share of the Gaussians upscaled at each event."""
     threshold: float | None = None
-    """Smallest average gradient that is upscaled (k_G)."""
+    """Smallest average gradient that is upscaled (k_G); needed by select="threshold"."""
     budget_mb: float | None = None
-    """Reported memory never exceeds this many MB (10^6 bytes)."""
+    """Largest reported memory in MB (10^6 bytes); needed by select="budget"."""
     anisotropic: bool = static(default=True)
     """Double one axis only on thin Gaussians; off: always both."""
     axes: Literal["paper", "authors"] = static(default="paper")
-    """Which axis of a thin Gaussian doubles (`next_sizes`)."""
+    """Axis that a thin Gaussian doubles: the long one, or the short one as in the authors' program."""
     k_a: float = 4.0
     """Aspect ratio above which a Gaussian counts as elongated."""
     k_s: float = 0.01
     """Shorter scale, in units of the normalised world, below which an elongated Gaussian counts as thin."""
     cap: int = static(default=4)
     """Largest texture side in texels (at most 16)."""
+
+
+@event
+class Upscale(UpscaleChoices, HostEvent):
+    """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
+
     at: tuple[float, ...] | None = static(default=None)
     """Fractions of the stage after which textures grow; None: so often that the cap can be reached, every 1/60 of the
     stage as in the paper, under 30,000 iterations every 0.15."""
@@ -85,7 +88,7 @@ class Upscale(HostEvent):
             interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
-        return iterations_at(fractions, num_iterations, "texture.upscale_at")
+        return iterations_at(fractions, num_iterations, of=self)
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         if self.select == "budget":
@@ -121,8 +124,8 @@ class Upscale(HostEvent):
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
-        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(_compiled_shapes), kept)
-        _compiled_shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
+        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(due.shapes), kept)
+        due.shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
         model = model.with_textures(rebuilt.textures, rebuilt.layout)
         return Change(model, rebuilt.moments, self.init(model))
 

@@ -7,8 +7,9 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, dataclass_transform
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
+from a2tg_jax.texture import Shape
 
 
 class Times(NamedTuple):
@@ -92,7 +94,9 @@ class Due:
     count: int = 1
     """How many times it has."""
     views: Sequence[View] = ()
-    """Those that are trained on, with the cameras that the scene gives."""
+    """Training views, with the cameras that the scene gives."""
+    shapes: set[Shape] = dataclasses.field(default_factory=set)
+    """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
 
 
 class EventInfo(NamedTuple):
@@ -115,6 +119,23 @@ class Change(NamedTuple):
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
     Model, moments and state are those of the new order; what other events have gathered then follows."""
+
+
+def with_names(message: str, name_of: Callable[[str], str]) -> str:
+    """Return a message in which `name_of` names each field that stands in braces, such as "{cap}"."""
+    return re.sub(r"\{(\w+)\}", lambda match: name_of(match[1]), message)
+
+
+class FieldError(ValueError):
+    """Mistake in a field of an event. `System.naming_options` replaces the field's name by that of its option."""
+
+    def __init__(self, event: "Event", message: str):
+        """Args:
+        event: whose fields they are.
+        message: one line with the fields' names in braces.
+        """
+        super().__init__(with_names(message, lambda name: name))
+        self.event, self.message = event, message
 
 
 class Event:
@@ -183,7 +204,9 @@ class StepEvent(Event):
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
     impossible: ClassVar[str] = ""
-    """Why training cannot go on where `EventInfo.is_possible` is False, and what to do."""
+    """Reason why training cannot go on if `EventInfo.is_possible` is False; the event's fields stand in braces."""
+    refused: ClassVar[str] = ""
+    """Advice if `EventInfo.num_refused` is not 0, such as "raise {cap}"; the event's fields stand in braces."""
 
     def times(self, num_iterations: int) -> Times:
         """When it happens in a stage of so many iterations (host)."""
@@ -210,14 +233,23 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 
-def iterations_at(fractions: tuple[float, ...], num_iterations: int, name: str = "at") -> tuple[int, ...]:
-    """The iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
+def iterations_at(
+    fractions: tuple[float, ...], num_iterations: int, name: str = "at", of: Event | None = None
+) -> tuple[int, ...]:
+    """Return the iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
+
+    Args:
+      fractions: ascending, between 0 and 1.
+      num_iterations: length of the stage.
+      name: name of the fractions in the error.
+      of: event that has the fractions as its field `name`; None if `name` is an option.
 
     Raises:
-      ValueError: calling them `name`, unless they are ascending and between 0 and 1.
+      ValueError: if the fractions are not ascending or not between 0 and 1; a `FieldError` if `of` is given.
     """
     if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
-        raise ValueError(f"{name} must be ascending fractions between 0 and 1; got {shortened(fractions)}")
+        wrong = f"must be ascending fractions between 0 and 1; got {shortened(fractions)}"
+        raise ValueError(f"{name} {wrong}") if of is None else FieldError(of, f"{{{name}}} {wrong}")
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 
@@ -230,6 +262,22 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
 def event(cls):
     """Decorator: a frozen dataclass that is a pytree of its numbers."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+T = TypeVar("T")
+
+
+def from_options(kind: type[T], options: Any, **others: Any) -> T:
+    """Build an event from options.
+
+    Args:
+      kind: class of the event.
+      options: dataclass; its fields of the same names set fields of the event.
+      others: further fields of the event, which take precedence.
+    """
+    fields = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    shared = fields & {field.name for field in dataclasses.fields(options)} - set(others)
+    return kind(**{name: getattr(options, name) for name in shared}, **others)
 
 
 def gather_rows(model: Model, rows: Array) -> Model:

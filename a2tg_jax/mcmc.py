@@ -20,7 +20,18 @@ from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, event, gather_rows, static
+from a2tg_jax.events import (
+    Change,
+    EventInfo,
+    FieldError,
+    Now,
+    StepEvent,
+    Times,
+    clear_moments,
+    event,
+    gather_rows,
+    static,
+)
 from a2tg_jax.model import Model
 from a2tg_jax.texture import bucket_capacity
 
@@ -278,8 +289,7 @@ class Noise(StepEvent):
     """Exploration noise on the means, after every iteration (`perturb`)."""
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
-        num_live = model.gaussians.num if model.num_live is None else model.num_live
-        gaussians = perturb(now.keys[0], model.gaussians, num_live, now.rate_of_means)
+        gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means)
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
@@ -291,10 +301,8 @@ class Mcmc(StepEvent):
     """Largest number of Gaussians."""
 
     num_keys: ClassVar[int] = 2
-    impossible: ClassVar[str] = (
-        "no Gaussian above the death opacity is left: check the cameras and points of the scene, or lower "
-        "rates.logit_opacities"
-    )
+    impossible: ClassVar[str] = "no Gaussian above the death opacity is left"
+    refused: ClassVar[str] = "raise {cap}"
 
     def times(self, num_iterations: int) -> Times:
         return densify_times(num_iterations)
@@ -318,7 +326,7 @@ class Mcmc(StepEvent):
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
-        least, cap = self.least(now, num_rows_live(model)), min(self.cap, model.gaussians.num)
+        least, cap = self.least(now, model.live_count), min(self.cap, model.gaussians.num)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
@@ -330,7 +338,7 @@ class Mcmc(StepEvent):
     @staticmethod
     def _move(model: Model, moments: AdamState, plan) -> tuple[Model, AdamState, MoveInfo]:
         appearance, layout = model.appearance, model.layout
-        num_live = num_rows_live(model)
+        num_live = model.live_count
         moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)
         gaussians, params = appearance.share(model.gaussians, model.params, layout, moves.num_shares)
         num_live = num_live + moves.info.num_added
@@ -344,17 +352,13 @@ class FillingMcmc(Mcmc):
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations).num_times:
-            raise ValueError(
-                f"in {num_iterations} iterations there is no growth from {num:,} Gaussians to the {self.cap:,} that "
-                "there shall be: raise stage1_iterations or initial_gaussians"
+            raise FieldError(
+                self,
+                f"{{cap}} has room for {self.cap:,} Gaussians, but in {num_iterations} iterations there is no growth "
+                f"from {num:,}",
             )
         return max(num, self.cap)
 
     def least(self, now: Now, num_live: Array) -> Array | int:
         assert now.times is not None
         return number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
-
-
-def num_rows_live(model: Model) -> Array:
-    """How many rows exist, int32."""
-    return jnp.asarray(model.gaussians.num if model.num_live is None else model.num_live, jnp.int32)

@@ -59,6 +59,11 @@ class Model:
         return self.gaussians.num if self.num_live is None else int(self.num_live)
 
     @property
+    def live_count(self) -> Array:
+        """Number of Gaussians that exist, [] int32; may be traced."""
+        return jnp.asarray(self.gaussians.num if self.num_live is None else self.num_live, jnp.int32)
+
+    @property
     def num_bytes(self) -> int:
         """Bytes of the trained floats of the Gaussians that exist, padding left out (host)."""
         return self.bytes_of(self.num)

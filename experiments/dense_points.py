@@ -23,6 +23,7 @@ from lab import tables
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import SYSTEMS, find_system
 
@@ -54,7 +55,7 @@ def measured(scene: a2tg.Scene, name: str, ratio: float) -> dict[str, float | st
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            model = a2tg.fit(scene, system, progress=False).model
+            model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     except ValueError as error:
         return {"refused": str(error)}
     return {

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import a2tg_jax as a2tg
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.core.similarity import camera_centers
+from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training.corrections import exposed
@@ -121,7 +122,7 @@ def viewmats_of(views: tuple[a2tg.View, ...]) -> np.ndarray:
 def measured(scene: Scene, disturbed: Scene, variant: str, iterations: int) -> dict[str, float]:
     """One training: PSNR of test views as they are, up to exposure, up to pose; how far training cameras are off."""
     system = dataclasses.replace(SYSTEM, stage1_iterations=iterations, **VARIANTS[variant])
-    model = a2tg.fit(disturbed, system, progress=False).model
+    model = a2tg.fit(disturbed, system, progress=False, session=a2tg.Session(tidy_memory)).model
     refined, test = refined_views(disturbed.train, model), disturbed.test
     before, after = (pose_error(viewmats_of(views), viewmats_of(scene.train)) for views in (disturbed.train, refined))
     return {

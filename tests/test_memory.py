@@ -4,7 +4,18 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from a2tg_jax.host.memory import keep_room_for_programs, memory_limit, memory_peak, return_free_memory
+from a2tg_jax import fit, synthetic_scene
+from a2tg_jax.host import memory
+from a2tg_jax.host.memory import (
+    keep_room_for_programs,
+    memory_limit,
+    memory_peak,
+    return_free_memory,
+    tidy_memory,
+)
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.training.session import Session
+from a2tg_jax.training.step import jitted_step
 
 
 def told(folder, count: int, limit: str):
@@ -28,6 +39,18 @@ def test_programs_are_dropped_before_there_is_no_room_for_more(tmp_path, count, 
 def test_without_such_a_system_nothing_happens(tmp_path):
     assert not keep_room_for_programs(tmp_path / "nowhere")
     return_free_memory()
+
+
+@pytest.mark.parametrize("session", [None, Session(tidy_memory)])
+def test_training_drops_programs_only_if_its_session_does(session, monkeypatch):
+    """With so small a share of memory's pieces that every compilation exceeds it."""
+    monkeypatch.setattr(memory, "LARGEST_SHARE", 0)
+    scene = synthetic_scene(num_views=3, width=24, height=16, num_points=40)
+    jitted_step().clear_cache()
+    double = jax.jit(lambda x: 2 * x)
+    double(jnp.ones(3))
+    fit(scene, Gaussians2dMcmc(stage1_iterations=2), progress=False, session=session)
+    assert double._cache_size() == (1 if session is None else 0)
 
 
 GROUPS = {

@@ -12,7 +12,6 @@ import pytest
 from toy_system import Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax import adapt
 from a2tg_jax.training import fit_stage, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
@@ -206,10 +205,9 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name, thresholds", [("gaussians-2d", "densify"), ("a2tg", "texture")])
 @pytest.mark.parametrize("sweep", [*SWEEPS, "thresholds"])
-def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds, monkeypatch):
+def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds):
     """In a process that has compiled nothing yet."""
-    monkeypatch.setattr(loop, "_compiled_capacities", {})
-    monkeypatch.setattr(adapt, "_compiled_shapes", set())
+    session = a2tg.Session()
     jitted_step().clear_cache()
     if sweep == "thresholds":
         numbers = (2e-4, 3e-4, 4e-4) if thresholds == "densify" else (1e-6, 2e-6, 4e-6)
@@ -219,14 +217,14 @@ def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds, monkeyp
         variants = SWEEPS[sweep]
     counts = []
     for changes in variants:
-        before, rooms = jitted_step().num_compiled(), copy.deepcopy(loop._compiled_capacities)
+        before, rooms = jitted_step().num_compiled(), copy.deepcopy(session.capacities)
         merged = dict(changes)
         if name == "a2tg":
             merged["texture"] = {"upscale_at": [0.5], **changes.get("texture", {})}
-        result = a2tg.fit(scene, tiny(name, **merged), progress=False)
+        result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
         # Lists that grow in the middle of a run are compiled anew; a run tells how often that was.
         count = max(0, jitted_step().num_compiled() - before - result.num_regrown)
-        counts.append((count, loop._compiled_capacities == rooms))
+        counts.append((count, session.capacities == rooms))
     # So are lists that must be longer from the start, as where a seed puts more splats on the screen.
     again = [count for count, had_room in counts[1:] if had_room]
     assert again and not any(again), f"traces per run, and whether it had room: {counts}"
@@ -263,6 +261,20 @@ def test_results_do_not_depend_on_where_photographs_are(scene, monkeypatch):
 def test_gaussians_that_find_no_room_are_counted_and_said(scene):
     system = tiny("gaussians-2d", densify={"cap": 61, "threshold": 1e-9})
     with pytest.warns(UserWarning, match=r"no room for a Gaussian .* raise densify.cap"):
+        a2tg.fit(scene, system, progress=False)
+
+
+@pytest.mark.parametrize(
+    "name, reason",
+    [
+        ("gaussians-2d-mcmc", "no Gaussian above the death opacity is left"),
+        ("gaussians-2d", "adaptive density control would prune every Gaussian: lower densify.least_opacity"),
+    ],
+)
+def test_a_training_without_gaussians_left_tells_what_to_change(scene, name, reason):
+    system = tiny(name, initial_opacity=0.001, rates={"logit_opacities": 0.0})
+    advice = "check the cameras and points of the scene, or lower rates.logit_opacities"
+    with pytest.raises(ValueError, match=rf"^training cannot go on at iteration \d+ .*: {reason}; {advice}$"):
         a2tg.fit(scene, system, progress=False)
 
 

@@ -14,7 +14,6 @@ from a2tg_jax import (
     Change,
     Checkpoint,
     StepEvent,
-    adapt,
     event,
     fit,
     load_checkpoint,
@@ -30,6 +29,7 @@ from a2tg_jax.texture import Shape
 from a2tg_jax.training import LearningRates, LossConfig, Stage, fit_stage, like, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 
@@ -91,11 +91,12 @@ def test_resumed_run_is_the_same(scene, trained, tmp_path, which):
     assert_same(resumed, result)
 
 
-def test_shapes_of_earlier_runs_change_nothing(scene, trained, tmp_path, monkeypatch):
+def test_shapes_of_earlier_runs_change_nothing(scene, trained, tmp_path):
     """Buckets with the room of another run's textures, one of them for a size that nobody has here."""
     model = trained[0].model
     capacities = (*(len(bucket) + 2 for bucket in model.params.buckets), 1)
-    monkeypatch.setattr(adapt, "_compiled_shapes", {Shape((*model.layout.resolutions, (5, 5)), capacities)})
+    session = Session()
+    session.shapes.add(Shape((*model.layout.resolutions, (5, 5)), capacities))
     path, rooms = tmp_path / "checkpoint.npz", []
 
     def keep(checkpoint):
@@ -103,9 +104,10 @@ def test_shapes_of_earlier_runs_change_nothing(scene, trained, tmp_path, monkeyp
             save_checkpoint(path, checkpoint)
             rooms.append(tuple(map(len, checkpoint.state.model.params.buckets)))
 
-    assert_same(fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, progress=False), trained[0])
+    told = {"progress": False, "session": session}
+    assert_same(fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, **told), trained[0])
     assert rooms == [capacities]
-    assert_same(fit(scene, CONFIG, resume=load_checkpoint(path), progress=False), trained[0])
+    assert_same(fit(scene, CONFIG, resume=load_checkpoint(path), **told), trained[0])
 
 
 @event

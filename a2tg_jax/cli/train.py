@@ -10,6 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.data.mask_files import AlphaMeaning
+from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.lock import opened
@@ -30,7 +31,7 @@ from a2tg_jax.results.summary import RunResult, summary_text
 from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.training import System
+from a2tg_jax.training import Session, System
 
 BASELINE = "gaussians-2d-mcmc"
 DEMO_SYSTEM = A2tg(
@@ -56,7 +57,7 @@ class Demo:
 
     def run(self) -> None:
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
-        tell_result(begin_run(record, self.out, overwrite=self.overwrite), self.out)
+        tell_result(begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session()), self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,10 +113,16 @@ class Train:
 
     def run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
-        watched = in_browser if self.view else unseen
+        watched, session = in_browser if self.view else unseen, tidy_session()
         if not self.resume:
             result = begin_run(
-                self.record, self.out, overwrite=self.overwrite, lpips_weights=weights, max_memory=most, watched=watched
+                self.record,
+                self.out,
+                overwrite=self.overwrite,
+                lpips_weights=weights,
+                max_memory=most,
+                watched=watched,
+                session=session,
             )
             tell_result(result, self.out)
             return
@@ -126,7 +133,7 @@ class Train:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
             tell_forecast(scene, record.plan, most)
-            tell_result(go_on(run, scene, lpips_weights=weights, watched=watched), self.out)
+            tell_result(go_on(run, scene, lpips_weights=weights, watched=watched, session=session), self.out)
 
     @property
     def record(self) -> RunRecord:
@@ -188,6 +195,11 @@ def _value_of(flag: str, arguments: list[str]) -> str:
         if word.startswith(flag + "="):
             return word.split("=", 1)[1]
     return ""
+
+
+def tidy_session() -> Session:
+    """Return a session that tidies this process's memory after each compilation."""
+    return Session(after_compiling=tidy_memory)
 
 
 def tell_result(result: RunResult, folder: Path) -> None:

@@ -19,6 +19,7 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.events import (
     Change,
     EventInfo,
+    FieldError,
     Now,
     Seen,
     Statistic,
@@ -66,10 +67,8 @@ class CloneSplitPrune(StepEvent):
     largest_share: float = 0.1
     """Larger ones, as a share of scene_scale, are pruned after the first reset of opacities."""
 
-    impossible: ClassVar[str] = (
-        "adaptive density control would prune every Gaussian: check the cameras and points of the scene, or lower "
-        "densify.least_opacity"
-    )
+    impossible: ClassVar[str] = "adaptive density control would prune every Gaussian: lower {least_opacity}"
+    refused: ClassVar[str] = "raise {cap}"
 
     @property
     def statistic(self) -> Statistic:
@@ -134,10 +133,10 @@ class FillingDensity(CloneSplitPrune):
     def num_rows(self, num: int, num_iterations: int) -> int:
         count = self.times(num_iterations).num_times
         if num * 2.0**count < self.cap:
-            raise ValueError(
-                f"{num:,} Gaussians that double at most in each of the {count} densifications of {num_iterations} "
-                f"iterations do not become the {self.cap:,} of memory_budget: raise stage1_iterations or "
-                "initial_gaussians, or lower memory_budget"
+            raise FieldError(
+                self,
+                f"{{cap}} has room for {self.cap:,} Gaussians, but {num:,} Gaussians at most double in each of the "
+                f"{count} densifications of {num_iterations} iterations",
             )
         return max(num, self.cap)
 
@@ -159,8 +158,7 @@ class FillingDensity(CloneSplitPrune):
 
 def is_live(model: Model) -> Array:
     """[N] which rows exist."""
-    num = model.gaussians.num
-    return jnp.arange(num, dtype=jnp.int32) < (num if model.num_live is None else model.num_live)
+    return jnp.arange(model.gaussians.num, dtype=jnp.int32) < model.live_count
 
 
 def _sizes(model: Model) -> Array:

@@ -20,7 +20,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import jit
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View, counted_pixels, views_by_size
-from a2tg_jax.events import Change, Due, HostEvent, event, gather_moments, gather_rows, static
+from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, plan_render, render_traced
@@ -42,7 +42,7 @@ class Prune(HostEvent):
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         if any(not 0 < fraction <= 1 for fraction in self.at) or list(self.at) != sorted(set(self.at)):
-            raise ValueError(f"at must be ascending fractions above 0, up to 1; got {shortened(self.at)}")
+            raise FieldError(self, f"{{at}} must be ascending fractions above 0, up to 1; got {shortened(self.at)}")
         return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in self.at))
 
     def num_after(self, num: int, num_iterations: int) -> int:
@@ -65,10 +65,10 @@ class Prune(HostEvent):
     def _num_left(self, num: int) -> int:
         if self.keep is not None:
             if self.keep < 1:
-                raise ValueError(f"keep must be at least 1 Gaussian; got {self.keep}")
+                raise FieldError(self, f"{{keep}} must be at least 1 Gaussian; got {self.keep}")
             return min(num, self.keep)
         if not 0 <= self.share < 1:
-            raise ValueError(f"share must lie in [0, 1); got {self.share}")
+            raise FieldError(self, f"{{share}} must lie in [0, 1); got {self.share}")
         return num - round(num * float(self.share))
 
 

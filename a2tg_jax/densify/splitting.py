@@ -21,7 +21,7 @@ from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.densify.clone_split import halved
 from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, event, gather_rows
-from a2tg_jax.mcmc import FillingMcmc, Moves, num_rows_live, plan_growth, plan_relocation
+from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
 
 LEAST_WEIGHT = 1e-12
@@ -44,7 +44,7 @@ class SplitByGradient(FillingMcmc):
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         to_move, to_add, to_split = jax.random.split(now.keys[0], 3)
-        num_live = num_rows_live(model)
+        num_live = model.live_count
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_relocation(to_move, self._opacities(model), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
@@ -93,6 +93,6 @@ def split_rows(
     total = state.total / moves.num_shares.astype(state.total.dtype)
     state = GradientStatistics(total[moves.rows], state.views[moves.rows])
     moments = clear_moments(model, moments, is_split)
-    num_live = num_rows_live(model) + moves.info.num_added
+    num_live = model.live_count + moves.info.num_added
     model = dataclasses.replace(gather_rows(model, moves.rows), num_live=num_live)
     return dataclasses.replace(model, gaussians=halved(key, model.gaussians, is_split)), moments, state

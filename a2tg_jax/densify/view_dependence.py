@@ -79,7 +79,7 @@ class AdaptDegrees(HostEvent):
     observes = True
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations, "view_dependence.at")
+        return iterations_at(self.at, num_iterations, of=self)
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         return max(num_bytes, bytes_of(self.budget_mb))

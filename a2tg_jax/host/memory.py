@@ -58,6 +58,12 @@ def _left_in(folder: Path) -> int | None:
     return None
 
 
+def tidy_memory() -> None:
+    """Return free memory and keep room for programs, after one was compiled."""
+    return_free_memory()
+    keep_room_for_programs()
+
+
 def return_free_memory() -> None:
     """Has the C library give back what it keeps for itself: 100 to 200 MB after a training step was compiled.
 

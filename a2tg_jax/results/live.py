@@ -20,7 +20,7 @@ from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.viewing import ServedPhotographs
-from a2tg_jax.training.fit import BACKGROUNDS
+from a2tg_jax.training.fitting import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, viewer_html
 from a2tg_jax.web.server import Route, served

@@ -17,6 +17,7 @@ from a2tg_jax.results.replacement import set_aside
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,
+    Session,
     StageResult,
     System,
     fit_stage,
@@ -40,6 +41,7 @@ def train_run(
     progress: bool = True,
     is_stopped: IsStopped = never,
     watch: Watch = unwatched,
+    session: Session | None = None,
 ) -> None:
     """Train every stage of the run's record that is not finished yet.
 
@@ -53,14 +55,16 @@ def train_run(
       progress: show a progress bar.
       is_stopped: asked between steps. Once it says True, there is a checkpoint and a KeyboardInterrupt.
       watch: called between steps with the stage under way (`training.loop.Watch`).
+      session: shapes that trainings of this process share; None: a new one.
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other numbers
         than the record's.
     """
     record = replaced_by or read_record(run)
+    session = Session() if session is None else session
     for planned in record.plan.stages:
-        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch)
+        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch, session)
         if replaced_by is not None:
             result = training.train(replaced_by)
         elif run.model(planned.name).is_file():
@@ -86,6 +90,7 @@ class _Training:
     progress: bool
     is_stopped: IsStopped
     watch: Watch
+    session: Session
 
     def train(self, replaced_by: RunRecord | None = None) -> StageResult:
         """Train the stage from its newest checkpoint or from its beginning; after a divergence, restore if that is
@@ -115,6 +120,7 @@ class _Training:
             is_stopped=self.is_stopped,
             num_restored=num_restored,
             watch=self.watch,
+            session=self.session,
         )
 
     def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:

@@ -16,6 +16,7 @@ from a2tg_jax.results.replacement import drop_old
 from a2tg_jax.results.run_evaluation import evaluate_run
 from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import RunResult
+from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
@@ -35,6 +36,7 @@ def begin_run(
     lpips_weights: Path | None = None,
     max_memory: int | None = None,
     watched: Watched = unseen,
+    session: Session | None = None,
 ) -> RunResult:
     """Train and measure a new run, after checking everything about it.
 
@@ -46,6 +48,7 @@ def begin_run(
       lpips_weights: a weights file for LPIPS; None leaves it out.
       max_memory: bytes that the process may take (`forecast.allowed_memory`).
       watched: who looks at the training of a scene meanwhile.
+      session: shapes that trainings of this process share; None: a new one.
 
     Raises:
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
@@ -56,9 +59,9 @@ def begin_run(
     with claimed(run):
         check_free(out, overwrite=overwrite)  # Another process may have been here meanwhile.
         if overwrite and run.is_begun:
-            return go_on(run, scene, lpips_weights=lpips_weights, replaced_by=record, watched=watched)
+            return go_on(run, scene, lpips_weights=lpips_weights, replaced_by=record, watched=watched, session=session)
         write_record(create_run(out), record)
-        return go_on(run, scene, lpips_weights=lpips_weights, watched=watched)
+        return go_on(run, scene, lpips_weights=lpips_weights, watched=watched, session=session)
 
 
 def go_on(
@@ -68,12 +71,13 @@ def go_on(
     lpips_weights: Path | None = None,
     replaced_by: RunRecord | None = None,
     watched: Watched = unseen,
+    session: Session | None = None,
 ) -> RunResult:
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
     with _advised(run, is_replacing=replaced_by is not None):
         with signals.noted() as is_stopped, watched(scene) as watch:
-            train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped, watch=watch)
+            train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped, watch=watch, session=session)
         return measure(run, scene, lpips_weights=lpips_weights)
 
 

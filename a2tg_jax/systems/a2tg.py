@@ -2,17 +2,19 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.adapt import Upscale
+from a2tg_jax.adapt import Upscale, UpscaleChoices
 from a2tg_jax.appearance import Plain, TexelRates, Textured, TextureOptions
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
-from a2tg_jax.events import Statistic
+from a2tg_jax.events import Statistic, from_options
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.systems.stage1 import (
     ANY_RATE,
     FLOATS_PER_TEXEL,
     LOOKUP_RANGES,
+    MCMC_OPTIONS,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -37,35 +39,21 @@ PAPER_THRESHOLD = 2e-5
 
 
 @dataclasses.dataclass(frozen=True)
-class TextureConfig:
+class TextureConfig(UpscaleChoices):
     """Adaptive anisotropic textures."""
 
-    select: Literal["fraction", "threshold", "budget"] = "fraction"
-    """How the Gaussians to upscale are chosen; with a memory_budget, always as by "budget"."""
-    fraction: float = 0.25
-    """Share of the Gaussians upscaled at each event."""
-    threshold: float | None = None
-    """Smallest average gradient that is upscaled (k_G); needed by select="threshold"."""
-    budget_mb: float | None = None
-    """Reported memory never exceeds this many MB (10^6 bytes); needed by select="budget". It bounds the textures alone,
-    beside the Gaussians of densify.cap: memory_budget chooses both."""
-    anisotropic: bool = True
-    """Double one axis only on thin Gaussians; off: always both."""
-    axes: Literal["paper", "authors"] = "paper"
-    """Thin Gaussians double along their long axis, or along the short one as in the authors' program."""
-    gradient: Statistic = "position"
-    """The gradient that chooses: by position in the world, or "screen" as in the authors' program."""
-    moments: Literal["zero", "copied"] = "zero"
+    select: Literal["fraction", "threshold", "budget"] = Upscale.select
+    """Rule that chooses the Gaussians to upscale; a memory_budget sets "budget"."""
+    budget_mb: float | None = Upscale.budget_mb
+    """Largest reported memory in MB (10^6 bytes); needed by select="budget". It bounds the textures alone, beside the
+    Gaussians of densify.cap; memory_budget chooses both."""
+    gradient: Statistic = Upscale.gradient
+    """Gradient that chooses: by position in the world, or "screen" as in the authors' program."""
+    moments: Literal["zero", "copied"] = Upscale.moments
     """Adam's moments of a texture that has grown: zero, or copied from its old texels as in the authors' program."""
-    k_a: float = 4.0
-    """Aspect ratio above which a Gaussian counts as elongated."""
-    k_s: float = 0.01
-    """Shorter scale, in units of the normalised world, below which an elongated Gaussian counts as thin."""
-    cap: int = 4
-    """Largest texture side in texels (at most 16)."""
-    upscale_at: tuple[float, ...] | None = None
-    """Fractions of stage 2 at which textures grow; None: so often that the cap can be reached, every 1/60 of the stage
-    as in the paper, under 30,000 iterations every 0.15."""
+    upscale_at: tuple[float, ...] | None = Upscale.at
+    """Fractions of stage 2 at which textures grow; None: as often as it takes to reach the cap, every 1/60 of the
+    stage as in the paper, every 0.15 in stages under 30,000 iterations."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     single_rate: float | None = None
@@ -75,19 +63,16 @@ class TextureConfig:
     """How textures are read."""
 
     def event(self) -> Upscale:
-        """The upscaling that these numbers ask for.
+        """Return the upscaling of these options.
 
         Raises:
-          ValueError: if the number is missing by which Gaussians are selected.
+          ValueError: if the option that `select` needs is missing.
         """
         if self.select == "budget" and self.budget_mb is None:
             raise ValueError("texture.select is 'budget', so texture.budget_mb must say how many MB (10^6 bytes)")
         if self.select == "threshold" and self.threshold is None:
             raise ValueError("texture.select is 'threshold', so texture.threshold must say which average gradient")
-        return Upscale(
-            self.select, self.fraction, self.threshold, self.budget_mb, self.anisotropic, self.axes, self.k_a, self.k_s,
-            self.cap, self.upscale_at, self.gradient, self.moments,
-        )  # fmt: skip
+        return from_options(Upscale, self, at=self.upscale_at)
 
     @staticmethod
     def official() -> "TextureConfig":
@@ -126,6 +111,11 @@ class A2tg(System):
         "texture.single_rate": ANY_RATE,
         **LOOKUP_RANGES,
     }
+    event_options: ClassVar[Mapping[str, str]] = {
+        **MCMC_OPTIONS,
+        **{f"Upscale.{field.name}": f"texture.{field.name}" for field in dataclasses.fields(Upscale)},
+        "Upscale.at": "texture.upscale_at",
+    }
 
     def stages(self) -> tuple[Stage, ...]:
         lookup, upscale = self.texture.lookup, self._texture().event()
@@ -147,7 +137,8 @@ class A2tg(System):
 
     def _budget_texels(self, upscale: Upscale) -> float:
         """Texels a Gaussian that the number of Gaussians leaves room for: at most half of what there can be."""
-        can_grow = bool(upscale.iterations(self.stage2_iterations))
+        with self.naming_options():
+            can_grow = bool(upscale.iterations(self.stage2_iterations))
         return min(BUDGET_TEXELS, (1 + upscale.cap**2) / 2) if can_grow else 1
 
     @classmethod

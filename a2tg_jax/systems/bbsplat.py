@@ -1,11 +1,12 @@
 """BBSplat: RGBA billboards from the first iteration, densified by MCMC on the mean alpha of their pictures."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.mcmc import FillingMcmc, Mcmc
-from a2tg_jax.systems.stage1 import ANY_RATE, FLOATS_PER_TEXEL, QUICK, SMOKE, continued, growing_stage
+from a2tg_jax.systems.stage1 import ANY_RATE, FLOATS_PER_TEXEL, MCMC_OPTIONS, QUICK, SMOKE, continued, growing_stage
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
@@ -47,6 +48,7 @@ class BBSplat(System):
         "billboard.rgb": ANY_RATE,
         "billboard.alpha": ANY_RATE,
     }
+    event_options: ClassVar[Mapping[str, str]] = MCMC_OPTIONS
 
     def stages(self) -> tuple[Stage, ...]:
         if self.densify.cap < 2:

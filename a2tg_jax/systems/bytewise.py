@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
@@ -10,10 +11,10 @@ from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
-from a2tg_jax.events import Event, iterations_at
+from a2tg_jax.events import Event, from_options, iterations_at
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
-from a2tg_jax.systems.stage1 import LOOKUP_RANGES, QUICK, SMOKE, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import LOOKUP_RANGES, MCMC_OPTIONS, QUICK, SMOKE, growing_stage, later_stage
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
@@ -35,7 +36,7 @@ class CapConfig:
 class PruneConfig:
     """Gaussians that show least, which go while others grow in their place."""
 
-    share: float = 0.1
+    share: float = Prune.share
     """Of the Gaussians, each time; 0: none before the end of the stage."""
     at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
     """Fractions of the first stage, up to 0.8. In short stages, those after the last growth are left out."""
@@ -49,9 +50,9 @@ class ViewDependenceConfig:
     """Of the bytes; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
-    idle: float = 0.0
+    idle: float = AdaptDegrees.idle
     """Bands that change a colour by less than this are given up for others."""
-    at: tuple[float, ...] = (0.05, 0.1)
+    at: tuple[float, ...] = AdaptDegrees.at
     """Fractions of the second stage at which degrees change."""
 
 
@@ -63,7 +64,7 @@ class DetailTextureConfig:
     """Of the bytes; 0: none."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
-    cap: int = 4
+    cap: int = Upscale.cap
     """Largest texture side in texels (at most 16)."""
     at: tuple[float, ...] = (0.1, 0.2, 0.3)
     """Fractions of the second stage at which textures grow."""
@@ -86,6 +87,16 @@ class Bytewise(System):
 
     name: ClassVar[str] = "bytewise"
     ranges: ClassVar[Ranges] = LOOKUP_RANGES
+    event_options: ClassVar[Mapping[str, str]] = {
+        **MCMC_OPTIONS,
+        "Prune.share": "prune.share",
+        "Prune.at": "prune.at",
+        "AdaptDegrees.at": "view_dependence.at",
+        "AdaptDegrees.idle": "view_dependence.idle",
+        "AdaptDegrees.highest": "sh_degree",
+        "Upscale.at": "texture.at",
+        "Upscale.cap": "texture.cap",
+    }
 
     @property
     def initial_sh_degree(self) -> int:
@@ -109,7 +120,7 @@ class Bytewise(System):
             return ()
         num, last_growth = self.stage1_iterations, densify_times(self.stage1_iterations).last_time
         at = tuple(fraction for fraction in self.prune.at if round(fraction * num) < last_growth)
-        return (Prune(self.prune.share, at=at),) if at else ()
+        return (from_options(Prune, self.prune, at=at),) if at else ()
 
     @property
     def _share(self) -> float:
@@ -144,9 +155,9 @@ class Bytewise(System):
         events: list[Event] = []
         if view.share:
             most = megabytes * (1 - texture.share)
-            events.append(AdaptDegrees(most, at=view.at, highest=self.sh_degree, idle=view.idle))
+            events.append(from_options(AdaptDegrees, view, budget_mb=most, highest=self.sh_degree))
         if texture.share:
-            events.append(Upscale("budget", budget_mb=megabytes, cap=texture.cap, at=texture.at))
+            events.append(from_options(Upscale, texture, select="budget", budget_mb=megabytes))
         return tuple(events)
 
     @classmethod

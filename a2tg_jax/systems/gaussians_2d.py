@@ -1,9 +1,11 @@
 """2DGS*: plain 2D Gaussians under adaptive density control, with the gradient statistic of 2DGS."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import ClassVar, Self
 
 from a2tg_jax.systems.stage1 import (
+    DENSITY_OPTIONS,
     DENSITY_RANGES,
     QUICK,
     QUICK_CAP,
@@ -28,6 +30,7 @@ class Gaussians2d(System):
 
     name: ClassVar[str] = "gaussians-2d"
     ranges: ClassVar[Ranges] = DENSITY_RANGES
+    event_options: ClassVar[Mapping[str, str]] = DENSITY_OPTIONS
 
     def stages(self) -> tuple[Stage, ...]:
         first = growing_stage(self, self.stage1_iterations, self.densify.events(self.budget_cap()))

@@ -1,9 +1,19 @@
 """2DGS*-MCMC: plain 2D Gaussians under MCMC densification; also continued, so that equal iterations can be compared."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import ClassVar, Self
 
-from a2tg_jax.systems.stage1 import QUICK, QUICK_CAP, SMOKE, SMOKE_CAP, McmcConfig, continued, growing_stage
+from a2tg_jax.systems.stage1 import (
+    MCMC_OPTIONS,
+    QUICK,
+    QUICK_CAP,
+    SMOKE,
+    SMOKE_CAP,
+    McmcConfig,
+    continued,
+    growing_stage,
+)
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -18,6 +28,7 @@ class Gaussians2dMcmc(System):
     densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
 
     name: ClassVar[str] = "gaussians-2d-mcmc"
+    event_options: ClassVar[Mapping[str, str]] = MCMC_OPTIONS
 
     def stages(self) -> tuple[Stage, ...]:
         first = growing_stage(self, self.stage1_iterations, self.densify.events(self.budget_cap()))

@@ -6,7 +6,7 @@ from typing import Any
 
 from a2tg_jax.appearance import Appearance, Plain
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity, OpacityReset
-from a2tg_jax.events import Event
+from a2tg_jax.events import Event, from_options
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import LearningRates, Stage
@@ -26,6 +26,14 @@ SMOKE_CAP = 1_000
 FLOATS_PER_TEXEL = 4
 ANY_RATE = (0, math.inf)
 LOOKUP_RANGES: Ranges = {"texture.lookup.max_alpha": (1e-3, 0.9999), "texture.lookup.initial_rgb": (-1.0, 1.0)}
+MCMC_OPTIONS = {"Mcmc.cap": "densify.cap"}
+DENSITY_OPTIONS = {
+    "CloneSplitPrune.cap": "densify.cap",
+    "CloneSplitPrune.threshold": "densify.threshold",
+    "CloneSplitPrune.least_opacity": "densify.least_opacity",
+    "OpacityReset.most": "densify.reset_opacity",
+}
+"""Options by the field of an event that they set (`System.event_options`)."""
 DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0, 0.99)}
 
 
@@ -33,7 +41,7 @@ DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity"
 class McmcConfig:
     """MCMC densification (3DGS-MCMC)."""
 
-    cap: int = 500_000
+    cap: int = Mcmc.cap
     """Largest number of Gaussians; a memory_budget takes its place."""
     is_enabled: bool = True
     """Relocate and grow."""
@@ -50,21 +58,21 @@ class McmcConfig:
             return (Noise(), FillingMcmc(budget_cap))
         if self.cap < 2:
             raise ValueError(f"densify.cap must be at least 2 Gaussians; got {self.cap}")
-        return (Noise(), Mcmc(self.cap)) if self.is_enabled else (Noise(),)
+        return (Noise(), from_options(Mcmc, self)) if self.is_enabled else (Noise(),)
 
 
 @dataclasses.dataclass(frozen=True)
 class DensityConfig:
     """Adaptive density control (3DGS, 2DGS)."""
 
-    cap: int = 500_000
+    cap: int = CloneSplitPrune.cap
     """Largest number of Gaussians; so many rows are allocated. A memory_budget takes its place."""
-    threshold: float = 2e-4
+    threshold: float = CloneSplitPrune.threshold
     """Smallest average gradient, by the position on the screen in units of half an image, that is densified. With a
     memory_budget the largest gradients are, however small."""
-    least_opacity: float = 0.05
+    least_opacity: float = CloneSplitPrune.least_opacity
     """Fainter Gaussians are pruned."""
-    reset_opacity: float = 0.01
+    reset_opacity: float = OpacityReset.most
     """No Gaussian stays more opaque, every max(500, n/10) of n iterations until n/2."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
@@ -78,8 +86,7 @@ class DensityConfig:
         if not 0 < self.reset_opacity < 1:
             raise ValueError(f"densify.reset_opacity must lie between 0 and 1; got {self.reset_opacity}")
         kind, cap = (CloneSplitPrune, self.cap) if budget_cap is None else (FillingDensity, budget_cap)
-        density = kind(cap, threshold=self.threshold, least_opacity=self.least_opacity)
-        return (density, OpacityReset(self.reset_opacity))
+        return from_options(kind, self, cap=cap), OpacityReset(self.reset_opacity)
 
 
 def growing_stage(
@@ -92,9 +99,16 @@ def growing_stage(
 ) -> Stage:
     """A first stage, in which the degree of spherical harmonics rises."""
     return Stage(
-        name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate, system.corrections_of(0),
+        name=name,
+        appearance=appearance,
+        events=events,
+        losses=system.loss.terms(),
+        rates=system.rates,
+        iterations=iterations,
+        params_rate=params_rate,
+        corrections=system.corrections_of(0),
         raises_sh_degree=True,
-    )  # fmt: skip
+    )
 
 
 def later_stage(
@@ -106,8 +120,16 @@ def later_stage(
     params_rate: Any = 0.0,
 ) -> Stage:
     """A second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
-    corrections = system.corrections_of(1)
-    return Stage(name, appearance, events, system.loss.terms(), system.rates, iterations, params_rate, corrections)
+    return Stage(
+        name=name,
+        appearance=appearance,
+        events=events,
+        losses=system.loss.terms(),
+        rates=system.rates,
+        iterations=iterations,
+        params_rate=params_rate,
+        corrections=system.corrections_of(1),
+    )
 
 
 def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:

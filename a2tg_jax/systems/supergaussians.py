@@ -1,12 +1,14 @@
 """SuperGaussians: colour and opacity vary over each splat by four movable kernels; adaptive density control."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 from a2tg_jax.appearance import MovableKernels
 from a2tg_jax.appearance.movable_kernels import MovableKernelParams
 from a2tg_jax.systems.stage1 import (
     ANY_RATE,
+    DENSITY_OPTIONS,
     DENSITY_RANGES,
     QUICK,
     QUICK_CAP,
@@ -33,9 +35,9 @@ class KernelConfig:
     sharpness: float = 1.25e-3
 
     def rates(self) -> MovableKernelParams:
-        """One for each field of the kernels."""
-        fields: Any = (self.centers, self.sharpness, self.logit_opacities, self.colors)
-        return MovableKernelParams(*fields)
+        """Return one rate for each field of the kernels."""
+        rates: dict[str, Any] = dataclasses.asdict(self)
+        return MovableKernelParams(**rates)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,6 +58,7 @@ class SuperGaussians(System):
             ("kernels.colors", "kernels.logit_opacities", "kernels.centers", "kernels.sharpness"), ANY_RATE
         ),
     }
+    event_options: ClassVar[Mapping[str, str]] = DENSITY_OPTIONS
 
     def stages(self) -> tuple[Stage, ...]:
         kernels, rates = MovableKernels(), self.kernels.rates()

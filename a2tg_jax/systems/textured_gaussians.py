@@ -1,6 +1,7 @@
 """Textured Gaussians*: every texture k×k from the start of the second stage, no events."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Textured, TextureOptions
@@ -8,6 +9,7 @@ from a2tg_jax.systems.stage1 import (
     ANY_RATE,
     FLOATS_PER_TEXEL,
     LOOKUP_RANGES,
+    MCMC_OPTIONS,
     QUICK_CAP,
     QUICK_OPACITY,
     QUICK_RATES,
@@ -49,6 +51,7 @@ class TexturedGaussians(System):
         "texture.rate": ANY_RATE,
         **LOOKUP_RANGES,
     }
+    event_options: ClassVar[Mapping[str, str]] = MCMC_OPTIONS
 
     def stages(self) -> tuple[Stage, ...]:
         side = self.texture.side

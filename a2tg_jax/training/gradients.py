@@ -15,6 +15,7 @@ from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.render import RenderOutput, RenderSettings, check_background, render_traced, with_capacity
+from a2tg_jax.training.corrections import Correction, corrected_camera
 
 
 class ViewGradients(NamedTuple):
@@ -74,16 +75,91 @@ def view_gradients(
     dtype = model.gaussians.means.dtype
     settings = with_capacity(settings, model.gaussians, camera, model.rule, model.num_live)
 
-    def of_parameters(gaussians, params, probe):
+    def of_view(shown: Model, view: View, output: RenderOutput) -> tuple[Array, RenderOutput]:
+        return loss(shown, output), output
+
+    found = differentiate(
+        of_view, model, View(camera, jnp.asarray(background, dtype)), settings,
+        has_geometry=has_geometry, sh_degree=sh_degree, statistic=statistic, has_probe=True,
+    )  # fmt: skip
+    statistics, is_visible = read_probe(found.probe, statistic, camera.width, camera.height)
+    return ViewGradients(
+        found.value, found.gaussians, found.params, safe_norm(statistics), is_visible, found.told, found.num_pairs
+    )
+
+
+class View(NamedTuple):
+    """A view that `differentiate` renders, with the corrections that it is differentiated in."""
+
+    camera: Camera
+    background: Array
+    """[3]."""
+    corrections: tuple[Correction, ...] = ()
+    rows: tuple[Array, ...] = ()
+    """The view's row of each correction."""
+
+    @property
+    def corrected(self) -> "View":
+        """The view from its corrected camera."""
+        return self._replace(camera=corrected_camera(self.corrections, self.rows, self.camera))
+
+
+class Differentiated(NamedTuple):
+    """What `differentiate` returns."""
+
+    value: Array
+    """The loss, a scalar."""
+    told: Any
+    """What the loss function returned beside it."""
+    num_pairs: Array
+    """What a capacity must hold."""
+    gaussians: Gaussians
+    """Gradient in the Gaussians."""
+    params: Any
+    """Gradient in what they show."""
+    rows: tuple[Array, ...]
+    """Gradient in the view's row of each correction."""
+    probe: Any
+    """[N, 4] gradient at the probe, from which `read_probe` reads the statistic; None without a probe."""
+
+
+def differentiate(
+    loss: Callable[[Model, View, RenderOutput], tuple[Array, Any]],
+    model: Model,
+    view: View,
+    settings: RenderSettings,
+    *,
+    has_geometry: bool,
+    sh_degree: Any,
+    statistic: Statistic | None,
+    has_probe: bool,
+) -> Differentiated:
+    """Render a view and differentiate its loss: the core of `view_gradients` and of the training step.
+
+    Args:
+      loss: of the model, the corrected view and its render; returns a scalar, and anything beside it.
+      model: differentiated in its Gaussians and parameters.
+      view: differentiated in its rows.
+      settings: with a capacity under jit.
+      has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
+      sh_degree: overrides the settings'; may be traced.
+      statistic: of which position the probe tells; None without a probe.
+      has_probe: gather the statistic.
+    """
+
+    def of_parameters(
+        gaussians: Gaussians, params: Any, rows: tuple[Array, ...], probe: Array | None
+    ) -> tuple[Array, tuple[Any, Array]]:
+        seen = view._replace(rows=rows).corrected
         shown = dataclasses.replace(model, gaussians=gaussians, params=params)
         output, num_pairs = render_traced(
-            gaussians, camera, shown.rule, jnp.asarray(background, dtype), settings,
+            gaussians, seen.camera, shown.rule, view.background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
-        return loss(shown, output), (output, num_pairs)
+        value, told = loss(shown, seen, output)
+        return value, (told, num_pairs)
 
-    probe = jnp.zeros((model.gaussians.num, 4), dtype)
-    differentiate = jax.value_and_grad(of_parameters, argnums=(0, 1, 2), has_aux=True)
-    (value, (output, num_pairs)), (gaussians, params, found) = differentiate(model.gaussians, model.params, probe)
-    statistics, is_visible = read_probe(found, statistic, camera.width, camera.height)
-    return ViewGradients(value, gaussians, params, safe_norm(statistics), is_visible, output, num_pairs)
+    probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
+    with_gradients = jax.value_and_grad(of_parameters, argnums=(0, 1, 2, 3), has_aux=True)
+    (value, (told, num_pairs)), gradients = with_gradients(model.gaussians, model.params, view.rows, probe)
+    return Differentiated(value, told, num_pairs, *gradients)

@@ -7,7 +7,7 @@ it idle (`step.TrainState.status`), so they are launched again once its cause is
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ import numpy as np
 
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, HostEvent, StepEvent
-from a2tg_jax.host.memory import keep_room_for_programs, return_free_memory
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -25,6 +24,7 @@ from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diver
 from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
+from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import padded
 from a2tg_jax.training.step import (
     EXPLODED,
@@ -81,6 +81,7 @@ class StageRun:
         start: Model | None,
         resume: Checkpoint | None = None,
         num_restored: int | None = None,
+        session: Session | None = None,
     ):
         """Args:
         scene: its training views are trained on.
@@ -89,7 +90,9 @@ class StageRun:
         start: the model to start from; None where `resume` is given.
         resume: a checkpoint of this stage.
         num_restored: which order of the views, from 0; None: that of the checkpoint, or the first.
+        session: what trainings of this process share; None: a new one.
         """
+        self.session = Session() if session is None else session
         self.views, self.system, self.index = scene.train, system, index
         self.stage = system.stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
@@ -185,11 +188,17 @@ class StageRun:
                 if is_stopped() and iteration < end:
                     raise KeyboardInterrupt
         if self.num_refused:
+            advice = "; or ".join(self._told_by_events("refused"))
             warnings.warn(
                 f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
-                f"have been added, all {self.state.model.gaussians.num:,} rows being taken: raise densify.cap",
+                f"have been added, all {self.state.model.gaussians.num:,} rows being taken{advice and f': {advice}'}",
                 stacklevel=2,
             )
+
+    def _told_by_events(self, name: str) -> list[str]:
+        """Return the messages of step events in an attribute, with the options' names for the events' fields."""
+        events = [event for event in self.stage.events if isinstance(event, StepEvent)]
+        return [self.system.told(event, message) for event in events if (message := getattr(event, name))]
 
     def _next_stop(self, iteration: int, checkpoint_every: int | None) -> int:
         """The iteration after which the host has something to do."""
@@ -234,8 +243,7 @@ class StageRun:
         num_compiled = step.num_compiled()
         self.state, info = step(*arguments)
         if step.num_compiled() > num_compiled:
-            return_free_memory()
-            keep_room_for_programs()
+            self.session.after_compiling()
         return info
 
     def _size(self, iteration: int) -> tuple[int, int]:
@@ -247,14 +255,17 @@ class StageRun:
         if info.status == OVERFLOW:
             self.num_regrown += 1
             size = self._size(iteration)
-            self.capacities[size] = self._shared_capacity(size, capacity_for(int(float(info.num_pairs) * GROWTH_ROOM)))
+            self.capacities[size] = self._capacity(size, float(info.num_pairs) * GROWTH_ROOM)
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
             raise self._diverged(iteration, where, info)
         assert info.status == IMPOSSIBLE
-        reasons = [event.impossible for event in self.stage.events if isinstance(event, StepEvent) and event.impossible]
-        raise ValueError(f"training cannot go on {where}: {'; or '.join(reasons)}")
+        reasons = "; or ".join(self._told_by_events("impossible"))
+        raise ValueError(
+            f"training cannot go on {where}: {reasons}; check the cameras and points of the scene, or lower "
+            "rates.logit_opacities"
+        )
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
         """The error that tells what was not finite, or too large."""
@@ -284,7 +295,7 @@ class StageRun:
                 due = event.iterations(self.stage.iterations)
                 if iteration not in due:
                     continue
-                told = Due(due.index(iteration) + 1, len(due), self.views)
+                told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
                 change = event.apply(told, self.state.model, self.state.moments, state)
                 self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
                 if change.rows is not None:
@@ -314,23 +325,13 @@ class StageRun:
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
             pairs = max(pairs_of_view(live.gaussians, camera, live.rule, settings) for camera in cameras)
             growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
-            self.capacities[size] = self._shared_capacity(size, capacity_for(int(pairs * GROWTH_ROOM * growth)))
+            self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
-    def _shared_capacity(self, size: tuple[int, int], needed: int) -> int:
-        """The largest capacity that is compiled already and at most twice what is needed; else a new one."""
+    def _capacity(self, size: tuple[int, int], pairs: float) -> int:
+        """Return a capacity for so many pairs in views of a size, one that the session knows if possible."""
         stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
-        known = _compiled_capacities.setdefault((*stage, *size), set())
-        power = 2 ** (needed.bit_length() - 1)
-        rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
-        # The largest: lists that overflowed in an earlier run will do so again.
-        capacity = max((room for room in known if needed <= room <= 2 * needed), default=rounded)
-        known.add(capacity)
-        return capacity
-
-
-_compiled_capacities: dict[Hashable, set[int]] = {}
-"""Capacities that steps of this process have been compiled for, by stage and image size; no result depends on them."""
+        return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
 
 
 def check_resume(resume: Checkpoint, system: System, index: int) -> None:

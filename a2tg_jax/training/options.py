@@ -1,11 +1,14 @@
 """Options that every system has: views, initial Gaussians, loss, learning rates, the seed."""
 
+import contextlib
 import dataclasses
 import math
 import typing
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
+from a2tg_jax.events import Event, FieldError, with_names
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
@@ -21,7 +24,7 @@ Ranges = dict[str, tuple[float, float]]
 class LossConfig:
     """Weights of the photometric loss and of the optional terms (0 is off, the paper's setting)."""
 
-    ssim_weight: float = 0.2
+    ssim_weight: float = Photometric.ssim_weight
     """w in (1 - w)·L1 + w·(1 - SSIM)."""
     normal_weight: float = 0.0
     """Normal consistency of 2DGS: rendered normals against the normals of the rendered depth."""
@@ -48,11 +51,11 @@ class LossConfig:
 class CorrectionConfig:
     """How fast what `exposure` and `refine_poses` ask for is learned."""
 
-    exposure_rate: float = 1e-2
+    exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
-    pose_rate: float = 1e-3
+    pose_rate: float = PoseRefinement.rate
     """That of the motions, in radians and in units of the normalised world."""
-    final_factor: float = 0.1
+    final_factor: float = Exposure.final_factor
     """Both rates at the end of the first stage, and in later ones, over those at its start."""
 
 
@@ -92,7 +95,9 @@ class System:
     name: ClassVar[str] = ""
     """What the command line calls the system."""
     ranges: ClassVar[Ranges] = {}
-    """Of options of its own."""
+    """Ranges of the system's own options."""
+    event_options: ClassVar[Mapping[str, str]] = {}
+    """Options by the field of an event that they set, such as {"Mcmc.cap": "densify.cap"}: messages name them."""
 
     def __post_init__(self) -> None:
         """A budget is kept as a number of MB, however it was written."""
@@ -140,8 +145,8 @@ class System:
         """
         rates, last = self.corrections, self.corrections.final_factor
         start, end = (1.0, last) if stage == 0 else (last, 1.0)
-        poses = (PoseRefinement(rates.pose_rate * start, end),) if self.refine_poses else ()
-        exposures = (Exposure(rates.exposure_rate * start, end),) if self.exposure else ()
+        poses = (PoseRefinement(rate=rates.pose_rate * start, final_factor=end),) if self.refine_poses else ()
+        exposures = (Exposure(rate=rates.exposure_rate * start, final_factor=end),) if self.exposure else ()
         return (*poses, *exposures)
 
     def stages(self) -> tuple[Stage, ...]:
@@ -178,6 +183,10 @@ class System:
           ValueError: naming the option, what was wanted and what came.
         """
         self._check_numbers()
+        with self.naming_options():
+            self._check_stages()
+
+    def _check_stages(self) -> None:
         stages = self.stages()
         if not stages:
             raise ValueError(f"{type(self).__name__} has no stages")
@@ -192,6 +201,33 @@ class System:
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
+
+    def option_of(self, event: Event, field: str) -> str | None:
+        """Return the name of the option that sets a field of an event; None if the system does not tell."""
+        classes = (f"{kind.__name__}.{field}" for kind in type(event).__mro__)
+        name = next((self.event_options[known] for known in classes if known in self.event_options), None)
+        return "memory_budget" if self.memory_budget is not None and name in BUDGET_OPTIONS else name
+
+    def told(self, event: Event, message: str) -> str:
+        """Return an event's message with the options' names in place of its fields, which stand in braces."""
+        return with_names(message, lambda field: self.option_of(event, field) or f"{field} of {type(event).__name__}")
+
+    @contextlib.contextmanager
+    def naming_options(self) -> Iterator[None]:
+        """Name the option in place of the field in errors of events.
+
+        Raises:
+          ValueError: in place of a `FieldError`.
+        """
+        try:
+            yield
+        except FieldError as error:
+            raise ValueError(self.told(error.event, error.message)) from error
+
+    def more_growth(self) -> str:
+        """Return the names of the options that make more Gaussians, for advice."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
     def check_number(self, num: int) -> None:
         """Refuses what cannot be trained from so many Gaussians.
@@ -222,6 +258,8 @@ class System:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
 
+BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
+"""Options whose place a memory budget takes."""
 RANGES = {
     "batch_size": (1, math.inf),
     "initial_gaussians": (2, math.inf),

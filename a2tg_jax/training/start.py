@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from a2tg_jax.core.gaussians import Gaussians, init_from_points
 from a2tg_jax.data.scene import Scene
+from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
@@ -30,9 +31,21 @@ def check_start(scene: Scene, system: System) -> None:
       ValueError: naming the options to change.
     """
     first, num = system.stages()[0], min(initial_number(scene, system), len(scene.points))
-    for event in first.events:
-        event.num_rows(num, first.iterations)
+    with system.naming_options():
+        _rows_needed(first, num, system)
     system.check_number(num)
+
+
+def _rows_needed(stage: Stage, num: int, system: System) -> int:
+    """Return the rows that a stage allocates for `num` Gaussians.
+
+    Raises:
+      FieldError: naming the options to change, if an event cannot reach its number.
+    """
+    try:
+        return num_rows(stage, num)
+    except FieldError as error:
+        raise FieldError(error.event, f"{error.message}: raise {system.more_growth()}, or lower {{cap}}") from error
 
 
 def initial_number(scene: Scene, system: System) -> int:
@@ -56,7 +69,7 @@ def padded(model: Model, stage: Stage, system: System) -> Model:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
     """
     num = model.gaussians.num
-    room = num_rows(stage, num)
+    room = _rows_needed(stage, num, system)
     gaussians = _with_rows(model.gaussians, room)
     params, layout = model.params, model.layout
     if model.appearance != stage.appearance or room > num:

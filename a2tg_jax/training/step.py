@@ -21,7 +21,7 @@ from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (
     CorrectionState,
@@ -31,6 +31,7 @@ from a2tg_jax.training.corrections import (
     rows_of,
     updated,
 )
+from a2tg_jax.training.gradients import View, differentiate
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 
@@ -102,7 +103,7 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
 class Attempt(NamedTuple):
     """What a step makes of a state, whether it can be taken or not."""
 
-    views: "_ViewGradients"
+    views: "BatchGradients"
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
     """Means over the views; of the corrections, by the row of each view [V, ...]."""
     state: TrainState
@@ -175,8 +176,8 @@ def attempt(
     return Attempt(found, (*grads, found.grads[2]), after, info)
 
 
-class _ViewGradients(NamedTuple):
-    """Per view [V, ...]."""
+class BatchGradients(NamedTuple):
+    """Loss and gradients of the V views of a step, [V, ...]."""
 
     loss: Array
     psnr: Array
@@ -190,37 +191,33 @@ class _ViewGradients(NamedTuple):
 
 def _gradients(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration, own
-) -> _ViewGradients:
+) -> BatchGradients:
     """Loss and gradients of every view, one after the other."""
     height, width = batch.images.shape[1:3]
     model, highest = state.model, settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if is_gathering else None
     has_geometry = any(term.has_geometry for term in stage.losses)
 
     def one_view(view):
         viewmat, K, image, alpha, mask, background, rows = view
         photograph = _black_outside(mask, _over(image, alpha, background))
 
-        def loss(gaussians, params, rows, probe):
-            camera = corrected_camera(stage.corrections, rows, Camera(viewmat, K, width, height))
-            target = Target(camera, photograph, background, mask)
-            shown = dataclasses.replace(model, gaussians=gaussians, params=params)
-            output, num_pairs = render_traced(
-                gaussians, target.camera, shown.rule, background, settings.render,
-                has_geometry=has_geometry, sh_degree=degree, num_live=model.num_live, probe=probe,
-                statistic=stage.statistic,
-            )  # fmt: skip
-            color = corrected_color(stage.corrections, rows, output.color)
+        def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
+            target = Target(seen.camera, photograph, background, mask)
+            color = corrected_color(seen.corrections, seen.rows, output.color)
             output = output._replace(color=_black_outside(mask, color))
             value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
             error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
-            return value, (error, num_pairs, output.overflow)
+            return value, (error, output.overflow)
 
-        differentiate = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)
-        (value, (error, num_pairs, overflow)), grads = differentiate(model.gaussians, model.params, rows, probe)
-        return _ViewGradients(value, -10 * jnp.log10(error), num_pairs, overflow, grads[:3], grads[3])
+        found = differentiate(
+            loss, model, View(Camera(viewmat, K, width, height), background, stage.corrections, rows), settings.render,
+            has_geometry=has_geometry, sh_degree=degree, statistic=stage.statistic, has_probe=is_gathering,
+        )  # fmt: skip
+        error, overflow = found.told
+        grads = found.gaussians, found.params, found.rows
+        return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
 
     pictures = batch.images, batch.alphas, batch.masks
     return jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
@@ -252,7 +249,7 @@ def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
     return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
 
 
-def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: _ViewGradients) -> Seen:
+def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: BatchGradients) -> Seen:
     """What events observe."""
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)

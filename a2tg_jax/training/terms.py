@@ -73,13 +73,9 @@ def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
 
 def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
     """Mean opacity of the live Gaussians (3DGS-MCMC)."""
-    return mean_opacity(model.gaussians, _num_live(model))
+    return mean_opacity(model.gaussians, model.live_count)
 
 
 def scale(model: Model, target: Target, output: RenderOutput) -> Array:
     """Mean scale of the live Gaussians (3DGS-MCMC)."""
-    return mean_scale(model.gaussians, _num_live(model))
-
-
-def _num_live(model: Model) -> Array | int:
-    return model.gaussians.num if model.num_live is None else model.num_live
+    return mean_scale(model.gaussians, model.live_count)

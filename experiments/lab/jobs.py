@@ -15,6 +15,7 @@ import numpy as np
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.core.origin import WHITE
+from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.plan import fingerprint, is_same_so_far
 from a2tg_jax.results.record import SceneSource
@@ -121,7 +122,14 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene) -> a2tg.StageResult:
         on_checkpoint=lambda checkpoint: a2tg.save_checkpoint(path, checkpoint),
         checkpoint_every=max(500, job.iterations // 10),
         progress=False,
+        session=_session(),
     )
+
+
+@functools.cache
+def _session() -> a2tg.Session:
+    """Return the session that all jobs of this process share."""
+    return a2tg.Session(after_compiling=tidy_memory)
 
 
 def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:

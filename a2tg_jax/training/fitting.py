@@ -12,6 +12,7 @@ from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, Watch, check_resume, never, unwatched
 from a2tg_jax.training.options import System
+from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
 
@@ -74,6 +75,7 @@ def fit(
     checkpoint_every: int | None = None,
     progress: bool = True,
     is_stopped: IsStopped = never,
+    session: Session | None = None,
 ) -> FitResult:
     """Trains a scene: every stage of a system, each from the result of the one before.
 
@@ -87,6 +89,7 @@ def fit(
       progress: show a progress bar.
       is_stopped: asked between steps. Once it says True, `on_checkpoint` is called a last time, and then
         KeyboardInterrupt raised.
+      session: shapes that trainings of this process share; None: a new one.
 
     Raises:
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; it has the state before that.
@@ -95,6 +98,7 @@ def fit(
     system.check()
     if resume is not None:
         check_resume(resume, system, resume.stage)
+    session = Session() if session is None else session
     first = 0 if resume is None else resume.stage
     results: list[StageResult] = []
     for index in range(first, len(system.stages())):
@@ -108,6 +112,7 @@ def fit(
             checkpoint_every=checkpoint_every,
             progress=progress,
             is_stopped=is_stopped,
+            session=session,
         )
         results.append(result)
     return FitResult(system, tuple(results))
@@ -127,6 +132,7 @@ def fit_stage(
     is_stopped: IsStopped = never,
     num_restored: int | None = None,
     watch: Watch = unwatched,
+    session: Session | None = None,
 ) -> StageResult:
     """Trains one stage of a system. Arguments as in `fit`.
 
@@ -146,8 +152,9 @@ def fit_stage(
     check_views(scene.train)
     if start is None and resume is None:
         start = initial_model(scene, system)
-    run = StageRun(scene, system, index, start, resume, num_restored)
-    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
+    with system.naming_options():
+        run = StageRun(scene, system, index, start, resume, num_restored, session)
+        run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
     origin = origin_of_scene(scene, BACKGROUNDS[system.background])
     origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
     model = dataclasses.replace(run.model, origin=origin)
@@ -166,6 +173,6 @@ def warn_of_budget(system: System, model: Model) -> None:
     elif used + used / model.num > budget:
         advice = f"there is no room for another Gaussian of {used / model.num:,.0f} bytes: raise memory_budget"
     else:
-        advice = "raise stage1_iterations or initial_gaussians"
+        advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
     warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=3)
