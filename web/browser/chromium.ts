@@ -15,8 +15,14 @@ export function launch(): Promise<Browser> {
   return chromium.launch({
     executablePath: CHROMIUM,
     args: [
-      "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-      "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+      "--no-sandbox",
+      "--disable-quic",
+      "--no-first-run",
+      "--disable-background-networking",
+      "--disable-component-update",
+      "--disable-sync",
+      "--use-angle=swiftshader",
+      "--enable-unsafe-swiftshader",
     ],
   });
 }
@@ -32,13 +38,21 @@ export function serve(files: Readonly<Record<string, Uint8Array | string | (() =
     const found = Object.entries(files).find(([path]) => path === request.url)?.[1];
     const body = typeof found === "function" ? found() : found;
     const isPage = request.url === "/";
-    response.writeHead(body === undefined ? 404 : 200, { "Content-Type": isPage ? "text/html" : "application/octet-stream" });
+    response.writeHead(body === undefined ? 404 : 200, {
+      "Content-Type": isPage ? "text/html" : "application/octet-stream",
+    });
     response.end(body);
   });
   return new Promise((resolve) => {
     server.listen(0, "127.0.0.1", () => {
       const { port } = server.address() as AddressInfo;
-      resolve({ address: `http://127.0.0.1:${port}/`, close: () => { server.close(); server.closeAllConnections(); } });
+      resolve({
+        address: `http://127.0.0.1:${port}/`,
+        close: () => {
+          server.close();
+          server.closeAllConnections();
+        },
+      });
     });
   });
 }

@@ -50,8 +50,12 @@ const clipped = (x: number): number => Math.min(Math.max(x, 0), 1);
 
 describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows what the JAX renderer shows", () => {
   let browser: Browser;
-  beforeAll(async () => { browser = await launch(); });
-  afterAll(async () => { await browser.close(); });
+  beforeAll(async () => {
+    browser = await launch();
+  });
+  afterAll(async () => {
+    await browser.close();
+  });
 
   test.each(NAMES)("%s", async (name) => {
     const folder = join(FOLDER, name);
@@ -61,7 +65,9 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
     const page = await browser.newPage({ viewport: { width: 160, height: 120 } });
     const errors: string[] = [];
     page.on("pageerror", (error) => errors.push(error.message));
-    page.on("console", (message) => { if (message.type() === "error") errors.push(message.text()); });
+    page.on("console", (message) => {
+      if (message.type() === "error") errors.push(message.text());
+    });
     await page.goto(served.address);
     await page.evaluate(() => window.a2tg?.loaded);
     for (const [index, view] of views.entries()) {
@@ -86,8 +92,10 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
         if (difference > 8 / 255) far++;
       });
       const mean = (255 * sum) / found.length;
-      console.log(`${name}, ${view.of}, ${index} ${view.mode}: mean ${mean.toFixed(4)}/255, largest ${(255 * largest).toFixed(1)}/255, ` +
-        `${((100 * far) / found.length).toFixed(3)}% beyond 8/255`);
+      console.log(
+        `${name}, ${view.of}, ${index} ${view.mode}: mean ${mean.toFixed(4)}/255, largest ${(255 * largest).toFixed(1)}/255, ` +
+          `${((100 * far) / found.length).toFixed(3)}% beyond 8/255`,
+      );
       expect(mean).toBeLessThan(isColor ? LIMITS[view.of] : GEOMETRY_LIMIT);
     }
     expect(errors.filter((error) => !error.includes("404"))).toEqual([]);

@@ -31,7 +31,8 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     const page = await browser.newPage({ viewport: size });
     const elsewhere: string[] = [];
     page.on("request", (request) => {
-      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address)) elsewhere.push(request.url());
+      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address))
+        elsewhere.push(request.url());
     });
     await page.goto(served.address + hash);
     await page.evaluate(() => window.a2tg?.loaded);
@@ -73,7 +74,10 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     expect(await page.textContent("#legend")).toContain("near");
     const before = await position(page);
     await page.keyboard.down("w");
-    await page.waitForFunction((from) => Math.hypot(...(window.a2tg?.viewer.pose.position ?? []).map((x, i) => x - from[i])) > 0.01, before);
+    await page.waitForFunction(
+      (from) => Math.hypot(...(window.a2tg?.viewer.pose.position ?? []).map((x, i) => x - from[i])) > 0.01,
+      before,
+    );
     await page.keyboard.up("w");
     expect(await page.inputValue("#camera")).toBe("-1");
     await page.keyboard.press(".");
@@ -84,21 +88,33 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
 
   test("dragging turns around the target, the wheel comes nearer to it", async () => {
     const { page } = await opened();
-    const target = (): Promise<number[]> => page.evaluate(() => {
-      const { position: at, rotation, focus } = window.a2tg?.viewer.pose ?? { position: [], rotation: [[], [], []], focus: 0 };
-      return at.map((x, i) => x + focus * rotation[2][i]);
-    });
+    const target = (): Promise<number[]> =>
+      page.evaluate(() => {
+        const {
+          position: at,
+          rotation,
+          focus,
+        } = window.a2tg?.viewer.pose ?? { position: [], rotation: [[], [], []], focus: 0 };
+        return at.map((x, i) => x + focus * rotation[2][i]);
+      });
     const [before, from] = [await target(), await position(page)];
     await page.mouse.move(200, 200);
     await page.mouse.down();
     await page.mouse.move(260, 220, { steps: 4 });
     await page.mouse.up();
-    (await target()).forEach((x, i) => { expect(x).toBeCloseTo(before[i], 5); });
+    (await target()).forEach((x, i) => {
+      expect(x).toBeCloseTo(before[i], 5);
+    });
     const turned = await position(page);
     expect(Math.hypot(...turned.map((x, i) => x - from[i]))).toBeGreaterThan(0.1);
     await page.mouse.wheel(0, -300);
-    await page.waitForFunction((at) => window.a2tg?.viewer.pose.position.some((x, i) => Math.abs(x - at[i]) > 1e-3), turned);
-    (await target()).forEach((x, i) => { expect(x).toBeCloseTo(before[i], 5); });
+    await page.waitForFunction(
+      (at) => window.a2tg?.viewer.pose.position.some((x, i) => Math.abs(x - at[i]) > 1e-3),
+      turned,
+    );
+    (await target()).forEach((x, i) => {
+      expect(x).toBeCloseTo(before[i], 5);
+    });
     await page.close();
   });
 
@@ -112,9 +128,13 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.waitForFunction(() => location.hash.includes("mode=normals"));
     const hash = new URL(page.url()).hash;
     const other = await opened(hash);
-    (await position(other.page)).forEach((x, i, all) => { expect(x).toBeCloseTo(all[i], 5); });
+    (await position(other.page)).forEach((x, i, all) => {
+      expect(x).toBeCloseTo(all[i], 5);
+    });
     const [here, there] = [await position(page), await position(other.page)];
-    here.forEach((x, i) => { expect(there[i]).toBeCloseTo(x, 4); });
+    here.forEach((x, i) => {
+      expect(there[i]).toBeCloseTo(x, 4);
+    });
     expect(await other.page.inputValue("#mode")).toBe("normals");
     await page.close();
     await other.page.close();
@@ -148,20 +168,40 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.click("#keep");
     await page.click("#keep");
     const [download] = await Promise.all([page.waitForEvent("download"), page.click("#save")]);
-    const path = JSON.parse(readFileSync(await download.path(), "utf8")) as { format: string; version: number; views: unknown[] };
+    const path = JSON.parse(readFileSync(await download.path(), "utf8")) as {
+      format: string;
+      version: number;
+      views: unknown[];
+    };
     expect([path.format, path.version, path.views.length]).toEqual(["a2tg-jax path", 1, 2]);
     const { viewmat, K, size } = path.views[0] as { viewmat: number[]; K: number[]; size: number[] };
     const camera = await page.evaluate(() => window.a2tg?.viewer.splats?.header.cameras[0]);
-    viewmat.forEach((x, i) => { expect(x).toBeCloseTo(camera?.viewmat[i] ?? NaN, 5); });
+    viewmat.forEach((x, i) => {
+      expect(x).toBeCloseTo(camera?.viewmat[i] ?? NaN, 5);
+    });
     expect([K, size]).toEqual([camera?.K, camera?.size]);
     await page.close();
   });
 
   test("a training is followed, paused and resumed", async () => {
-    const status = { version: 0, stage: "textures", iteration: 20, iterations: 100, loss: 0.1, psnr: 20, num: 300, bytes: 9e4, is_paused: false };
+    const status = {
+      version: 0,
+      stage: "textures",
+      iteration: 20,
+      iterations: 100,
+      loss: 0.1,
+      psnr: 20,
+      num: 300,
+      bytes: 9e4,
+      is_paused: false,
+    };
     const tell = (is_paused: boolean): string => JSON.stringify(Object.assign(status, { is_paused }));
     const other = await serve({
-      "/": PAGE, "/scene.a2tgw": SCENE, "/training.json": () => tell(status.is_paused), "/pause": () => tell(true), "/resume": () => tell(false),
+      "/": PAGE,
+      "/scene.a2tgw": SCENE,
+      "/training.json": () => tell(status.is_paused),
+      "/pause": () => tell(true),
+      "/resume": () => tell(false),
     });
     const page = await browser.newPage({ viewport: { width: 640, height: 480 } });
     await page.goto(other.address);
@@ -203,15 +243,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   test("every control has a name", async () => {
     const { page } = await opened();
     const unnamed = await page.evaluate(() =>
-      [...document.querySelectorAll("input, select, button, canvas, progress")].filter((found) => {
-        const labels = found instanceof HTMLInputElement || found instanceof HTMLSelectElement ? (found.labels?.length ?? 0) : 0;
-        return labels === 0 && (found.getAttribute("aria-label") ?? found.textContent) === "";
-      }).map((found) => found.id));
+      [...document.querySelectorAll("input, select, button, canvas, progress")]
+        .filter((found) => {
+          const labels =
+            found instanceof HTMLInputElement || found instanceof HTMLSelectElement ? (found.labels?.length ?? 0) : 0;
+          return labels === 0 && (found.getAttribute("aria-label") ?? found.textContent) === "";
+        })
+        .map((found) => found.id),
+    );
     expect(unnamed).toEqual([]);
     await page.close();
   });
 
-  async function message(files: Record<string, Uint8Array | string>, prepare?: (page: Page) => Promise<unknown>): Promise<string | null> {
+  async function message(
+    files: Record<string, Uint8Array | string>,
+    prepare?: (page: Page) => Promise<unknown>,
+  ): Promise<string | null> {
     const other = await serve({ "/": PAGE, ...files });
     const page = await browser.newPage();
     await prepare?.(page);
@@ -224,14 +271,19 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
 
   test("a damaged scene is said to be", async () => {
     expect(await message({ "/scene.a2tgw": SCENE.subarray(0, SCENE.length - 100) })).toContain("cut off");
-    expect(await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) })).toContain("damaged");
+    expect(
+      await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) }),
+    ).toContain("damaged");
     expect(await message({ "/scene.a2tgw": "<script>alert(1)</script> and more text" })).toContain("not a scene");
     expect(await message({})).toContain("no scene.a2tgw");
   });
 
   test("a browser without WebGL 2 is said to lack it", async () => {
     const found = await message({ "/scene.a2tgw": SCENE }, (page) =>
-      page.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; }));
+      page.addInitScript(() => {
+        HTMLCanvasElement.prototype.getContext = () => null;
+      }),
+    );
     expect(found).toContain("no WebGL 2");
   });
 
@@ -239,7 +291,10 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     const folder = mkdtempSync(join(tmpdir(), "a2tg-"));
     const data = `<script type="text/plain" id="scene-data">${Buffer.from(SCENE).toString("base64")}</script>`;
     const path = join(folder, "one.html");
-    writeFileSync(path, PAGE.replace('<script type="module">', () => `${data}\n<script type="module">`));
+    writeFileSync(
+      path,
+      PAGE.replace('<script type="module">', () => `${data}\n<script type="module">`),
+    );
     const page = await browser.newPage();
     await page.goto(pathToFileURL(path).href);
     await page.evaluate(() => window.a2tg?.loaded);

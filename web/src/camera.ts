@@ -53,7 +53,9 @@ export function poseOf(viewmat: readonly number[], focus: number): Pose {
   const row = (i: number): Vec3 => [viewmat[4 * i], viewmat[4 * i + 1], viewmat[4 * i + 2]];
   const rotation: Mat3 = [row(0), row(1), row(2)];
   const t: Vec3 = [viewmat[3], viewmat[7], viewmat[11]];
-  const position: Vec3 = [0, 1, 2].map((k) => -(rotation[0][k] * t[0] + rotation[1][k] * t[1] + rotation[2][k] * t[2])) as unknown as Vec3;
+  const position: Vec3 = [0, 1, 2].map(
+    (k) => -(rotation[0][k] * t[0] + rotation[1][k] * t[1] + rotation[2][k] * t[2]),
+  ) as unknown as Vec3;
   return { position, rotation, focus };
 }
 

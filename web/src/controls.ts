@@ -18,10 +18,18 @@ export interface Steered {
 
 const TURN = 1 / 250;
 const FLIGHT: Readonly<Record<string, Vec3>> = {
-  KeyW: [0, 0, 1], KeyS: [0, 0, -1], KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyE: [0, -1, 0], KeyQ: [0, 1, 0],
+  KeyW: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  KeyE: [0, -1, 0],
+  KeyQ: [0, 1, 0],
 };
 const TURNS: Readonly<Record<string, readonly [number, number]>> = {
-  ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1],
+  ArrowLeft: [1, 0],
+  ArrowRight: [-1, 0],
+  ArrowUp: [0, 1],
+  ArrowDown: [0, -1],
 };
 
 export class Controls {
@@ -36,16 +44,32 @@ export class Controls {
   constructor(canvas: HTMLElement, steered: Steered) {
     this.canvas = canvas;
     this.steered = steered;
-    canvas.addEventListener("pointerdown", (event) => { this.press(event); });
-    canvas.addEventListener("pointermove", (event) => { this.drag(event); });
+    canvas.addEventListener("pointerdown", (event) => {
+      this.press(event);
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      this.drag(event);
+    });
     for (const kind of ["pointerup", "pointercancel"] as const) {
       canvas.addEventListener(kind, (event) => this.pointers.delete(event.pointerId));
     }
-    canvas.addEventListener("wheel", (event) => { this.wheel(event); }, { passive: false });
-    canvas.addEventListener("contextmenu", (event) => { event.preventDefault(); });
-    canvas.addEventListener("keydown", (event) => { this.pressKey(event); });
+    canvas.addEventListener(
+      "wheel",
+      (event) => {
+        this.wheel(event);
+      },
+      { passive: false },
+    );
+    canvas.addEventListener("contextmenu", (event) => {
+      event.preventDefault();
+    });
+    canvas.addEventListener("keydown", (event) => {
+      this.pressKey(event);
+    });
     canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
-    canvas.addEventListener("blur", () => { this.keys.clear(); });
+    canvas.addEventListener("blur", () => {
+      this.keys.clear();
+    });
   }
 
   private press(event: PointerEvent): void {
@@ -94,7 +118,10 @@ export class Controls {
       this.keys.add(event.code);
       if (!this.isFlying) {
         this.isFlying = true;
-        requestAnimationFrame((time) => { this.time = time; this.fly(time, event.shiftKey); });
+        requestAnimationFrame((time) => {
+          this.time = time;
+          this.fly(time, event.shiftKey);
+        });
       }
     } else if (event.key === "+" || event.key === "=") {
       this.zoom(1 / 1.1);
@@ -106,7 +133,10 @@ export class Controls {
   private fly(time: number, isFast: boolean): void {
     const seconds = Math.min((time - this.time) / 1000, 0.1);
     this.time = time;
-    if (this.keys.size === 0) { this.isFlying = false; return; }
+    if (this.keys.size === 0) {
+      this.isFlying = false;
+      return;
+    }
     const speed = this.steered.extent * (isFast ? 1.5 : 0.5) * seconds;
     let { pose } = this.steered;
     for (const key of this.keys) {
@@ -114,7 +144,9 @@ export class Controls {
       if (key in TURNS) pose = panned(pose, this.steered.up, TURNS[key][0] * seconds, TURNS[key][1] * seconds);
     }
     this.change(pose);
-    requestAnimationFrame((next) => { this.fly(next, isFast); });
+    requestAnimationFrame((next) => {
+      this.fly(next, isFast);
+    });
   }
 
   private zoom(factor: number): void {

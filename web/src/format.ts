@@ -56,7 +56,15 @@ export interface Header {
 }
 
 const BITS: Readonly<Record<string, number>> = {
-  log_scales: 8, quats: 8, opacities: 8, sh_0: 8, sh_1: 7, sh_2: 6, sh_3: 6, colors: 8, alphas: 8,
+  log_scales: 8,
+  quats: 8,
+  opacities: 8,
+  sh_0: 8,
+  sh_1: 7,
+  sh_2: 6,
+  sh_3: 6,
+  colors: 8,
+  alphas: 8,
 };
 
 /** What the first 22 bytes say. */

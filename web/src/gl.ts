@@ -11,7 +11,10 @@ export class Program {
   constructor(gl: WebGL2RenderingContext, vertex: string, fragment: string) {
     this.gl = gl;
     this.handle = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]] as const) {
+    for (const [kind, text] of [
+      [gl.VERTEX_SHADER, vertex],
+      [gl.FRAGMENT_SHADER, fragment],
+    ] as const) {
       const shader = gl.createShader(kind);
       if (shader === null) throw new Error("WebGL made no shader");
       gl.shaderSource(shader, text);

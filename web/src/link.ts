@@ -17,8 +17,17 @@ const LENGTH = 17;
 /** Such as #view=…&mode=depth: position, right, forward, focus, and the lens. */
 export function linkOf({ pose, lens, mode }: View): string {
   const numbers = [
-    ...pose.position, ...pose.rotation[0], ...pose.rotation[2], pose.focus,
-    lens.fx, lens.fy, lens.cx, lens.cy, lens.skew, lens.width, lens.height,
+    ...pose.position,
+    ...pose.rotation[0],
+    ...pose.rotation[2],
+    pose.focus,
+    lens.fx,
+    lens.fy,
+    lens.cx,
+    lens.cy,
+    lens.skew,
+    lens.width,
+    lens.height,
   ];
   const view = numbers.map((x) => Number(x.toPrecision(7)).toString()).join(",");
   return mode === "full" ? `#view=${view}` : `#view=${view}&mode=${mode}`;
@@ -34,5 +43,9 @@ export function viewOf(hash: string): View | null {
   if (!(fx > 0 && fy > 0 && width >= 1 && height >= 1 && numbers[9] > 0)) return null;
   const rotation = orthonormal([vector(3), [0, 0, 0], vector(6)]);
   const mode = MODES.find((name) => name === fields.get("mode")) ?? "full";
-  return { pose: { position: vector(0), rotation, focus: numbers[9] }, lens: { fx, fy, cx, cy, skew, width, height }, mode };
+  return {
+    pose: { position: vector(0), rotation, focus: numbers[9] },
+    lens: { fx, fy, cx, cy, skew, width, height },
+    mode,
+  };
 }

@@ -20,11 +20,18 @@ export interface PageApi {
   readonly loaded: Promise<void>;
   readonly viewer: Viewer;
   /** A picture as numbers, [h, w, 4]: colours times alpha, and alpha; rows from the top. */
-  render(viewmat: readonly number[], K: readonly number[], size: readonly number[], mode: string): Promise<Float32Array>;
+  render(
+    viewmat: readonly number[],
+    K: readonly number[],
+    size: readonly number[],
+    mode: string,
+  ): Promise<Float32Array>;
 }
 
 declare global {
-  interface Window { a2tg?: PageApi }
+  interface Window {
+    a2tg?: PageApi;
+  }
 }
 
 /** While a scene comes it is drawn again when there is so much more of it. */
@@ -75,7 +82,10 @@ function nextFrame(): Promise<void> {
 function tell(splats: Splats, numBytes: number): void {
   const { header } = splats;
   const figures: [string, string][] = [
-    ["Gaussians", splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num)],
+    [
+      "Gaussians",
+      splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num),
+    ],
     ["Texels", countText(header.numTexels ?? 0)],
     ["File", bytesText(numBytes)],
     ["On the GPU", bytesText(splats.numBytes)],
@@ -98,10 +108,16 @@ function lensOf(K: readonly number[], size: readonly number[]): Lens {
 function begin(): void {
   const viewer = new Viewer(element("view", HTMLCanvasElement));
   const panel = new Panel(viewer);
-  viewer.onFail = (reason) => { showMessage(`This browser could not sort the scene: ${reason}`); };
-  const show = async (): Promise<void> => { await load(viewer, panel, await openScene()); };
+  viewer.onFail = (reason) => {
+    showMessage(`This browser could not sort the scene: ${reason}`);
+  };
+  const show = async (): Promise<void> => {
+    await load(viewer, panel, await openScene());
+  };
   const isHeld = document.getElementById("scene-data") !== null;
-  const loaded = (isHeld ? Promise.resolve(false) : followTraining(show)).then((isLive) => isLive ? undefined : show());
+  const loaded = (isHeld ? Promise.resolve(false) : followTraining(show)).then((isLive) =>
+    isLive ? undefined : show(),
+  );
   loaded.catch(fail);
   void findPhotographs(panel);
   window.a2tg = {

@@ -39,22 +39,54 @@ export class Panel {
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
-    this.mode.addEventListener("change", () => { this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full"); });
-    this.divide.addEventListener("change", () => { this.setDivided(); });
-    this.divider.addEventListener("input", () => { this.setDivided(); });
-    this.camera.addEventListener("change", () => { this.goTo(Number(this.camera.value)); });
-    this.wipe.addEventListener("input", () => { this.placePhotograph(); });
-    this.onClick("before", () => { this.step(-1); });
-    this.onClick("after", () => { this.step(1); });
-    this.onClick("start", () => { this.restart(); });
-    this.onClick("link", () => { void this.copyLink(); });
-    this.onClick("fullscreen", () => { void toggleFullScreen(); });
-    this.onClick("keep", () => { this.keep(); });
-    this.onClick("save", () => { this.save(); });
-    viewer.onLeave = () => { this.leave(); };
-    addEventListener("keydown", (event) => { this.pressKey(event); });
-    addEventListener("resize", () => { this.placePhotograph(); });
-    addEventListener("hashchange", () => { this.followLink(); });
+    this.mode.addEventListener("change", () => {
+      this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full");
+    });
+    this.divide.addEventListener("change", () => {
+      this.setDivided();
+    });
+    this.divider.addEventListener("input", () => {
+      this.setDivided();
+    });
+    this.camera.addEventListener("change", () => {
+      this.goTo(Number(this.camera.value));
+    });
+    this.wipe.addEventListener("input", () => {
+      this.placePhotograph();
+    });
+    this.onClick("before", () => {
+      this.step(-1);
+    });
+    this.onClick("after", () => {
+      this.step(1);
+    });
+    this.onClick("start", () => {
+      this.restart();
+    });
+    this.onClick("link", () => {
+      void this.copyLink();
+    });
+    this.onClick("fullscreen", () => {
+      void toggleFullScreen();
+    });
+    this.onClick("keep", () => {
+      this.keep();
+    });
+    this.onClick("save", () => {
+      this.save();
+    });
+    viewer.onLeave = () => {
+      this.leave();
+    };
+    addEventListener("keydown", (event) => {
+      this.pressKey(event);
+    });
+    addEventListener("resize", () => {
+      this.placePhotograph();
+    });
+    addEventListener("hashchange", () => {
+      this.followLink();
+    });
     if (matchMedia("(max-width: 600px)").matches) element("panel", HTMLDetailsElement).open = false;
   }
 
@@ -66,7 +98,9 @@ export class Panel {
     document.title = `${title} · a2tg view`;
     setText("note", header.note);
     element("cameras", HTMLElement).hidden = header.cameras.length === 0;
-    const choices = header.cameras.map((camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)));
+    const choices = header.cameras.map(
+      (camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)),
+    );
     this.camera.replaceChildren(new Option("free", "-1"), ...choices);
     const hasTextures = (header.numTexels ?? 0) > 0;
     element("compare", HTMLElement).hidden = !hasTextures;
@@ -168,7 +202,11 @@ export class Panel {
     clearTimeout(this.linkTimer);
     this.linkTimer = window.setTimeout(() => {
       // The address of a page that opens from the disk may not be changed everywhere.
-      try { history.replaceState(null, "", this.link); } catch { /* then it stays */ }
+      try {
+        history.replaceState(null, "", this.link);
+      } catch {
+        /* then it stays */
+      }
     }, 400);
   }
 
@@ -187,7 +225,9 @@ export class Panel {
       location.hash = this.link;
       button.textContent = "In the address";
     }
-    window.setTimeout(() => { button.textContent = "Copy link"; }, 1500);
+    window.setTimeout(() => {
+      button.textContent = "Copy link";
+    }, 1500);
   }
 
   private followLink(): boolean {

@@ -86,7 +86,9 @@ export class Renderer {
       gl.bindTexture(gl.TEXTURE_2D, texture.handle);
       gl.uniform1i(splat.at(name), unit);
     });
-    const ends = (name: string, { low, step }: Ends): void => { gl.uniform2f(splat.at(name), low, step); };
+    const ends = (name: string, { low, step }: Ends): void => {
+      gl.uniform2f(splat.at(name), low, step);
+    };
     ends("scaleEnds", header.ends.log_scales);
     ends("quatEnds", header.ends.quats);
     ends("opacityEnds", header.ends.opacities);

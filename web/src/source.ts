@@ -16,7 +16,7 @@ export interface Source {
 /** The scene that the page holds, or the file beside it. */
 export async function openScene(): Promise<Source> {
   const held = document.getElementById("scene-data");
-  if (held !== null) return fromBytes(fromBase64((held.textContent).trim()));
+  if (held !== null) return fromBytes(fromBase64(held.textContent.trim()));
   let response: Response;
   try {
     response = await fetch(SCENE_FILE);
@@ -24,7 +24,7 @@ export async function openScene(): Promise<Source> {
     throw new SceneError(
       location.protocol === "file:"
         ? "This page must come from a web server: browsers let no page read the files beside it. " +
-          "a2tg export RUN --web OUT --single-file makes one that opens from the disk."
+            "a2tg export RUN --web OUT --single-file makes one that opens from the disk."
         : `The scene could not be fetched: ${SCENE_FILE}.`,
     );
   }
@@ -80,13 +80,23 @@ function headerOf(text: Uint8Array, head: ReturnType<typeof parseHead>): Header 
 
 type Reader = ReadableStreamDefaultReader<Uint8Array<ArrayBuffer>>;
 
-async function readBody(reader: Reader, first: Uint8Array<ArrayBuffer>, header: Header, listener: Listener): Promise<void> {
+async function readBody(
+  reader: Reader,
+  first: Uint8Array<ArrayBuffer>,
+  header: Header,
+  listener: Listener,
+): Promise<void> {
   let numRead = first.length;
   const coded = new ReadableStream<Uint8Array<ArrayBuffer>>({
-    start: (controller) => { controller.enqueue(first); },
+    start: (controller) => {
+      controller.enqueue(first);
+    },
     pull: async (controller) => {
       const { value, done } = await reader.read();
-      if (done) { controller.close(); return; }
+      if (done) {
+        controller.close();
+        return;
+      }
       numRead += value.length;
       controller.enqueue(value);
     },
@@ -105,7 +115,11 @@ async function readBody(reader: Reader, first: Uint8Array<ArrayBuffer>, header: 
 }
 
 /** At least so many bytes, what was read before included. */
-async function firstBytes(reader: Reader, num: number, before: Uint8Array = new Uint8Array(0)): Promise<Uint8Array<ArrayBuffer>> {
+async function firstBytes(
+  reader: Reader,
+  num: number,
+  before: Uint8Array = new Uint8Array(0),
+): Promise<Uint8Array<ArrayBuffer>> {
   const pieces: Uint8Array[] = [before];
   let total = before.length;
   while (total < num) {

@@ -49,8 +49,10 @@ export function statusText(status: Status): string {
   if (status.message !== "") return status.message;
   if (Number.isNaN(status.loss)) return status.stage === "" ? "The training begins." : `${status.stage} begins.`;
   const state = status.isPaused ? ", paused" : "";
-  return `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
-    `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`;
+  return (
+    `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
+    `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`
+  );
 }
 
 async function ask(path: string, method: "GET" | "POST"): Promise<Status | null> {
@@ -74,7 +76,9 @@ export async function followTraining(show: () => Promise<void>): Promise<boolean
   const button = element("pause", HTMLButtonElement);
   button.addEventListener("click", () => {
     const isPaused = button.dataset.paused === "yes";
-    void ask(isPaused ? "resume" : "pause", "POST").then((found) => { if (found !== null) tell(found); });
+    void ask(isPaused ? "resume" : "pause", "POST").then((found) => {
+      if (found !== null) tell(found);
+    });
   });
   for (let version = 0; status !== null; status = await ask(STATUS_FILE, "GET")) {
     tell(status);

@@ -11,7 +11,9 @@ const UP: Vec3 = [0, 0, 1];
 const POSE: Pose = overview([0.3, -0.2, 0.1], 1.3, UP);
 
 const closeTo = (found: readonly number[], wanted: readonly number[]): void => {
-  found.forEach((x, i) => { expect(x).toBeCloseTo(wanted[i], 9); });
+  found.forEach((x, i) => {
+    expect(x).toBeCloseTo(wanted[i], 9);
+  });
 };
 
 function pixel(pose: Pose, lens: Lens, point: Vec3): [number, number, number] {
@@ -69,7 +71,11 @@ test("aiming puts a point in the middle", () => {
   closeTo(found.slice(0, 2), [LENS.cx, LENS.cy]);
 });
 
-test.each([[1280, 480], [390, 844], [640, 480]])("a canvas of %i × %i shows the whole image", (width, height) => {
+test.each([
+  [1280, 480],
+  [390, 844],
+  [640, 480],
+])("a canvas of %i × %i shows the whole image", (width, height) => {
   const lens = fitted(LENS, width, height);
   const s = Math.min(width / 640, height / 480);
   expect(lens.cx - width / 2).toBeCloseTo(s * (LENS.cx - 320), 9);
@@ -79,15 +85,32 @@ test.each([[1280, 480], [390, 844], [640, 480]])("a canvas of %i × %i shows the
 test("links carry a view", () => {
   const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth" }));
   expect(view?.mode).toBe("depth");
-  view?.pose.position.forEach((x, i) => { expect(x).toBeCloseTo(POSE.position[i], 5); });
-  view?.pose.rotation.flat().forEach((x, i) => { expect(x).toBeCloseTo(POSE.rotation.flat()[i], 5); });
+  view?.pose.position.forEach((x, i) => {
+    expect(x).toBeCloseTo(POSE.position[i], 5);
+  });
+  view?.pose.rotation.flat().forEach((x, i) => {
+    expect(x).toBeCloseTo(POSE.rotation.flat()[i], 5);
+  });
   expect(view?.lens).toEqual(LENS);
 });
 
-test.each(["", "#view=", "#view=1,2,3", `#view=${"1,".repeat(16)}x`, `#view=${Array(17).fill("-1").join()}`, "#view=<b>", `#view=${Array(17).fill("1e99").join()}`])(
-  "other links carry none: %s", (hash) => { expect(viewOf(hash)).toBeNull(); });
+test.each([
+  "",
+  "#view=",
+  "#view=1,2,3",
+  `#view=${"1,".repeat(16)}x`,
+  `#view=${Array(17).fill("-1").join()}`,
+  "#view=<b>",
+  `#view=${Array(17).fill("1e99").join()}`,
+])("other links carry none: %s", (hash) => {
+  expect(viewOf(hash)).toBeNull();
+});
 
 test("rows that are no rotation are made one", () => {
-  const [x, y, z] = orthonormal([[0, 0, 0], [0, 0, 0], [0, 0, 0]]);
+  const [x, y, z] = orthonormal([
+    [0, 0, 0],
+    [0, 0, 0],
+    [0, 0, 0],
+  ]);
   closeTo(cross(x, y), z);
 });

@@ -14,8 +14,13 @@ async function read(bytes: Uint8Array<ArrayBuffer>): Promise<{ header: Header; c
   const chunks: Chunk[] = [];
   const headers: Header[] = [];
   await readScene(fromBytes(bytes), {
-    onHeader: (found) => { headers.push(found); },
-    onChunk: (chunk) => { chunks.push(chunk); return Promise.resolve(); },
+    onHeader: (found) => {
+      headers.push(found);
+    },
+    onChunk: (chunk) => {
+      chunks.push(chunk);
+      return Promise.resolve();
+    },
   });
   expect(headers.length).toBe(1);
   return { header: headers[0], chunks };
@@ -30,7 +35,9 @@ function changed(changes: Record<string, unknown>, cut = 0): Uint8Array<ArrayBuf
   const bytes = new Uint8Array(HEAD_BYTES + header.length + body.length);
   bytes.set(SMALL.subarray(0, 10));
   const view = new DataView(bytes.buffer);
-  [header.length, body.length, crc32(header)].forEach((number, i) => { view.setUint32(10 + 4 * i, number, true); });
+  [header.length, body.length, crc32(header)].forEach((number, i) => {
+    view.setUint32(10 + 4 * i, number, true);
+  });
   bytes.set(header, HEAD_BYTES);
   bytes.set(body, HEAD_BYTES + header.length);
   return bytes;
@@ -54,7 +61,9 @@ test("the header says what the file holds", async () => {
 test("rows are packed as another reader finds them", async () => {
   const { header, chunks } = await read(SMALL);
   const packer = new Packer(header);
-  const near = (found: number, wanted: number): void => { expect(Math.abs(found - wanted)).toBeLessThan(3e-5 * (1 + Math.abs(wanted))); };
+  const near = (found: number, wanted: number): void => {
+    expect(Math.abs(found - wanted)).toBeLessThan(3e-5 * (1 + Math.abs(wanted)));
+  };
   const value = (name: string, code: number): number => header.ends[name].low + code * header.ends[name].step;
   let [row, texel, harmonic] = [0, 0, 0];
   for (const chunk of chunks) {
@@ -128,18 +137,50 @@ test("every changed byte is noticed", async () => {
 });
 
 test.each([
-  { num: 1 << 24 }, { num: -1 }, { num: 1.5 }, { num: "3" }, { num_texels: 1 << 25 }, { num_texels: -2 }, { chunk: 0 },
-  { bytes: 2 ** 40 }, { bytes: 10 }, { base_degree: 4 }, { num_bands: 0 }, { num_bands: 9 }, { means: [] },
-  { means: [[1, 2, 3, 4], [1, 2, 3, 4], [1, 2, 3, null]] }, { ends: 3 }, { ends: { colors: [0] } }, { cameras: [{}] },
-  { cameras: [3] }, { uv: "elsewhere" }, { outside: null }, { max_alpha: 2 }, { near_plane: 0 }, { background: "red" },
-  { title: 3 }, { note: null },
+  { num: 1 << 24 },
+  { num: -1 },
+  { num: 1.5 },
+  { num: "3" },
+  { num_texels: 1 << 25 },
+  { num_texels: -2 },
+  { chunk: 0 },
+  { bytes: 2 ** 40 },
+  { bytes: 10 },
+  { base_degree: 4 },
+  { num_bands: 0 },
+  { num_bands: 9 },
+  { means: [] },
+  {
+    means: [
+      [1, 2, 3, 4],
+      [1, 2, 3, 4],
+      [1, 2, 3, null],
+    ],
+  },
+  { ends: 3 },
+  { ends: { colors: [0] } },
+  { cameras: [{}] },
+  { cameras: [3] },
+  { uv: "elsewhere" },
+  { outside: null },
+  { max_alpha: 2 },
+  { near_plane: 0 },
+  { background: "red" },
+  { title: 3 },
+  { note: null },
 ])("a header that lies is refused: %o", async (changes) => {
   await expect(read(changed(changes))).rejects.toThrow(SceneError);
 });
 
 test("rows that contradict the header are refused", async () => {
   expect((await read(changed({}))).header.num).toBe(NUM);
-  for (const changes of [{ num: NUM - 1 }, { num: NUM + 1 }, { num_texels: null }, { num_bands: 3 }, { base_degree: 2 }]) {
+  for (const changes of [
+    { num: NUM - 1 },
+    { num: NUM + 1 },
+    { num_texels: null },
+    { num_bands: 3 },
+    { base_degree: 2 },
+  ]) {
     await expect(read(changed(changes))).rejects.toThrow(SceneError);
   }
 });
@@ -149,5 +190,7 @@ test("room is made for what is announced only where it can be there", () => {
   const header = parseHeader(SMALL.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes), head);
   expect(fixedColumns(header)).toBe(18);
   expect(header.bytes).toBeLessThanOrEqual(1 << 24);
-  expect(() => parseHead(Uint8Array.from(SMALL.subarray(0, HEAD_BYTES), (byte, i) => (i >= 10 && i < 14 ? 255 : byte)))).toThrow(SceneError);
+  expect(() =>
+    parseHead(Uint8Array.from(SMALL.subarray(0, HEAD_BYTES), (byte, i) => (i >= 10 && i < 14 ? 255 : byte))),
+  ).toThrow(SceneError);
 });

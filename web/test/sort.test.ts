@@ -13,8 +13,10 @@ function drawn(num: number, seed: number): Float32Array {
 test.each([0, 1, 2, 257, 5000])("%i positions, from the farthest to the nearest, ties from the last", (num) => {
   const means = drawn(num, num + 1);
   const row = [0.25, -0.5, 1, 2];
-  const depths = Float32Array.from({ length: num }, (_, i) =>
-    row[0] * means[3 * i] + row[1] * means[3 * i + 1] + row[2] * means[3 * i + 2] + row[3]);
+  const depths = Float32Array.from(
+    { length: num },
+    (_, i) => row[0] * means[3 * i] + row[1] * means[3 * i + 1] + row[2] * means[3 * i + 2] + row[3],
+  );
   const wanted = [...depths.keys()].sort((a, b) => depths[b] - depths[a] || b - a);
   expect([...new DepthSorter().sort(means, num, row)]).toEqual(wanted);
 });
