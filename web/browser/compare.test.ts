@@ -9,19 +9,22 @@ import { join } from "node:path";
 import type { Browser } from "playwright-core";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
 
+import { at } from "../src/arrays";
+import type { Intrinsics, Viewmat } from "../src/camera";
+import type { Vec2, Vec3 } from "../src/math";
 import { CHROMIUM, launch, serve } from "./chromium";
 
 interface CaseView {
-  readonly viewmat: number[];
-  readonly K: number[];
-  readonly size: [number, number];
+  readonly viewmat: Viewmat;
+  readonly K: Intrinsics;
+  readonly size: Vec2;
   readonly mode: string;
   /** Whose picture it is: the model's, which the file was made of, or that of what the file holds. */
   readonly of: "the model" | "the file";
 }
 
 interface Case {
-  readonly background: [number, number, number];
+  readonly background: Vec3;
   readonly views: CaseView[];
 }
 
@@ -34,11 +37,12 @@ const GEOMETRY_LIMIT = 0.5;
 const PAGE = new URL("../../a2tg_jax/web/viewer.html", import.meta.url);
 
 /** Colours over the background, as a screen shows them: [h, w, 3]. */
-function composited(found: Float32Array, background: readonly number[]): Float32Array {
+function composited(found: Float32Array, background: Vec3): Float32Array {
   const num = found.length / 4;
   const colors = new Float32Array(3 * num);
   for (let i = 0; i < num; i++) {
-    for (let k = 0; k < 3; k++) colors[3 * i + k] = found[4 * i + k] + (1 - found[4 * i + 3]) * background[k];
+    const rest = 1 - at(found, 4 * i + 3);
+    for (const [k, behind] of background.entries()) colors[3 * i + k] = at(found, 4 * i + k) + rest * behind;
   }
   return colors;
 }
@@ -86,7 +90,7 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
       expect(found.length).toBe(wanted.length);
       let [sum, largest, far] = [0, 0, 0];
       found.forEach((x, i) => {
-        const difference = isColor ? Math.abs(clipped(x) - clipped(wanted[i])) : Math.abs(x - wanted[i]);
+        const difference = isColor ? Math.abs(clipped(x) - clipped(at(wanted, i))) : Math.abs(x - at(wanted, i));
         sum += difference;
         largest = Math.max(largest, difference);
         if (difference > 8 / 255) far++;

@@ -8,6 +8,12 @@ import { pathToFileURL } from "node:url";
 import type { Browser, Page } from "playwright-core";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
 
+import { at } from "../src/arrays";
+import { target } from "../src/camera";
+import type { Pose } from "../src/camera";
+import { norm, subtract } from "../src/math";
+import type { Vec3 } from "../src/math";
+import { expectClose } from "../test/close";
 import { CHROMIUM, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
@@ -39,8 +45,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     return { page, elsewhere };
   }
 
-  const position = (page: Page): Promise<readonly number[]> =>
-    page.evaluate(() => [...(window.a2tg?.viewer.pose.position ?? [])]);
+  async function poseOn(page: Page): Promise<Pose> {
+    const pose = await page.evaluate(() => window.a2tg?.viewer.pose);
+    if (pose === undefined) throw new Error("The page has no viewer.");
+    return pose;
+  }
+
+  /** Resolves when the camera is farther than `distance` from a position. */
+  async function movedFrom(page: Page, from: Vec3, distance: number): Promise<void> {
+    await page.waitForFunction(
+      ([x, y, z, least]) => {
+        const position = window.a2tg?.viewer.pose.position;
+        return position !== undefined && Math.hypot(position[0] - x, position[1] - y, position[2] - z) > least;
+      },
+      [...from, distance] as const,
+    );
+  }
 
   test("names are text, and nothing is fetched from elsewhere", async () => {
     const { page, elsewhere } = await opened();
@@ -72,49 +92,30 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.keyboard.press("5");
     expect(await page.inputValue("#mode")).toBe("depth");
     expect(await page.textContent("#legend")).toContain("near");
-    const before = await position(page);
+    const before = await poseOn(page);
     await page.keyboard.down("w");
-    await page.waitForFunction(
-      (from) => Math.hypot(...(window.a2tg?.viewer.pose.position ?? []).map((x, i) => x - from[i])) > 0.01,
-      before,
-    );
+    await movedFrom(page, before.position, 0.01);
     await page.keyboard.up("w");
     expect(await page.inputValue("#camera")).toBe("-1");
     await page.keyboard.press(".");
     expect(await page.inputValue("#camera")).toBe("0");
-    expect(await position(page)).toEqual(before);
+    expect((await poseOn(page)).position).toEqual(before.position);
     await page.close();
   });
 
   test("dragging turns around the target, the wheel comes nearer to it", async () => {
     const { page } = await opened();
-    const target = (): Promise<number[]> =>
-      page.evaluate(() => {
-        const {
-          position: at,
-          rotation,
-          focus,
-        } = window.a2tg?.viewer.pose ?? { position: [], rotation: [[], [], []], focus: 0 };
-        return at.map((x, i) => x + focus * rotation[2][i]);
-      });
-    const [before, from] = [await target(), await position(page)];
+    const before = await poseOn(page);
     await page.mouse.move(200, 200);
     await page.mouse.down();
     await page.mouse.move(260, 220, { steps: 4 });
     await page.mouse.up();
-    (await target()).forEach((x, i) => {
-      expect(x).toBeCloseTo(before[i], 5);
-    });
-    const turned = await position(page);
-    expect(Math.hypot(...turned.map((x, i) => x - from[i]))).toBeGreaterThan(0.1);
+    const turned = await poseOn(page);
+    expectClose(target(turned), target(before), 5);
+    expect(norm(subtract(turned.position, before.position))).toBeGreaterThan(0.1);
     await page.mouse.wheel(0, -300);
-    await page.waitForFunction(
-      (at) => window.a2tg?.viewer.pose.position.some((x, i) => Math.abs(x - at[i]) > 1e-3),
-      turned,
-    );
-    (await target()).forEach((x, i) => {
-      expect(x).toBeCloseTo(before[i], 5);
-    });
+    await movedFrom(page, turned.position, 2e-3);
+    expectClose(target(await poseOn(page)), target(before), 5);
     await page.close();
   });
 
@@ -128,13 +129,8 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.waitForFunction(() => location.hash.includes("mode=normals"));
     const hash = new URL(page.url()).hash;
     const other = await opened(hash);
-    (await position(other.page)).forEach((x, i, all) => {
-      expect(x).toBeCloseTo(all[i], 5);
-    });
-    const [here, there] = [await position(page), await position(other.page)];
-    here.forEach((x, i) => {
-      expect(there[i]).toBeCloseTo(x, 4);
-    });
+    const [here, there] = [await poseOn(page), await poseOn(other.page)];
+    expectClose(there.position, here.position, 4);
     expect(await other.page.inputValue("#mode")).toBe("normals");
     await page.close();
     await other.page.close();
@@ -171,14 +167,12 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     const path = JSON.parse(readFileSync(await download.path(), "utf8")) as {
       format: string;
       version: number;
-      views: unknown[];
+      views: { viewmat: number[]; K: number[]; size: number[] }[];
     };
     expect([path.format, path.version, path.views.length]).toEqual(["a2tg-jax path", 1, 2]);
-    const { viewmat, K, size } = path.views[0] as { viewmat: number[]; K: number[]; size: number[] };
+    const { viewmat, K, size } = at(path.views, 0);
     const camera = await page.evaluate(() => window.a2tg?.viewer.splats?.header.cameras[0]);
-    viewmat.forEach((x, i) => {
-      expect(x).toBeCloseTo(camera?.viewmat[i] ?? NaN, 5);
-    });
+    expectClose(viewmat, camera?.viewmat ?? [], 5);
     expect([K, size]).toEqual([camera?.K, camera?.size]);
     await page.close();
   });

@@ -1,7 +1,7 @@
 /** Where the viewer looks from, and what leads from the world to pixels. */
 
 import { add, cross, dot, lookingAlong, normalize, orthonormal, scale, subtract, turned } from "./math";
-import type { Mat3, Row4, Vec3 } from "./math";
+import type { Mat3, Row4, Vec2, Vec3 } from "./math";
 
 /** Pinhole intrinsics in pixels of an image of width × height; pixel centres lie at +0.5. */
 export interface Lens {
@@ -13,6 +13,11 @@ export interface Lens {
   readonly width: number;
   readonly height: number;
 }
+
+/** Intrinsics K row by row: fx, skew, cx, 0, fy, cy, 0, 0, 1. */
+export type Intrinsics = readonly [...Vec3, ...Vec3, ...Vec3];
+/** World-to-camera matrix row by row. */
+export type Viewmat = readonly [...Row4, ...Row4, ...Row4, ...Row4];
 
 export interface Pose {
   readonly position: Vec3;
@@ -42,27 +47,47 @@ export function fitted(lens: Lens, width: number, height: number): Lens {
 }
 
 export function projection(pose: Pose, lens: Lens): Projection {
-  const view = pose.rotation.map((axis): Row4 => [...axis, -dot(axis, pose.position)]) as [Row4, Row4, Row4];
-  const combined = (a: number, b: number, c: number): Row4 =>
-    [0, 1, 2, 3].map((k) => a * view[0][k] + b * view[1][k] + c * view[2][k]) as unknown as Row4;
-  return [combined(lens.fx, lens.skew, lens.cx), combined(0, lens.fy, lens.cy), view[2]];
+  const row = (axis: Vec3): Row4 => [...axis, -dot(axis, pose.position)];
+  const [x, y, z] = [row(pose.rotation[0]), row(pose.rotation[1]), row(pose.rotation[2])];
+  const combined = (a: number, b: number, c: number): Row4 => {
+    const entry = (k: 0 | 1 | 2 | 3): number => a * x[k] + b * y[k] + c * z[k];
+    return [entry(0), entry(1), entry(2), entry(3)];
+  };
+  return [combined(lens.fx, lens.skew, lens.cx), combined(0, lens.fy, lens.cy), z];
 }
 
-/** The pose of a world-to-camera matrix, 16 numbers row by row. */
-export function poseOf(viewmat: readonly number[], focus: number): Pose {
-  const row = (i: number): Vec3 => [viewmat[4 * i], viewmat[4 * i + 1], viewmat[4 * i + 2]];
-  const rotation: Mat3 = [row(0), row(1), row(2)];
-  const t: Vec3 = [viewmat[3], viewmat[7], viewmat[11]];
-  const position: Vec3 = [0, 1, 2].map(
-    (k) => -(rotation[0][k] * t[0] + rotation[1][k] * t[1] + rotation[2][k] * t[2]),
-  ) as unknown as Vec3;
-  return { position, rotation, focus };
+/** The lens of an image of `size` = [width, height]. */
+export function lensOf(K: Intrinsics, size: Vec2): Lens {
+  const [fx, skew, cx, , fy, cy] = K;
+  return { fx, fy, cx, cy, skew, width: size[0], height: size[1] };
 }
 
-/** The world-to-camera matrix of a pose, 16 numbers row by row. */
-export function viewmatOf(pose: Pose): number[] {
-  const rows = pose.rotation.flatMap((axis) => [...axis, -dot(axis, pose.position)]);
-  return [...rows, 0, 0, 0, 1];
+export function intrinsicsOf({ fx, fy, cx, cy, skew }: Lens): Intrinsics {
+  return [fx, skew, cx, 0, fy, cy, 0, 0, 1];
+}
+
+/** The pose of a world-to-camera matrix. */
+export function poseOf(viewmat: Viewmat, focus: number): Pose {
+  const [xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz] = viewmat;
+  const position: Vec3 = [
+    -(xx * tx + yx * ty + zx * tz),
+    -(xy * tx + yy * ty + zy * tz),
+    -(xz * tx + yz * ty + zz * tz),
+  ];
+  return {
+    position,
+    rotation: [
+      [xx, xy, xz],
+      [yx, yy, yz],
+      [zx, zy, zz],
+    ],
+    focus,
+  };
+}
+
+/** The world-to-camera matrix of a pose. */
+export function viewmatOf({ position, rotation: [x, y, z] }: Pose): Viewmat {
+  return [...x, -dot(x, position), ...y, -dot(y, position), ...z, -dot(z, position), 0, 0, 0, 1];
 }
 
 /** Turned around the target: by `yaw` about `up`, then by `pitch` about the camera's right; never over the top. */

@@ -113,9 +113,12 @@ export class ChunkReader {
   }
 
   private bandLengths(degrees: Uint8Array): number[] {
-    const counts = [0, 0, 0, 0];
-    for (const degree of degrees) for (let l = 1; l <= degree; l++) counts[l]++;
-    return Array.from({ length: this.header.numBands - 1 }, (_, i) => 3 * (2 * i + 3) * counts[i + 1]);
+    const counted = (least: number): number => {
+      let count = 0;
+      for (const degree of degrees) if (degree >= least) count++;
+      return count;
+    };
+    return Array.from({ length: this.header.numBands - 1 }, (_, i) => 3 * (2 * i + 3) * counted(i + 1));
   }
 
   private chunkOf(fixed: Uint8Array, rest: Uint8Array): Chunk {
@@ -133,7 +136,7 @@ export class ChunkReader {
 function numTexelsOf(sizes: Uint8Array, num: number): number {
   let total = 0;
   for (let i = 0; i < num; i++) {
-    const [height, width] = [sizes[i], sizes[num + i]];
+    const [height, width] = [sizes[i]!, sizes[num + i]!];
     if (height > 16 || width > 16 || (height === 0) !== (width === 0)) {
       throw new SceneError("The scene is damaged: a texture's size is impossible.");
     }

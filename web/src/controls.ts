@@ -2,7 +2,8 @@
 
 import type { Lens, Pose } from "./camera";
 import { dollied, moved, orbited, panned } from "./camera";
-import type { Vec3 } from "./math";
+import { scale } from "./math";
+import type { Vec2, Vec3 } from "./math";
 
 /** What motions need to know, and change. */
 export interface Steered {
@@ -25,7 +26,7 @@ const FLIGHT: Readonly<Record<string, Vec3>> = {
   KeyE: [0, -1, 0],
   KeyQ: [0, 1, 0],
 };
-const TURNS: Readonly<Record<string, readonly [number, number]>> = {
+const TURNS: Readonly<Record<string, Vec2>> = {
   ArrowLeft: [1, 0],
   ArrowRight: [-1, 0],
   ArrowUp: [0, 1],
@@ -140,8 +141,9 @@ export class Controls {
     const speed = this.steered.extent * (isFast ? 1.5 : 0.5) * seconds;
     let { pose } = this.steered;
     for (const key of this.keys) {
-      if (key in FLIGHT) pose = moved(pose, FLIGHT[key].map((x) => x * speed) as unknown as Vec3);
-      if (key in TURNS) pose = panned(pose, this.steered.up, TURNS[key][0] * seconds, TURNS[key][1] * seconds);
+      const [flight, turn] = [FLIGHT[key], TURNS[key]];
+      if (flight !== undefined) pose = moved(pose, scale(flight, speed));
+      if (turn !== undefined) pose = panned(pose, this.steered.up, turn[0] * seconds, turn[1] * seconds);
     }
     this.change(pose);
     requestAnimationFrame((next) => {

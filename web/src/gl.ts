@@ -136,6 +136,6 @@ export class Target {
     }
     const bytes = new Uint8Array(found.length);
     gl.readPixels(x, y, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-    return found.map((_, i) => bytes[i] / 255);
+    return Float32Array.from(bytes, (byte) => byte / 255);
   }
 }

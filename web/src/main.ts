@@ -2,9 +2,10 @@
 
 import "./style.css";
 
-import type { Lens } from "./camera";
-import { poseOf } from "./camera";
+import { lensOf, poseOf } from "./camera";
+import type { Intrinsics, Viewmat } from "./camera";
 import { SceneError } from "./format";
+import type { Vec2 } from "./math";
 import { bytesText, countText, element, setFigures, showMessage } from "./page";
 import { Panel } from "./panel";
 import { MODES } from "./shaders";
@@ -20,12 +21,7 @@ export interface PageApi {
   readonly loaded: Promise<void>;
   readonly viewer: Viewer;
   /** A picture as numbers, [h, w, 4]: colours times alpha, and alpha; rows from the top. */
-  render(
-    viewmat: readonly number[],
-    K: readonly number[],
-    size: readonly number[],
-    mode: string,
-  ): Promise<Float32Array>;
+  render(viewmat: Viewmat, K: Intrinsics, size: Vec2, mode: string): Promise<Float32Array>;
 }
 
 declare global {
@@ -99,10 +95,6 @@ async function findPhotographs(panel: Panel): Promise<void> {
   if (response?.ok !== true) return;
   const found: unknown = await response.json().catch(() => null);
   if (Array.isArray(found)) panel.setPhotographs(found.filter((x): x is number => Number.isInteger(x)));
-}
-
-function lensOf(K: readonly number[], size: readonly number[]): Lens {
-  return { fx: K[0], skew: K[1], cx: K[2], fy: K[4], cy: K[5], width: size[0], height: size[1] };
 }
 
 function begin(): void {

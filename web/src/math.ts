@@ -3,10 +3,16 @@
  * world, so that rotation · x + translation leads from the world to the camera.
  */
 
+export type Vec2 = readonly [number, number];
 export type Vec3 = readonly [number, number, number];
 export type Mat3 = readonly [Vec3, Vec3, Vec3];
 /** A row (x, y, z, constant): linear in a position. */
 export type Row4 = readonly [number, number, number, number];
+
+/** Whether `values` are as many finite numbers as the tuple type T has, which `length` names again. */
+export function isVector<T extends readonly number[]>(values: unknown, length: T["length"]): values is T {
+  return Array.isArray(values) && values.length === length && values.every(Number.isFinite);
+}
 
 export const add = (a: Vec3, b: Vec3): Vec3 => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const subtract = (a: Vec3, b: Vec3): Vec3 => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];

@@ -1,8 +1,10 @@
 /** The panel beside the picture: what is shown, the cameras with their photographs, the link, the path. */
 
-import { viewmatOf } from "./camera";
+import { intrinsicsOf, viewmatOf } from "./camera";
+import type { Intrinsics, Viewmat } from "./camera";
 import type { Header } from "./format";
 import { linkOf, viewOf } from "./link";
+import type { Vec2 } from "./math";
 import { element, setText } from "./page";
 import { MODES } from "./shaders";
 import type { Mode } from "./shaders";
@@ -18,9 +20,9 @@ const LEGENDS: Partial<Record<Mode, string>> = {
 
 /** A view of a path, as a2tg render --path reads it. */
 interface KeptView {
-  readonly viewmat: readonly number[];
-  readonly K: readonly number[];
-  readonly size: readonly number[];
+  readonly viewmat: Viewmat;
+  readonly K: Intrinsics;
+  readonly size: Vec2;
 }
 
 export class Panel {
@@ -179,7 +181,7 @@ export class Panel {
     this.photograph.hidden = !isThere;
     if (isThere) {
       this.photograph.src = `photographs/${index}.jpg`;
-      this.photograph.alt = `Photograph ${this.header?.cameras[index].name ?? ""}`;
+      this.photograph.alt = `Photograph ${this.header?.cameras[index]?.name ?? ""}`;
       this.placePhotograph();
     }
   }
@@ -245,8 +247,7 @@ export class Panel {
 
   private keep(): void {
     const { pose, image } = this.viewer;
-    const K = [image.fx, image.skew, image.cx, 0, image.fy, image.cy, 0, 0, 1];
-    this.kept.push({ viewmat: viewmatOf(pose), K, size: [image.width, image.height] });
+    this.kept.push({ viewmat: viewmatOf(pose), K: intrinsicsOf(image), size: [image.width, image.height] });
     this.tellKept();
   }
 

@@ -4,6 +4,7 @@ import type { Lens, Pose } from "./camera";
 import { projection } from "./camera";
 import type { Ends } from "./format";
 import { Program, Target } from "./gl";
+import type { Vec2 } from "./math";
 import { MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from "./shaders";
 import type { Mode } from "./shaders";
 import type { Splats } from "./splats";
@@ -53,7 +54,7 @@ export class Renderer {
   }
 
   /** The picture on the canvas. */
-  present(splats: Splats, mode: Mode, depths: readonly [number, number], divided: number | null = null): void {
+  present(splats: Splats, mode: Mode, depths: Vec2, divided: number | null = null): void {
     const { gl, screen } = this;
     const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -89,13 +90,13 @@ export class Renderer {
     const ends = (name: string, { low, step }: Ends): void => {
       gl.uniform2f(splat.at(name), low, step);
     };
-    ends("scaleEnds", header.ends.log_scales);
-    ends("quatEnds", header.ends.quats);
-    ends("opacityEnds", header.ends.opacities);
-    ends("colorEnds", header.ends.colors);
-    ends("alphaEnds", header.ends.alphas);
-    for (let l = 0; l < 4; l++) ends(`harmonicEnds[${l}]`, header.ends[`sh_${l}`]);
-    const { alphas } = header.ends;
+    const { log_scales, quats, opacities, sh_0, sh_1, sh_2, sh_3, colors, alphas } = header.ends;
+    ends("scaleEnds", log_scales);
+    ends("quatEnds", quats);
+    ends("opacityEnds", opacities);
+    ends("colorEnds", colors);
+    ends("alphaEnds", alphas);
+    for (const [l, band] of [sh_0, sh_1, sh_2, sh_3].entries()) ends(`harmonicEnds[${l}]`, band);
     gl.uniform1f(splat.at("peak"), header.numTexels === null ? 1 : Math.max(1, alphas.low + 255 * alphas.step));
     gl.uniform1f(splat.at("nearPlane"), header.nearPlane);
     gl.uniform1f(splat.at("maxAlpha"), header.maxAlpha);

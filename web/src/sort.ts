@@ -1,5 +1,7 @@
 /** The order in which splats are drawn: by the depth of their means, as the trainer's renderer has it. */
 
+import type { Row4 } from "./math";
+
 const BUCKETS = 1 << 16;
 
 /** Sorts any number of positions; room is kept between calls. */
@@ -14,7 +16,7 @@ export class DepthSorter {
    *
    * @param row depth = row · (x, y, z, 1)
    */
-  sort(means: Float32Array, num: number, row: readonly number[]): Uint32Array<ArrayBuffer> {
+  sort(means: Float32Array, num: number, row: Row4): Uint32Array<ArrayBuffer> {
     if (this.keys.length < num) {
       this.keys = new Uint32Array(num);
       this.order = new Uint32Array(num);
@@ -28,11 +30,11 @@ export class DepthSorter {
   }
 
   /** Unsigned integers in the order of the depths. */
-  private findKeys(means: Float32Array, num: number, row: readonly number[]): void {
+  private findKeys(means: Float32Array, num: number, [a, b, c, d]: Row4): void {
     const depths = new Float32Array(this.keys.buffer);
     for (let i = 0; i < num; i++) {
-      depths[i] = row[0] * means[3 * i] + row[1] * means[3 * i + 1] + row[2] * means[3 * i + 2] + row[3];
-      const bits = this.keys[i];
+      depths[i] = a * means[3 * i]! + b * means[3 * i + 1]! + c * means[3 * i + 2]! + d;
+      const bits = this.keys[i]!;
       this.keys[i] = bits & 0x80000000 ? ~bits : bits | 0x80000000;
     }
   }
@@ -41,16 +43,16 @@ export class DepthSorter {
   private pass(num: number, shift: number, from: Uint32Array | null, to: Uint32Array): void {
     const { counts, keys } = this;
     counts.fill(0);
-    for (let i = 0; i < num; i++) counts[(keys[i] >>> shift) & (BUCKETS - 1)]++;
+    for (let i = 0; i < num; i++) counts[(keys[i]! >>> shift) & (BUCKETS - 1)]!++;
     let place = 0;
     for (let bucket = BUCKETS - 1; bucket >= 0; bucket--) {
-      const count = counts[bucket];
+      const count = counts[bucket]!;
       counts[bucket] = place;
       place += count;
     }
     for (let i = 0; i < num; i++) {
-      const index = from === null ? num - 1 - i : from[i];
-      to[counts[(keys[index] >>> shift) & (BUCKETS - 1)]++] = index;
+      const index = from === null ? num - 1 - i : from[i]!;
+      to[counts[(keys[index]! >>> shift) & (BUCKETS - 1)]!++] = index;
     }
   }
 }

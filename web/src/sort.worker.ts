@@ -1,5 +1,6 @@
 /** Keeps the positions and answers with orders, so that drawing need not wait for sorting. */
 
+import type { Row4 } from "./math";
 import { DepthSorter } from "./sort";
 
 export interface AddMessage {
@@ -12,12 +13,12 @@ export interface AddMessage {
 
 export interface SortMessage {
   readonly kind: "sort";
-  readonly row: readonly number[];
+  readonly row: Row4;
 }
 
 export interface OrderMessage {
   readonly order: Uint32Array<ArrayBuffer>;
-  readonly row: readonly number[];
+  readonly row: Row4;
 }
 
 const sorter = new DepthSorter();

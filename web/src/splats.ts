@@ -1,11 +1,16 @@
 /** A scene on the graphics processor, and the worker that sorts it. */
 
-import { LongTexture } from "./gl";
-import type { Header } from "./format";
+import { at } from "./arrays";
 import type { Chunk } from "./chunks";
+import type { Header } from "./format";
+import { LongTexture } from "./gl";
+import type { Row4, Vec3 } from "./math";
 import { Packer, mostHarmonics } from "./packing";
 import SortWorker from "./sort.worker?worker&inline";
 import type { AddMessage, OrderMessage, SortMessage } from "./sort.worker";
+
+/** A chunk adds at most so many positions to a sample that has fewer. */
+const SAMPLE = 4096;
 
 export class Splats {
   readonly header: Header;
@@ -21,7 +26,7 @@ export class Splats {
   numTexels = 0;
   numBytes = 0;
   /** Positions of the first rows, which show most: to find a place to stand. */
-  readonly sample: number[] = [];
+  readonly sample: Vec3[] = [];
   /** Called when there is another order to draw. */
   onOrder: () => void = () => undefined;
   /** Called when the worker cannot work. */
@@ -31,8 +36,8 @@ export class Splats {
   private readonly packer: Packer;
   private readonly worker: Worker;
   private isSorting = false;
-  private wanted: readonly number[] | null = null;
-  private sorted: { row: readonly number[]; num: number } | null = null;
+  private wanted: Row4 | null = null;
+  private sorted: { row: Row4; num: number } | null = null;
   private waiting: (() => void)[] = [];
 
   constructor(gl: WebGL2RenderingContext, header: Header) {
@@ -61,13 +66,13 @@ export class Splats {
     this.numBytes += packed.rows.byteLength + packed.harmonics.byteLength + packed.texels.byteLength;
     this.num += packed.num;
     this.numTexels += packed.texels.length / 4;
-    if (this.sample.length < 3 * 4096) this.sample.push(...packed.means.subarray(0, 3 * 4096));
+    if (this.sample.length < SAMPLE) this.sample.push(...pointsOf(packed.means.subarray(0, 3 * SAMPLE)));
     const message: AddMessage = { kind: "add", means: packed.means, total: this.header.num };
     this.worker.postMessage(message, [packed.means.buffer]);
   }
 
   /** Asks for the order of these depths, row · (x, y, z, 1); the last one asked for wins. */
-  sort(row: readonly number[]): void {
+  sort(row: Row4): void {
     if (this.sorted !== null && this.sorted.num === this.num && row.every((x, i) => x === this.sorted?.row[i])) return;
     this.wanted = row;
     this.next();
@@ -105,4 +110,13 @@ export class Splats {
     this.next();
     this.onOrder();
   }
+}
+
+/** Positions from [x, y, z, …]. */
+function pointsOf(means: Float32Array): Vec3[] {
+  return Array.from({ length: means.length / 3 }, (_, i) => [
+    at(means, 3 * i),
+    at(means, 3 * i + 1),
+    at(means, 3 * i + 2),
+  ]);
 }

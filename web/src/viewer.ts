@@ -1,13 +1,14 @@
 /** A scene on a canvas: what is looked at, from where, and when it is drawn anew. */
 
-import { aimed, fitted, overview, poseOf, projection } from "./camera";
+import { at } from "./arrays";
+import { aimed, fitted, lensOf, overview, poseOf, projection } from "./camera";
 import type { Lens, Pose } from "./camera";
 import { Controls } from "./controls";
 import type { Steered } from "./controls";
 import { SceneError } from "./format";
 import type { Header, SceneCamera } from "./format";
 import { add, dot, norm, scale, subtract } from "./math";
-import type { Vec3 } from "./math";
+import type { Row4, Vec2, Vec3 } from "./math";
 import { Renderer } from "./renderer";
 import type { Mode } from "./shaders";
 import { Splats } from "./splats";
@@ -87,15 +88,15 @@ export class Viewer implements Steered {
   settle(splats: Splats): void {
     const { cameras } = splats.header;
     const { centre, radius } = middleOf(splats.sample);
-    this.up = cameras.length > 0 ? [0, 0, 1] : [0, -1, 0];
-    this.extent = cameras.length > 0 ? 1 : radius;
-    if (cameras.length > 0) this.goTo(cameras[0]);
+    const [first] = cameras;
+    this.up = first !== undefined ? [0, 0, 1] : [0, -1, 0];
+    this.extent = first !== undefined ? 1 : radius;
+    if (first !== undefined) this.goTo(first);
     else this.pose = overview(centre, radius, this.up);
   }
 
   goTo(camera: SceneCamera): void {
-    const [fx, skew, cx, , fy, cy] = camera.K;
-    this.image = { fx, fy, cx, cy, skew, width: camera.size[0], height: camera.size[1] };
+    this.image = lensOf(camera.K, camera.size);
     const pose = poseOf(camera.viewmat, 1);
     // What one turns around lies near the middle of the scene.
     this.pose = { ...pose, focus: Math.max(-dot(pose.position, pose.rotation[2]), 0.2 * this.extent) };
@@ -120,7 +121,8 @@ export class Viewer implements Steered {
     this.renderer.draw(splats, this.pose, lens, "depth");
     const column = Math.min(Math.max(Math.floor(x), 0), lens.width - 1);
     const row = Math.min(Math.max(Math.floor(y), 0), lens.height - 1);
-    const [depth, , , alpha] = this.renderer.target.read(column, row, 1, 1);
+    const pixel = this.renderer.target.read(column, row, 1, 1);
+    const [depth, alpha] = [at(pixel, 0), at(pixel, 3)];
     if (alpha > 0.1) {
       const z = depth / alpha;
       const [right, down, forward] = this.pose.rotation;
@@ -152,7 +154,7 @@ export class Viewer implements Steered {
     return found;
   }
 
-  private get depthRow(): readonly number[] {
+  private get depthRow(): Row4 {
     return projection(this.pose, this.lens)[2];
   }
 
@@ -183,21 +185,28 @@ export class Viewer implements Steered {
   }
 
   /** From where to where depths are told apart. */
-  private get depths(): readonly [number, number] {
+  private get depths(): Vec2 {
     return [0.3 * this.pose.focus, 5 * this.pose.focus];
   }
 }
 
-/** Where most of the positions [x, y, z, …] lie. */
-function middleOf(positions: readonly number[]): { centre: Vec3; radius: number } {
-  if (positions.length === 0) return { centre: [0, 0, 0], radius: 1 };
-  const axis = (k: number): number[] => positions.filter((_, i) => i % 3 === k);
-  const centre = [0, 1, 2].map((k) => quantile(axis(k), 0.5)) as unknown as Vec3;
-  const [xs, ys, zs] = [axis(0), axis(1), axis(2)];
-  const distances = xs.map((x, i) => norm(subtract([x, ys[i], zs[i]], centre)));
+/** Where most of the points lie. */
+function middleOf(points: readonly Vec3[]): { centre: Vec3; radius: number } {
+  if (points.length === 0) return { centre: [0, 0, 0], radius: 1 };
+  const median = (k: 0 | 1 | 2): number =>
+    quantile(
+      points.map((point) => point[k]),
+      0.5,
+    );
+  const centre: Vec3 = [median(0), median(1), median(2)];
+  const distances = points.map((point) => norm(subtract(point, centre)));
   return { centre, radius: Math.max(quantile(distances, 0.75), 1e-6) };
 }
 
+/** Sorts the values, of which there is at least one. */
 function quantile(values: number[], share: number): number {
-  return values.sort((a, b) => a - b)[Math.floor(share * (values.length - 1))];
+  return at(
+    values.sort((a, b) => a - b),
+    Math.floor(share * (values.length - 1)),
+  );
 }

@@ -1,9 +1,11 @@
 import { expect, test } from "vitest";
 
+import { at } from "../src/arrays";
 import type { Chunk } from "../src/chunks";
 import { ChunkReader } from "../src/chunks";
-import { HEAD_BYTES, SceneError, crc32, fixedColumns, parseHead, parseHeader } from "../src/format";
-import type { Header } from "../src/format";
+import { crc32 } from "../src/crc32";
+import { HEAD_BYTES, SceneError, fixedColumns, parseHead, parseHeader } from "../src/format";
+import type { Header, Quantity } from "../src/format";
 import { HARMONIC_TEXELS, Packer, mostHarmonics } from "../src/packing";
 import { fromBytes, readScene } from "../src/source";
 import { NUMBERS, SMALL } from "./small";
@@ -23,7 +25,7 @@ async function read(bytes: Uint8Array<ArrayBuffer>): Promise<{ header: Header; c
     },
   });
   expect(headers.length).toBe(1);
-  return { header: headers[0], chunks };
+  return { header: at(headers, 0), chunks };
 }
 
 /** The small scene with another header. */
@@ -43,7 +45,8 @@ function changed(changes: Record<string, unknown>, cut = 0): Uint8Array<ArrayBuf
   return bytes;
 }
 
-const byteOf = (word: number, index: number): number => (word >>> (8 * index)) & 255;
+const SH = ["sh_0", "sh_1", "sh_2", "sh_3"] as const;
+const byteOf = (words: Uint32Array, place: number, index: number): number => (at(words, place) >>> (8 * index)) & 255;
 
 test("crc32 is zlib's", () => {
   expect(crc32(new TextEncoder().encode("123456789"))).toBe(0xcbf43926);
@@ -52,7 +55,7 @@ test("crc32 is zlib's", () => {
 test("the header says what the file holds", async () => {
   const { header, chunks } = await read(SMALL);
   expect(header.num).toBe(NUM);
-  expect([header.title, header.note, header.cameras[0].name]).toEqual(["small", "a note", "<b>a</b>.png"]);
+  expect([header.title, header.note, header.cameras[0]?.name]).toEqual(["small", "a note", "<b>a</b>.png"]);
   expect(header.background).toEqual([0.25, 0.5, 0.75]);
   expect(chunks.length).toBeGreaterThan(1);
   expect(chunks.reduce((sum, chunk) => sum + chunk.num, 0)).toBe(NUM);
@@ -64,7 +67,7 @@ test("rows are packed as another reader finds them", async () => {
   const near = (found: number, wanted: number): void => {
     expect(Math.abs(found - wanted)).toBeLessThan(3e-5 * (1 + Math.abs(wanted)));
   };
-  const value = (name: string, code: number): number => header.ends[name].low + code * header.ends[name].step;
+  const value = (name: Quantity, code: number): number => header.ends[name].low + code * header.ends[name].step;
   let [row, texel, harmonic] = [0, 0, 0];
   for (const chunk of chunks) {
     const packed = packer.pack(chunk);
@@ -72,34 +75,35 @@ test("rows are packed as another reader finds them", async () => {
     for (let i = 0; i < packed.num; i++, row++) {
       const words = packed.rows.subarray(8 * i, 8 * i + 8);
       for (let k = 0; k < 3; k++) {
-        near(packed.means[3 * i + k], NUMBERS.means[3 * row + k]);
-        expect(floats[8 * i + k]).toBe(packed.means[3 * i + k]);
-        near(value("quats", byteOf(words[4], k)), NUMBERS.quats[4 * row + k + 1]);
-        if (row < 40) near(value("sh_0", byteOf(words[3], k)), NUMBERS.sh[48 * row + k]);
+        near(at(packed.means, 3 * i + k), at(NUMBERS.means, 3 * row + k));
+        expect(at(floats, 8 * i + k)).toBe(at(packed.means, 3 * i + k));
+        near(value("quats", byteOf(words, 4, k)), at(NUMBERS.quats, 4 * row + k + 1));
+        if (row < 40) near(value("sh_0", byteOf(words, 3, k)), at(NUMBERS.sh, 48 * row + k));
       }
-      const degree = byteOf(words[3], 3);
+      const degree = byteOf(words, 3, 3);
       expect(degree).toBe(NUMBERS.degrees[row]);
-      near(value("opacities", byteOf(words[4], 3)), NUMBERS.opacities[row]);
-      for (let k = 0; k < 2; k++) near(value("log_scales", byteOf(words[5], k)), NUMBERS.log_scales[2 * row + k]);
-      const [width, height] = [byteOf(words[5], 2), byteOf(words[5], 3)];
+      near(value("opacities", byteOf(words, 4, 3)), at(NUMBERS.opacities, row));
+      for (let k = 0; k < 2; k++) near(value("log_scales", byteOf(words, 5, k)), at(NUMBERS.log_scales, 2 * row + k));
+      const [width, height] = [byteOf(words, 5, 2), byteOf(words, 5, 3)];
       expect([height, width]).toEqual(NUMBERS.sizes.slice(2 * row, 2 * row + 2));
       expect([words[6], words[7]]).toEqual([texel, harmonic]);
       for (let k = 1; row < 40 && k < (degree + 1) ** 2; k++) {
-        const band = Math.floor(Math.sqrt(k));
-        const first = packed.rows[7];
-        const word = packed.harmonics[4 * (harmonic - first) + k - 1];
-        for (let c = 0; c < 3; c++) near(value(`sh_${band}`, byteOf(word, c)), NUMBERS.sh[48 * row + 3 * k + c]);
+        const band = at(SH, Math.floor(Math.sqrt(k)));
+        const place = 4 * (harmonic - at(packed.rows, 7)) + k - 1;
+        for (let c = 0; c < 3; c++) {
+          near(value(band, byteOf(packed.harmonics, place, c)), at(NUMBERS.sh, 48 * row + 3 * k + c));
+        }
       }
       for (let t = texel; t < Math.min(texel + width * height, 100); t++) {
-        const codes = packed.texels.subarray(4 * (t - packed.rows[6]));
+        const codes = packed.texels.subarray(4 * (t - at(packed.rows, 6)));
         for (let c = 0; c < 3; c++) {
-          const root = value("colors", codes[c]);
-          near(root * Math.abs(root), NUMBERS.texels[4 * t + c]);
+          const root = value("colors", at(codes, c));
+          near(root * Math.abs(root), at(NUMBERS.texels, 4 * t + c));
         }
-        near(value("alphas", codes[3]), NUMBERS.texels[4 * t + 3]);
+        near(value("alphas", at(codes, 3)), at(NUMBERS.texels, 4 * t + 3));
       }
       texel += width * height;
-      harmonic += HARMONIC_TEXELS[degree];
+      harmonic += at(HARMONIC_TEXELS, degree);
     }
   }
   expect(row).toBe(NUM);
@@ -131,7 +135,7 @@ test("files that are cut off are refused", async () => {
 test("every changed byte is noticed", async () => {
   for (let place = 0; place < SMALL.length; place += 97) {
     const spoiled = SMALL.slice();
-    spoiled[place] ^= 0x55;
+    spoiled[place] = at(spoiled, place) ^ 0x55;
     await expect(read(spoiled), `byte ${place}`).rejects.toThrow(SceneError);
   }
 });
