@@ -45,32 +45,16 @@ export class Controls {
   constructor(canvas: HTMLElement, steered: Steered) {
     this.canvas = canvas;
     this.steered = steered;
-    canvas.addEventListener("pointerdown", (event) => {
-      this.press(event);
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      this.drag(event);
-    });
+    canvas.addEventListener("pointerdown", (event) => this.press(event));
+    canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"] as const) {
       canvas.addEventListener(kind, (event) => this.pointers.delete(event.pointerId));
     }
-    canvas.addEventListener(
-      "wheel",
-      (event) => {
-        this.wheel(event);
-      },
-      { passive: false },
-    );
-    canvas.addEventListener("contextmenu", (event) => {
-      event.preventDefault();
-    });
-    canvas.addEventListener("keydown", (event) => {
-      this.pressKey(event);
-    });
+    canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("keydown", (event) => this.pressKey(event));
     canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
-    canvas.addEventListener("blur", () => {
-      this.keys.clear();
-    });
+    canvas.addEventListener("blur", () => this.keys.clear());
   }
 
   private press(event: PointerEvent): void {
@@ -146,9 +130,7 @@ export class Controls {
       if (turn !== undefined) pose = panned(pose, this.steered.up, turn[0] * seconds, turn[1] * seconds);
     }
     this.change(pose);
-    requestAnimationFrame((next) => {
-      this.fly(next, isFast);
-    });
+    requestAnimationFrame((next) => this.fly(next, isFast));
   }
 
   private zoom(factor: number): void {

@@ -118,9 +118,9 @@ function begin(): void {
     render: (viewmat, K, size, mode) =>
       viewer.read(poseOf(viewmat, 1), lensOf(K, size), MODES.find((name) => name === mode) ?? "full"),
   };
-  viewer.canvas.addEventListener("webglcontextlost", () => {
-    showMessage("The graphics processor was lost, perhaps because its memory is full. Reload the page to try again.");
-  });
+  viewer.canvas.addEventListener("webglcontextlost", () =>
+    showMessage("The graphics processor was lost, perhaps because its memory is full. Reload the page to try again."),
+  );
 }
 
 function fail(error: unknown): void {

@@ -41,54 +41,26 @@ export class Panel {
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
-    this.mode.addEventListener("change", () => {
-      this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full");
-    });
-    this.divide.addEventListener("change", () => {
-      this.setDivided();
-    });
-    this.divider.addEventListener("input", () => {
-      this.setDivided();
-    });
-    this.camera.addEventListener("change", () => {
-      this.goTo(Number(this.camera.value));
-    });
-    this.wipe.addEventListener("input", () => {
-      this.placePhotograph();
-    });
-    this.onClick("before", () => {
-      this.step(-1);
-    });
-    this.onClick("after", () => {
-      this.step(1);
-    });
-    this.onClick("start", () => {
-      this.restart();
-    });
+    this.mode.addEventListener("change", () => this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full"));
+    this.divide.addEventListener("change", () => this.setDivided());
+    this.divider.addEventListener("input", () => this.setDivided());
+    this.camera.addEventListener("change", () => this.goTo(Number(this.camera.value)));
+    this.wipe.addEventListener("input", () => this.placePhotograph());
+    this.onClick("before", () => this.step(-1));
+    this.onClick("after", () => this.step(1));
+    this.onClick("start", () => this.restart());
     this.onClick("link", () => {
       void this.copyLink();
     });
     this.onClick("fullscreen", () => {
       void toggleFullScreen();
     });
-    this.onClick("keep", () => {
-      this.keep();
-    });
-    this.onClick("save", () => {
-      this.save();
-    });
-    viewer.onLeave = () => {
-      this.leave();
-    };
-    addEventListener("keydown", (event) => {
-      this.pressKey(event);
-    });
-    addEventListener("resize", () => {
-      this.placePhotograph();
-    });
-    addEventListener("hashchange", () => {
-      this.followLink();
-    });
+    this.onClick("keep", () => this.keep());
+    this.onClick("save", () => this.save());
+    viewer.onLeave = () => this.leave();
+    addEventListener("keydown", (event) => this.pressKey(event));
+    addEventListener("resize", () => this.placePhotograph());
+    addEventListener("hashchange", () => this.followLink());
     if (matchMedia("(max-width: 600px)").matches) element("panel", HTMLDetailsElement).open = false;
   }
 

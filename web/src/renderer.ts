@@ -87,9 +87,7 @@ export class Renderer {
       gl.bindTexture(gl.TEXTURE_2D, texture.handle);
       gl.uniform1i(splat.at(name), unit);
     });
-    const ends = (name: string, { low, step }: Ends): void => {
-      gl.uniform2f(splat.at(name), low, step);
-    };
+    const ends = (name: string, { low, step }: Ends): void => gl.uniform2f(splat.at(name), low, step);
     const { log_scales, quats, opacities, sh_0, sh_1, sh_2, sh_3, colors, alphas } = header.ends;
     ends("scaleEnds", log_scales);
     ends("quatEnds", quats);

@@ -88,9 +88,7 @@ async function readBody(
 ): Promise<void> {
   let numRead = first.length;
   const coded = new ReadableStream<Uint8Array<ArrayBuffer>>({
-    start: (controller) => {
-      controller.enqueue(first);
-    },
+    start: (controller) => controller.enqueue(first),
     pull: async (controller) => {
       const { value, done } = await reader.read();
       if (done) {

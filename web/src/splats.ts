@@ -50,12 +50,8 @@ export class Splats {
     this.order = gl.createBuffer();
     this.packer = new Packer(header);
     this.worker = new SortWorker();
-    this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => {
-      this.receive(event.data);
-    });
-    this.worker.addEventListener("error", (event) => {
-      this.onFail(event.message);
-    });
+    this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => this.receive(event.data));
+    this.worker.addEventListener("error", (event) => this.onFail(event.message));
   }
 
   add(chunk: Chunk): void {

@@ -58,9 +58,7 @@ export class Viewer implements Steered {
     this.gl = gl;
     this.renderer = new Renderer(gl);
     new Controls(canvas, this);
-    new ResizeObserver(() => {
-      this.draw();
-    }).observe(canvas);
+    new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
   /** Begins a scene; it takes the place of the one before once all of it is sorted. */
@@ -73,9 +71,7 @@ export class Viewer implements Steered {
       }
       this.draw();
     };
-    splats.onFail = (reason) => {
-      this.onFail(reason);
-    };
+    splats.onFail = (reason) => this.onFail(reason);
     return splats;
   }
 
@@ -137,9 +133,7 @@ export class Viewer implements Steered {
   draw(): void {
     if (this.isWaiting) return;
     this.isWaiting = true;
-    requestAnimationFrame((time) => {
-      this.frame(time);
-    });
+    requestAnimationFrame((time) => this.frame(time));
   }
 
   /** The picture of a pose and a lens as numbers, [h, w, 4], rows from the top: colours times alpha, and alpha. */

@@ -16,9 +16,7 @@ async function read(bytes: Uint8Array<ArrayBuffer>): Promise<{ header: Header; c
   const chunks: Chunk[] = [];
   const headers: Header[] = [];
   await readScene(fromBytes(bytes), {
-    onHeader: (found) => {
-      headers.push(found);
-    },
+    onHeader: (found) => headers.push(found),
     onChunk: (chunk) => {
       chunks.push(chunk);
       return Promise.resolve();
@@ -64,9 +62,8 @@ test("the header says what the file holds", async () => {
 test("rows are packed as another reader finds them", async () => {
   const { header, chunks } = await read(SMALL);
   const packer = new Packer(header);
-  const near = (found: number, wanted: number): void => {
+  const near = (found: number, wanted: number): void =>
     expect(Math.abs(found - wanted)).toBeLessThan(3e-5 * (1 + Math.abs(wanted)));
-  };
   const value = (name: Quantity, code: number): number => header.ends[name].low + code * header.ends[name].step;
   let [row, texel, harmonic] = [0, 0, 0];
   for (const chunk of chunks) {
