@@ -6,11 +6,11 @@ export default tseslint.config(
   {
     languageOptions: { parserOptions: { projectService: true } },
     rules: {
-      // Handlers are one call long: () => this.draw().
+      // Handlers may be one call: () => this.draw().
       "@typescript-eslint/no-confusing-void-expression": ["error", { ignoreArrowShorthand: true }],
-      // Words of text are numbers and strings alike here.
+      // Messages contain numbers.
       "@typescript-eslint/restrict-template-expressions": ["error", { allowNumber: true }],
-      // What a scene file says is text and never becomes markup.
+      // Text from scene files must never become markup.
       "no-restricted-properties": [
         "error",
         { property: "innerHTML", message: "use textContent" },
@@ -20,7 +20,7 @@ export default tseslint.config(
     },
   },
   {
-    // Loops over every row and byte of a scene: their bounds keep indices inside, and a check of each would cost time.
+    // Hot loops over every row and byte of a scene: bounds keep indices valid, and a check per access would be slow.
     files: ["src/chunks.ts", "src/crc32.ts", "src/packing.ts", "src/sort.ts"],
     rules: { "@typescript-eslint/no-non-null-assertion": "off" },
   },

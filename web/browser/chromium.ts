@@ -1,4 +1,4 @@
-/** The machine's Chromium, and a server of a few files in memory. */
+/** Chromium and an in-memory web server for tests. */
 
 import { existsSync } from "node:fs";
 import { createServer } from "node:http";
@@ -10,7 +10,7 @@ import type { Browser } from "playwright-core";
 const PLACES = [process.env.CHROMIUM ?? "", "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
 export const CHROMIUM = PLACES.find((path) => path !== "" && existsSync(path));
 
-/** Headless, drawing WebGL 2 in software. */
+/** Launch Chromium headless, with WebGL 2 in software. */
 export function launch(): Promise<Browser> {
   return chromium.launch({
     executablePath: CHROMIUM,
@@ -32,7 +32,7 @@ export interface Served {
   close(): void;
 }
 
-/** Answers with files by path, such as "/scene.a2tgw", or with what a function makes each time. */
+/** Serve files by path, such as "/scene.a2tgw". A function is called for each request. */
 export function serve(files: Readonly<Record<string, Uint8Array | string | (() => string)>>): Promise<Served> {
   const server = createServer((request, response) => {
     const found = Object.entries(files).find(([path]) => path === request.url)?.[1];

@@ -1,6 +1,7 @@
 /**
- * Pictures of the page beside those of the JAX renderer: A2TG_CASES is a folder with a folder for each scene, which
- * holds scene.a2tgw, views.json, and of each view i the colours as float32, i.f32 (tests/viewer_cases.py writes it).
+ * Comparison of the page with the JAX renderer. A2TG_CASES is a folder with one folder per scene. Each holds
+ * scene.a2tgw, views.json and, for view i, the renderer's colours as float32 in i.f32. tests/viewer_cases.py writes
+ * these files.
  */
 
 import { existsSync, readFileSync, readdirSync } from "node:fs";
@@ -19,7 +20,7 @@ interface CaseView {
   readonly K: Intrinsics;
   readonly size: Vec2;
   readonly mode: string;
-  /** Whose picture it is: the model's, which the file was made of, or that of what the file holds. */
+  /** Source of the renderer's picture: the original model, or the model decoded from the file. */
   readonly of: "the model" | "the file";
 }
 
@@ -30,13 +31,13 @@ interface Case {
 
 const FOLDER = process.env.A2TG_CASES ?? "";
 const NAMES = FOLDER !== "" && existsSync(FOLDER) ? readdirSync(FOLDER) : [];
-/** Mean absolute differences in 1/255: of the model's picture, and of what the file holds, where nothing was rounded. */
+/** Largest mean absolute differences in 1/255. The model's limit includes the rounding of the file. */
 const LIMITS = { "the model": 1, "the file": 0.15 } as const;
-/** Of depths and normals, which half floats hold less finely than colours in [0, 1]. */
+/** Limit for depths and normals, for which half floats are coarser than for colours in [0, 1]. */
 const GEOMETRY_LIMIT = 0.5;
 const PAGE = new URL("../../a2tg_jax/web/viewer.html", import.meta.url);
 
-/** Colours over the background, as a screen shows them: [h, w, 3]. */
+/** Composite colours over the background: [h, w, 3]. */
 function composited(found: Float32Array, background: Vec3): Float32Array {
   const num = found.length / 4;
   const colors = new Float32Array(3 * num);
@@ -47,7 +48,7 @@ function composited(found: Float32Array, background: Vec3): Float32Array {
   return colors;
 }
 
-/** Weighted sums as they are, without alpha: [h, w, 3]. */
+/** Drop alpha and keep the weighted sums: [h, w, 3]. */
 const withoutAlpha = (found: Float32Array): Float32Array => found.filter((_, i) => i % 4 !== 3);
 
 const clipped = (x: number): number => Math.min(Math.max(x, 0), 1);
@@ -65,7 +66,7 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
     const folder = join(FOLDER, name);
     const { background, views } = JSON.parse(readFileSync(join(folder, "views.json"), "utf8")) as Case;
     const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgw": readFileSync(join(folder, "scene.a2tgw")) });
-    // The canvas itself is drawn besides, slowly in software: a small one.
+    // The canvas is drawn too, slowly in software, so keep it small.
     const page = await browser.newPage({ viewport: { width: 160, height: 120 } });
     const errors: string[] = [];
     page.on("pageerror", (error) => errors.push(error.message));

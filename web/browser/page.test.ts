@@ -1,4 +1,4 @@
-/** The page in Chromium: what it says, how it is steered, what it refuses. */
+/** The page in Chromium: its texts, its controls and its error messages. */
 
 import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
@@ -32,7 +32,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     served.close();
   });
 
-  /** A page that has loaded, of a size, at the end of an address; it counts what it asks of others. */
+  /** Open the page and wait for the scene. `elsewhere` collects requests to other servers. */
   async function opened(hash = "", size = { width: 640, height: 480 }): Promise<{ page: Page; elsewhere: string[] }> {
     const page = await browser.newPage({ viewport: size });
     const elsewhere: string[] = [];
@@ -51,7 +51,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     return pose;
   }
 
-  /** Resolves when the camera is farther than `distance` from a position. */
+  /** Resolve when the camera is farther than `distance` from a position. */
   async function movedFrom(page: Page, from: Vec3, distance: number): Promise<void> {
     await page.waitForFunction(
       ([x, y, z, least]) => {
@@ -62,7 +62,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     );
   }
 
-  test("names are text, and nothing is fetched from elsewhere", async () => {
+  test("names are shown as text and nothing is fetched from other servers", async () => {
     const { page, elsewhere } = await opened();
     expect(await page.title()).toBe("small · a2tg view");
     expect(await page.textContent("#note")).toBe("a note");
@@ -73,7 +73,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("scripts that someone puts in do not run", async () => {
+  test("injected scripts do not run", async () => {
     const { page } = await opened();
     const isRun = await page.evaluate(async () => {
       const script = document.createElement("script");
@@ -86,7 +86,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("keys choose modes and cameras, and fly", async () => {
+  test("keys select modes and cameras, and fly", async () => {
     const { page } = await opened();
     await page.focus("#view");
     await page.keyboard.press("5");
@@ -103,7 +103,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("dragging turns around the target, the wheel comes nearer to it", async () => {
+  test("dragging orbits the target and the wheel zooms", async () => {
     const { page } = await opened();
     const before = await poseOn(page);
     await page.mouse.move(200, 200);
@@ -119,7 +119,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("the address carries the view", async () => {
+  test("the address preserves the view", async () => {
     const { page } = await opened();
     await page.mouse.move(200, 200);
     await page.mouse.down();
@@ -136,7 +136,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await other.page.close();
   });
 
-  test("photographs lie behind a slider, where there are some", async () => {
+  test("a slider shows the camera's photograph", async () => {
     const { page } = await opened();
     await page.waitForSelector("#wipe");
     await page.fill("#wipe", "0.5");
@@ -158,7 +158,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("views that were kept are saved as a path", async () => {
+  test("kept views are saved as a path", async () => {
     const { page } = await opened();
     expect(await page.isDisabled("#save")).toBe(true);
     await page.click("#keep");
@@ -219,7 +219,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("a phone's screen holds all of it", async () => {
+  test("the panel fits on a phone's screen", async () => {
     const { page } = await opened("", { width: 390, height: 844 });
     expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBe(390);
     const closed = await page.locator("#panel").boundingBox();
@@ -263,7 +263,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     return found;
   }
 
-  test("a damaged scene is said to be", async () => {
+  test("damaged scenes give clear errors", async () => {
     expect(await message({ "/scene.a2tgw": SCENE.subarray(0, SCENE.length - 100) })).toContain("cut off");
     expect(
       await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) }),
@@ -272,7 +272,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     expect(await message({})).toContain("no scene.a2tgw");
   });
 
-  test("a browser without WebGL 2 is said to lack it", async () => {
+  test("a browser without WebGL 2 gives a clear error", async () => {
     const found = await message({ "/scene.a2tgw": SCENE }, (page) =>
       page.addInitScript(() => {
         HTMLCanvasElement.prototype.getContext = () => null;
@@ -281,7 +281,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     expect(found).toContain("no WebGL 2");
   });
 
-  test("a single file opens from the disk, and the page alone says that it cannot", async () => {
+  test("a single file opens from disk and the bare page explains why it cannot", async () => {
     const folder = mkdtempSync(join(tmpdir(), "a2tg-"));
     const data = `<script type="text/plain" id="scene-data">${Buffer.from(SCENE).toString("base64")}</script>`;
     const path = join(folder, "one.html");

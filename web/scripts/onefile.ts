@@ -1,4 +1,4 @@
-/** Makes one page of what Vite builds: script and style inside, and a policy that allows nothing else. */
+/** Vite plugin that inlines script and style into one page, with a content security policy that allows no other. */
 
 import { createHash } from "node:crypto";
 import type { Plugin } from "vite";
@@ -21,7 +21,8 @@ function policy(script: string, style: string): string {
 /** Return the only element. Throws an Error if there are none or several. */
 function only<T>(found: readonly T[], what: string): T {
   const [first] = found;
-  if (first === undefined || found.length > 1) throw new Error(`The build has ${found.length} of one ${what}.`);
+  if (first === undefined || found.length > 1)
+    throw new Error(`Expected one ${what} in the build, found ${found.length}.`);
   return first;
 }
 

@@ -1,9 +1,9 @@
-/** Where the viewer looks from, and what leads from the world to pixels. */
+/** The camera: pose, lens, projection from the world to pixels, and motions. */
 
 import { add, cross, dot, lookingAlong, normalize, orthonormal, scale, subtract, turned } from "./math";
 import type { Mat3, Row4, Vec2, Vec3 } from "./math";
 
-/** Pinhole intrinsics in pixels of an image of width × height; pixel centres lie at +0.5. */
+/** Pinhole intrinsics in pixels for an image of width × height. Pixel centres lie at +0.5. */
 export interface Lens {
   readonly fx: number;
   readonly fy: number;
@@ -21,18 +21,18 @@ export type Viewmat = readonly [...Row4, ...Row4, ...Row4, ...Row4];
 
 export interface Pose {
   readonly position: Vec3;
-  /** Rows: right, down, forward, in the world. */
+  /** Camera axes in the world, one a row: right, down, forward. */
   readonly rotation: Mat3;
-  /** Distance to the point that one turns around. */
+  /** Distance to the target, the centre of orbits. */
   readonly focus: number;
 }
 
-/** Rows of K·[R | t]: from a position in the world to homogeneous pixels; the last one gives the depth. */
+/** Rows of K·[R | t], which maps world positions to homogeneous pixels. The last row gives the depth. */
 export type Projection = readonly [Row4, Row4, Row4];
 
 export const target = (pose: Pose): Vec3 => add(pose.position, scale(pose.rotation[2], pose.focus));
 
-/** The lens for a canvas: the lens' whole image is seen, as large as it fits, in the middle. */
+/** Scale and centre the lens so that its whole image just fits a canvas. */
 export function fitted(lens: Lens, width: number, height: number): Lens {
   const s = Math.min(width / lens.width, height / lens.height);
   return {
@@ -56,7 +56,7 @@ export function projection(pose: Pose, lens: Lens): Projection {
   return [combined(lens.fx, lens.skew, lens.cx), combined(0, lens.fy, lens.cy), z];
 }
 
-/** The lens of an image of `size` = [width, height]. */
+/** Build a lens from intrinsics and `size` = [width, height]. */
 export function lensOf(K: Intrinsics, size: Vec2): Lens {
   const [fx, skew, cx, , fy, cy] = K;
   return { fx, fy, cx, cy, skew, width: size[0], height: size[1] };
@@ -66,7 +66,7 @@ export function intrinsicsOf({ fx, fy, cx, cy, skew }: Lens): Intrinsics {
   return [fx, skew, cx, 0, fy, cy, 0, 0, 1];
 }
 
-/** The pose of a world-to-camera matrix. */
+/** Convert a world-to-camera matrix to a pose. */
 export function poseOf(viewmat: Viewmat, focus: number): Pose {
   const [xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz] = viewmat;
   const position: Vec3 = [
@@ -85,19 +85,19 @@ export function poseOf(viewmat: Viewmat, focus: number): Pose {
   };
 }
 
-/** The world-to-camera matrix of a pose. */
+/** Convert a pose to its world-to-camera matrix. */
 export function viewmatOf({ position, rotation: [x, y, z] }: Pose): Viewmat {
   return [...x, -dot(x, position), ...y, -dot(y, position), ...z, -dot(z, position), 0, 0, 0, 1];
 }
 
-/** Turned around the target: by `yaw` about `up`, then by `pitch` about the camera's right; never over the top. */
+/** Orbit the target: `yaw` about `up`, then `pitch` about the camera's right axis. Stops short of the poles. */
 export function orbited(pose: Pose, up: Vec3, yaw: number, pitch: number): Pose {
   const centre = target(pose);
   const rotation = looked(pose.rotation, up, yaw, pitch);
   return { ...pose, rotation, position: subtract(centre, scale(rotation[2], pose.focus)) };
 }
 
-/** Turned on the spot. */
+/** Turn the camera in place. */
 export function panned(pose: Pose, up: Vec3, yaw: number, pitch: number): Pose {
   return { ...pose, rotation: looked(pose.rotation, up, yaw, pitch) };
 }
@@ -115,26 +115,26 @@ function looked(rotation: Mat3, up: Vec3, yaw: number, pitch: number): Mat3 {
   return orthonormal(isOver ? level : pitched);
 }
 
-/** Moved along the camera's own axes, right, down and forward, in units of the world. */
+/** Move the camera along its own axes (right, down, forward) in world units. */
 export function moved(pose: Pose, by: Vec3): Pose {
   const [x, y, z] = pose.rotation;
   return { ...pose, position: add(pose.position, add(add(scale(x, by[0]), scale(y, by[1])), scale(z, by[2]))) };
 }
 
-/** Nearer to the target by a factor. */
+/** Multiply the distance to the target by `factor`, but keep it at or above `least`. */
 export function dollied(pose: Pose, factor: number, least: number): Pose {
   const focus = Math.max(pose.focus * factor, least);
   return { ...pose, focus, position: subtract(target(pose), scale(pose.rotation[2], focus)) };
 }
 
-/** The same direction, levelled, around another target. */
+/** Move the camera so that `at` becomes the target. The rotation and the depth of `at` stay the same. */
 export function aimed(pose: Pose, at: Vec3): Pose {
   const offset = subtract(at, pose.position);
   const focus = Math.max(dot(offset, pose.rotation[2]), 1e-6);
   return { ...pose, focus, position: subtract(at, scale(pose.rotation[2], focus)) };
 }
 
-/** A first view of points around a centre. */
+/** Return an initial view of a scene with this centre and radius. */
 export function overview(centre: Vec3, radius: number, up: Vec3): Pose {
   const side = Math.abs(up[0]) < 0.9 ? cross(up, [1, 0, 0]) : cross(up, [0, 1, 0]);
   const forward = normalize(subtract(scale(normalize(side), 1), scale(up, 0.35)));

@@ -1,17 +1,17 @@
-/** Mouse, touch and keys, as motions of a pose. */
+/** Camera control by mouse, touch and keyboard. */
 
 import type { Lens, Pose } from "./camera";
 import { dollied, moved, orbited, panned } from "./camera";
 import { scale } from "./math";
 import type { Vec2, Vec3 } from "./math";
 
-/** What motions need to know, and change. */
+/** State that the controls read and change. */
 export interface Steered {
   pose: Pose;
   readonly up: Vec3;
-  /** Of the scene: how fast one flies, and how near one comes. */
+  /** Size of the scene, which sets the flying speed and the smallest distance to the target. */
   readonly extent: number;
-  /** For the canvas, in its pixels as the page counts them. */
+  /** Lens for the canvas, in CSS pixels. */
   readonly lens: Lens;
   onMove(): void;
   onAim(x: number, y: number): void;
@@ -137,7 +137,7 @@ export class Controls {
     this.change(dollied(this.steered.pose, factor, 1e-3 * this.steered.extent));
   }
 
-  /** The target goes along with the pointer. */
+  /** Move the camera so that the target follows the pointer. */
   private shift(dx: number, dy: number): void {
     const { pose, lens } = this.steered;
     this.change(moved(pose, [(-dx * pose.focus) / lens.fx, (-dy * pose.focus) / lens.fy, 0]));

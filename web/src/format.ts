@@ -1,4 +1,4 @@
-/** The frame and the header of *.a2tgw (docs/formats.md): nothing is believed that was not checked. */
+/** Head and header of *.a2tgw files (docs/formats.md). Every value is checked before use. */
 
 import type { Intrinsics, Viewmat } from "./camera";
 import { crc32 } from "./crc32";
@@ -13,7 +13,7 @@ const LARGEST_HEADER = 1 << 24;
 const LARGEST_RATIO = 64;
 const FREE_ROOM = 1 << 20;
 
-/** What is wrong with a file, in words for its reader. */
+/** An error whose message is shown to the user as it is. */
 export class SceneError extends Error {
   override name = "SceneError";
 }
@@ -32,15 +32,16 @@ export interface SceneCamera {
   readonly K: Intrinsics;
 }
 
+/** Affine map from codes to values: low + step · code. */
 export interface Ends {
   readonly low: number;
   readonly step: number;
 }
 
-/** What is stored in bytes, by its name in the header. */
+/** Quantized values, as the header names them. */
 export type Quantity = "log_scales" | "quats" | "opacities" | "sh_0" | "sh_1" | "sh_2" | "sh_3" | "colors" | "alphas";
 
-/** Centre, spread, and the first and last step of an axis of the means. */
+/** Quantization of one axis of the means: centre, spread, first and last step. */
 export type Axis = readonly [number, number, number, number];
 
 export interface Header {
@@ -50,7 +51,7 @@ export interface Header {
   readonly chunk: number;
   readonly baseDegree: number;
   readonly numBands: number;
-  /** null: splats have no textures. */
+  /** Total number of texels; null without textures. */
   readonly numTexels: number | null;
   readonly bytes: number;
   readonly nearPlane: number;
@@ -63,29 +64,29 @@ export interface Header {
   readonly cameras: readonly SceneCamera[];
 }
 
-/** What the first 22 bytes say. */
+/** Read the first 22 bytes. Throws a SceneError unless they start a scene file of this version. */
 export function parseHead(bytes: Uint8Array): Head {
   if (bytes.length < HEAD_BYTES || MAGIC.some((byte, i) => bytes[i] !== byte)) {
-    throw new SceneError("This is not a scene of a2tg view (*.a2tgw).");
+    throw new SceneError("This is not a scene file of a2tg view (*.a2tgw).");
   }
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const version = view.getUint16(8, true);
   if (version !== VERSION) {
-    throw new SceneError(`The scene is of version ${version}; this viewer reads version ${VERSION}.`);
+    throw new SceneError(`The scene file has version ${version}; this viewer reads version ${VERSION}.`);
   }
   const head = {
     headerBytes: view.getUint32(10, true),
     bodyBytes: view.getUint32(14, true),
     checksum: view.getUint32(18, true),
   };
-  if (head.headerBytes > LARGEST_HEADER) throw damaged(`a header of ${head.headerBytes} bytes`);
+  if (head.headerBytes > LARGEST_HEADER) throw damaged(`its header claims ${head.headerBytes} bytes`);
   return head;
 }
 
-/** The header's text, of which every number is looked at. */
+/** Read and check the header. Throws a SceneError if a field is missing or out of range. */
 export function parseHeader(text: Uint8Array, head: Head): Header {
-  if (crc32(text) !== head.checksum) throw damaged("the checksum of the header differs");
-  const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "header");
+  if (crc32(text) !== head.checksum) throw damaged("the checksum of its header does not match");
+  const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "the header");
   const header: Header = {
     title: raw.text("title"),
     note: raw.text("note"),
@@ -104,12 +105,13 @@ export function parseHeader(text: Uint8Array, head: Head): Header {
     background: vector<Vec3>(raw.list("background"), 3, "background"),
     cameras: raw.isNull("cameras") ? [] : raw.list("cameras").map(cameraOf),
   };
-  if (header.bytes < 16 * header.num + 4 * (header.numTexels ?? 0)) throw damaged("it announces more rows than bytes");
-  if (header.baseDegree >= header.numBands) throw damaged("its degrees contradict each other");
+  if (header.bytes < 16 * header.num + 4 * (header.numTexels ?? 0))
+    throw damaged("its header claims more rows than bytes");
+  if (header.baseDegree >= header.numBands) throw damaged("base_degree is not below num_bands");
   return header;
 }
 
-/** Columns of bytes per row that come first in each chunk: 6 of means, 9 of numbers, degree, and sizes. */
+/** Return the bytes per row in the first part of a chunk: 6 of means, 9 of numbers, degree, texture sizes. */
 export const fixedColumns = (header: Header): number => (header.numTexels === null ? 16 : 18);
 
 function meansOf(axes: readonly unknown[]): Header["means"] {
@@ -145,25 +147,25 @@ function cameraOf(value: unknown, index: number): SceneCamera {
     K: vector<Intrinsics>(raw.list("K"), 9, "K"),
   };
   if (!(camera.size[0] >= 1 && camera.size[1] >= 1 && camera.K[0] > 0 && camera.K[4] > 0)) {
-    throw damaged(`camera ${index} has no size`);
+    throw damaged(`the size or focal length of camera ${index} is out of range`);
   }
   return camera;
 }
 
 function vector<T extends readonly number[]>(values: unknown, length: T["length"], name: string): T {
-  if (!isVector<T>(values, length)) throw damaged(`${name} must be ${length} numbers`);
+  if (!isVector<T>(values, length)) throw damaged(`${name} must be ${length} finite numbers`);
   return values;
 }
 
 const damaged = (what: string): SceneError => new SceneError(`The scene is damaged: ${what}.`);
 
-/** JSON of which nothing is known. */
+/** An untrusted JSON object whose fields are checked as they are read. */
 class Fields {
   private readonly values: Readonly<Record<string, unknown>>;
   private readonly where: string;
 
   constructor(value: unknown, where: string) {
-    if (typeof value !== "object" || value === null || Array.isArray(value)) throw damaged(`${where} is no object`);
+    if (typeof value !== "object" || value === null || Array.isArray(value)) throw damaged(`${where} is not an object`);
     this.values = value as Readonly<Record<string, unknown>>;
     this.where = where;
   }
@@ -216,6 +218,6 @@ class Fields {
   }
 
   private wrong(name: string): never {
-    throw damaged(`${name} in its ${this.where} is missing or impossible`);
+    throw damaged(`${name} in ${this.where} is missing or out of range`);
   }
 }

@@ -1,4 +1,4 @@
-/** A view as the end of an address, and back. */
+/** Conversion between views and URL fragments. */
 
 import type { Lens, Pose } from "./camera";
 import { isVector, orthonormal } from "./math";
@@ -15,7 +15,7 @@ export interface View {
 /** Position, right, forward; focus; fx, fy, cx, cy, skew, width, height. */
 type ViewNumbers = readonly [...Vec3, ...Vec3, ...Vec3, number, ...Vec3, ...Vec3, number];
 
-/** Such as #view=…&mode=depth: position, right, forward, focus, and the lens. */
+/** Return the fragment of a view, such as #view=…&mode=depth. */
 export function linkOf({ pose, lens, mode }: View): string {
   const numbers: ViewNumbers = [
     ...pose.position,
@@ -34,7 +34,7 @@ export function linkOf({ pose, lens, mode }: View): string {
   return mode === "full" ? `#view=${view}` : `#view=${view}&mode=${mode}`;
 }
 
-/** null where it says no view. */
+/** Parse a fragment. Returns null if it holds no valid view. */
 export function viewOf(hash: string): View | null {
   const fields = new URLSearchParams(hash.replace(/^#/, ""));
   const numbers: readonly number[] = (fields.get("view") ?? "").split(",").map(Number);

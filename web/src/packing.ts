@@ -1,10 +1,11 @@
 /**
- * Rows of a chunk as the shader reads them. Of each row 32 bytes, two texels of four 32-bit words:
+ * Repacking of chunks for the shader. Each row takes 32 bytes, two texels of four 32-bit words:
  *
  *     x, y, z as floats | degree 0: red, green, blue; degree
  *     quaternion x, y, z; opacity | log-scale u, v; Tu, Tv | first texel of its texture | first word of its harmonics
  *
- * One word (red, green, blue, nothing) per coefficient above degree 0, in fours, and four bytes per texel.
+ * Each coefficient above degree 0 takes one word (red, green, blue, unused), padded to groups of four. Each texel takes
+ * four bytes.
  */
 
 import { at } from "./arrays";
@@ -13,23 +14,23 @@ import { fixedColumns } from "./format";
 import type { Axis, Header } from "./format";
 
 export const ROW_WORDS = 8;
-/** Groups of four words that the coefficients above degree 0 take, by degree. */
+/** Number of groups of four words for the coefficients above degree 0, by degree. */
 export const HARMONIC_TEXELS = [0, 1, 2, 4] as const;
 const COEFFICIENTS = [0, 3, 8, 15] as const;
 
 export interface Packed {
   readonly num: number;
-  /** [n, 3] */
+  /** [n, 3] positions. */
   readonly means: Float32Array<ArrayBuffer>;
-  /** [n, 8] */
+  /** [n, 8] words of rows. */
   readonly rows: Uint32Array;
-  /** [h, 4] */
+  /** [h, 4] words of harmonics. */
   readonly harmonics: Uint32Array;
-  /** [t, 4] */
+  /** [t, 4] red, green, blue, alpha. */
   readonly texels: Uint8Array;
 }
 
-/** Makes what the shader reads of chunks, one after the other. */
+/** Packs successive chunks, counting texels and harmonics across them. */
 export class Packer {
   private readonly header: Header;
   private numTexels = 0;
@@ -72,14 +73,14 @@ export class Packer {
   }
 }
 
-/** At most so many groups of four words of harmonics are in a file of these bytes. */
+/** Return an upper bound on the groups of four harmonics words in a file. */
 export function mostHarmonics(header: Header): number {
   const most = at(HARMONIC_TEXELS, header.numBands - 1);
   const fixed = fixedColumns(header) * header.num + 4 * (header.numTexels ?? 0);
   return Math.min(most * header.num, Math.ceil(Math.max(header.bytes - fixed, 0) / 9));
 }
 
-/** Four bytes as one word, the first lowest, each modulo 256. */
+/** Pack four numbers modulo 256 into a word, the first one lowest. */
 function word(a: number, b: number, c: number, d: number): number {
   return ((a & 255) | ((b & 255) << 8) | ((c & 255) << 16) | ((d & 255) << 24)) >>> 0;
 }
@@ -97,7 +98,7 @@ function positions(chunk: Chunk, axes: readonly Axis[]): Float32Array<ArrayBuffe
   return found;
 }
 
-/** Coefficients by row, where the file has them by band, colour and coefficient. */
+/** Reorder coefficients by row. The file orders them by band, colour and coefficient. */
 function harmonicsOf(chunk: Chunk, numGroups: number): Uint32Array {
   const words = new Uint32Array(4 * numGroups);
   const places = new Uint32Array(chunk.num);

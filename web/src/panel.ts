@@ -1,4 +1,4 @@
-/** The panel beside the picture: what is shown, the cameras with their photographs, the link, the path. */
+/** The side panel: display mode, cameras and their photographs, link, path. */
 
 import { intrinsicsOf, viewmatOf } from "./camera";
 import type { Intrinsics, Viewmat } from "./camera";
@@ -11,14 +11,14 @@ import type { Mode } from "./shaders";
 import type { Viewer } from "./viewer";
 
 const LEGENDS: Partial<Record<Mode, string>> = {
-  texture: "What textures add to the colour; grey is nothing.",
-  resolution: "Square textures are blue, others red; the more texels, the deeper. Dark: one texel.",
-  depth: "Bright is near.",
-  normals: "Red, green and blue are x, y and z of the normal.",
-  ellipses: "Each Gaussian out to 1.4 standard deviations.",
+  texture: "Colour added by textures. Grey means none.",
+  resolution: "Square textures are blue, others red. More texels give a deeper colour. Dark means one texel or none.",
+  depth: "Bright is near, dark is far.",
+  normals: "Red, green and blue show x, y and z of the normal.",
+  ellipses: "Each Gaussian is drawn out to 1.4 standard deviations.",
 };
 
-/** A view of a path, as a2tg render --path reads it. */
+/** View in a path file, in the format of a2tg render --path. */
 interface KeptView {
   readonly viewmat: Viewmat;
   readonly K: Intrinsics;
@@ -64,7 +64,7 @@ export class Panel {
     if (matchMedia("(max-width: 600px)").matches) element("panel", HTMLDetailsElement).open = false;
   }
 
-  /** A scene has begun. */
+  /** Show the title, cameras and modes of a new scene. */
   begin(header: Header): void {
     this.header = header;
     const title = header.title === "" ? "a2tg view" : header.title;
@@ -83,12 +83,12 @@ export class Panel {
     }
   }
 
-  /** The scene stands: goes where the address says, or to its first camera. */
+  /** Go to the view in the address, or to the first camera. */
   ready(): void {
     if (!this.followLink()) this.restart();
   }
 
-  /** The cameras of which there is a photograph beside the page. */
+  /** Set which cameras have a photograph beside the page. */
   setPhotographs(indices: readonly number[]): void {
     this.photographs = new Set(indices);
     this.showPhotograph();
@@ -158,7 +158,7 @@ export class Panel {
     }
   }
 
-  /** Where the camera's image lies on the canvas, wiped to the slider's share. */
+  /** Align the photograph with the camera's image and clip it at the slider's share of the width. */
   private placePhotograph(): void {
     const { image, lens } = this.viewer;
     const s = lens.fx / image.fx;
@@ -175,7 +175,7 @@ export class Panel {
   private noteLink(): void {
     clearTimeout(this.linkTimer);
     this.linkTimer = window.setTimeout(() => {
-      // The address of a page that opens from the disk may not be changed everywhere.
+      // Some browsers forbid changing the address of a page opened from disk.
       try {
         history.replaceState(null, "", this.link);
       } catch {
@@ -197,7 +197,7 @@ export class Panel {
       button.textContent = "Copied";
     } catch {
       location.hash = this.link;
-      button.textContent = "In the address";
+      button.textContent = "See address bar";
     }
     window.setTimeout(() => {
       button.textContent = "Copy link";

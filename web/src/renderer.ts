@@ -1,4 +1,4 @@
-/** Draws splats: sorted back to front into a picture of half floats, then that onto the canvas. */
+/** Draws sorted splats back to front into an offscreen picture, then copies it to the canvas. */
 
 import type { Lens, Pose } from "./camera";
 import { projection } from "./camera";
@@ -9,7 +9,7 @@ import { MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } f
 import type { Mode } from "./shaders";
 import type { Splats } from "./splats";
 
-/** What is drawn of the picture's columns. */
+/** Range of columns that is drawn in one mode. */
 interface Part {
   readonly mode: Mode;
   readonly from: number;
@@ -24,7 +24,7 @@ export class Renderer {
   private readonly vertices: WebGLVertexArrayObject;
   private readonly nothing: WebGLVertexArrayObject;
 
-  /** Throws where shaders are refused. */
+  /** Throws an Error if the driver rejects a shader. */
   constructor(gl: WebGL2RenderingContext) {
     this.gl = gl;
     this.target = new Target(gl);
@@ -34,7 +34,7 @@ export class Renderer {
     this.nothing = gl.createVertexArray();
   }
 
-  /** The picture of a pose, of the lens' size; `divided`: left of that share of the width with textures, right without. */
+  /** Draw a pose at the lens' size. Right of the share `divided` of the width, textures are left out. */
   draw(splats: Splats, pose: Pose, lens: Lens, mode: Mode, divided: number | null = null): void {
     const { gl, target } = this;
     target.resize(lens.width, lens.height);
@@ -53,7 +53,7 @@ export class Renderer {
     gl.disable(gl.BLEND);
   }
 
-  /** The picture on the canvas. */
+  /** Copy the picture to the canvas. */
   present(splats: Splats, mode: Mode, depths: Vec2, divided: number | null = null): void {
     const { gl, screen } = this;
     const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];

@@ -1,20 +1,20 @@
-/** The order in which splats are drawn: by the depth of their means, as the trainer's renderer has it. */
+/** Depth order of splats: by the depth of their means, with the renderer's rule for ties. */
 
 import type { Row4 } from "./math";
 
 const BUCKETS = 1 << 16;
 
-/** Sorts any number of positions; room is kept between calls. */
+/** Sorts positions by depth. Buffers are reused between calls. */
 export class DepthSorter {
   private keys = new Uint32Array(0);
   private order = new Uint32Array(0);
   private readonly counts = new Uint32Array(BUCKETS);
 
   /**
-   * Indices of the first `num` of the positions [x, y, z, …] from the farthest to the nearest; of equally deep ones the
-   * last comes first.
+   * Return the indices of the first `num` positions [x, y, z, …] from the farthest to the nearest. Among equal depths
+   * the highest index comes first.
    *
-   * @param row depth = row · (x, y, z, 1)
+   * @param row - gives the depth row · (x, y, z, 1)
    */
   sort(means: Float32Array, num: number, row: Row4): Uint32Array<ArrayBuffer> {
     if (this.keys.length < num) {
@@ -23,13 +23,13 @@ export class DepthSorter {
     }
     this.findKeys(means, num, row);
     const found = new Uint32Array(num);
-    // Two passes of a stable counting sort; both go backwards through a descending order.
+    // A radix sort: two passes of a stable counting sort, both in descending order.
     this.pass(num, 0, null, this.order);
     this.pass(num, 16, this.order, found);
     return found;
   }
 
-  /** Unsigned integers in the order of the depths. */
+  /** Map depths to unsigned integers of the same order. */
   private findKeys(means: Float32Array, num: number, [a, b, c, d]: Row4): void {
     const depths = new Float32Array(this.keys.buffer);
     for (let i = 0; i < num; i++) {
@@ -39,7 +39,7 @@ export class DepthSorter {
     }
   }
 
-  /** Descending by 16 bits; without a `from`, indices come from the last to the first. */
+  /** Sort by 16 bits, descending and stable. If `from` is null, the indices start in reverse order. */
   private pass(num: number, shift: number, from: Uint32Array | null, to: Uint32Array): void {
     const { counts, keys } = this;
     counts.fill(0);

@@ -1,4 +1,4 @@
-/** A scene on the graphics processor, and the worker that sorts it. */
+/** A scene in GPU memory and the worker that sorts it. */
 
 import { at } from "./arrays";
 import type { Chunk } from "./chunks";
@@ -9,7 +9,7 @@ import { Packer, mostHarmonics } from "./packing";
 import SortWorker from "./sort.worker?worker&inline";
 import type { AddMessage, OrderMessage, SortMessage } from "./sort.worker";
 
-/** A chunk adds at most so many positions to a sample that has fewer. */
+/** Size at which the sample stops growing, and largest number of positions that one chunk adds to it. */
 const SAMPLE = 4096;
 
 export class Splats {
@@ -19,17 +19,17 @@ export class Splats {
   readonly texels: LongTexture;
   readonly order: WebGLBuffer;
   readonly widthBits: number;
-  /** Rows that have come. */
+  /** Number of rows received. */
   num = 0;
-  /** Rows in the order that is drawn. */
+  /** Number of rows in the current order. */
   numDrawn = 0;
   numTexels = 0;
   numBytes = 0;
-  /** Positions of the first rows, which show most: to find a place to stand. */
+  /** Positions of the first rows, the most visible ones, from which the initial view is found. */
   readonly sample: Vec3[] = [];
-  /** Called when there is another order to draw. */
+  /** Handler for a new order. */
   onOrder: () => void = () => undefined;
-  /** Called when the worker cannot work. */
+  /** Handler for errors of the worker. */
   onFail: (reason: string) => void = () => undefined;
 
   private readonly gl: WebGL2RenderingContext;
@@ -67,14 +67,14 @@ export class Splats {
     this.worker.postMessage(message, [packed.means.buffer]);
   }
 
-  /** Asks for the order of these depths, row · (x, y, z, 1); the last one asked for wins. */
+  /** Request a sort by the depth row · (x, y, z, 1). A later request replaces a pending one. */
   sort(row: Row4): void {
     if (this.sorted !== null && this.sorted.num === this.num && row.every((x, i) => x === this.sorted?.row[i])) return;
     this.wanted = row;
     this.next();
   }
 
-  /** Resolves when the order asked for last is there. */
+  /** Resolve when the last request is done. */
   async settled(): Promise<void> {
     if (!this.isSorting && this.wanted === null) return;
     await new Promise<void>((resolve) => this.waiting.push(resolve));
@@ -108,7 +108,7 @@ export class Splats {
   }
 }
 
-/** Positions from [x, y, z, …]. */
+/** Split [x, y, z, …] into positions. */
 function pointsOf(means: Float32Array): Vec3[] {
   return Array.from({ length: means.length / 3 }, (_, i) => [
     at(means, 3 * i),

@@ -28,13 +28,13 @@ test("the target lies in the middle, at the focus", () => {
   expectClose(pixel(POSE, LENS, target(POSE)), [LENS.cx, LENS.cy, POSE.focus]);
 });
 
-test("what is up in the world is up on the screen", () => {
+test("the world's up direction is up on the screen", () => {
   const above = pixel(POSE, LENS, [0.3, -0.2, 0.6]);
   expect(above[1]).toBeLessThan(LENS.cy);
   expectRotation(POSE);
 });
 
-test("a world-to-camera matrix and back", () => {
+test("a pose survives conversion to a matrix and back", () => {
   const viewmat = viewmatOf(POSE);
   const again = poseOf(viewmat, POSE.focus);
   expectClose(again.position, POSE.position);
@@ -52,12 +52,12 @@ test("orbits keep the target and its distance", () => {
   }
 });
 
-test("dollies keep the target, to a least distance", () => {
+test("dollies keep the target and a minimum distance", () => {
   expectClose(target(dollied(POSE, 0.5, 0.01)), target(POSE));
   expect(dollied(POSE, 1e-9, 0.25).focus).toBe(0.25);
 });
 
-test("moves go along the camera's own axes", () => {
+test("moves follow the camera's own axes", () => {
   const by = subtract(moved(POSE, [0, 0, 2]).position, POSE.position);
   expect(dot(by, POSE.rotation[2])).toBeCloseTo(2, 9);
 });
@@ -79,7 +79,7 @@ test.each([
   expect(lens.fy / lens.fx).toBeCloseTo(LENS.fy / LENS.fx, 9);
 });
 
-test("links carry a view", () => {
+test("links preserve a view", () => {
   const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth" }));
   expect(view?.mode).toBe("depth");
   expectClose(view?.pose.position ?? [], POSE.position, 5);
@@ -95,11 +95,11 @@ test.each([
   `#view=${Array(17).fill("-1").join()}`,
   "#view=<b>",
   `#view=${Array(17).fill("1e99").join()}`,
-])("other links carry none: %s", (hash) => {
+])("other links hold no view: %s", (hash) => {
   expect(viewOf(hash)).toBeNull();
 });
 
-test("rows that are no rotation are made one", () => {
+test("degenerate rows become a rotation", () => {
   const [x, y, z] = orthonormal([
     [0, 0, 0],
     [0, 0, 0],

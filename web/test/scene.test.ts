@@ -26,7 +26,7 @@ async function read(bytes: Uint8Array<ArrayBuffer>): Promise<{ header: Header; c
   return { header: at(headers, 0), chunks };
 }
 
-/** The small scene with another header. */
+/** Return the small scene with fields of its header replaced and `cut` bytes of its body removed. */
 function changed(changes: Record<string, unknown>, cut = 0): Uint8Array<ArrayBuffer> {
   const head = parseHead(SMALL);
   const text = new TextDecoder().decode(SMALL.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes));
@@ -46,11 +46,11 @@ function changed(changes: Record<string, unknown>, cut = 0): Uint8Array<ArrayBuf
 const SH = ["sh_0", "sh_1", "sh_2", "sh_3"] as const;
 const byteOf = (words: Uint32Array, place: number, index: number): number => (at(words, place) >>> (8 * index)) & 255;
 
-test("crc32 is zlib's", () => {
+test("crc32 equals zlib's", () => {
   expect(crc32(new TextEncoder().encode("123456789"))).toBe(0xcbf43926);
 });
 
-test("the header says what the file holds", async () => {
+test("the header describes the file", async () => {
   const { header, chunks } = await read(SMALL);
   expect(header.num).toBe(NUM);
   expect([header.title, header.note, header.cameras[0]?.name]).toEqual(["small", "a note", "<b>a</b>.png"]);
@@ -59,7 +59,7 @@ test("the header says what the file holds", async () => {
   expect(chunks.reduce((sum, chunk) => sum + chunk.num, 0)).toBe(NUM);
 });
 
-test("rows are packed as another reader finds them", async () => {
+test("packed rows equal those of the Python reader", async () => {
   const { header, chunks } = await read(SMALL);
   const packer = new Packer(header);
   const near = (found: number, wanted: number): void =>
@@ -108,7 +108,7 @@ test("rows are packed as another reader finds them", async () => {
   expect(harmonic).toBeLessThanOrEqual(mostHarmonics(header));
 });
 
-test.each([1, 7, 1000, 1e6])("bytes may come in pieces of %i", async (size) => {
+test.each([1, 7, 1000, 1e6])("bytes may arrive in pieces of %i", async (size) => {
   const { header, chunks } = await read(SMALL);
   const head = parseHead(SMALL);
   const coded = new Blob([SMALL.subarray(HEAD_BYTES + head.headerBytes)]).stream();
@@ -122,14 +122,14 @@ test.each([1, 7, 1000, 1e6])("bytes may come in pieces of %i", async (size) => {
   expect(() => reader.push(new Uint8Array(1))).toThrow(SceneError);
 });
 
-test("files that are cut off are refused", async () => {
+test("truncated files are rejected", async () => {
   for (const length of [0, 5, HEAD_BYTES, HEAD_BYTES + 30, SMALL.length >> 1, SMALL.length - 1]) {
     await expect(read(SMALL.slice(0, length))).rejects.toThrow(SceneError);
   }
   await expect(read(changed({}, 40))).rejects.toThrow(/damaged|cut off/);
 });
 
-test("every changed byte is noticed", async () => {
+test("every changed byte is detected", async () => {
   for (let place = 0; place < SMALL.length; place += 97) {
     const spoiled = SMALL.slice();
     spoiled[place] = at(spoiled, place) ^ 0x55;
@@ -169,11 +169,11 @@ test.each([
   { background: "red" },
   { title: 3 },
   { note: null },
-])("a header that lies is refused: %o", async (changes) => {
+])("invalid headers are rejected: %o", async (changes) => {
   await expect(read(changed(changes))).rejects.toThrow(SceneError);
 });
 
-test("rows that contradict the header are refused", async () => {
+test("rows that contradict the header are rejected", async () => {
   expect((await read(changed({}))).header.num).toBe(NUM);
   for (const changes of [
     { num: NUM - 1 },
@@ -186,7 +186,7 @@ test("rows that contradict the header are refused", async () => {
   }
 });
 
-test("room is made for what is announced only where it can be there", () => {
+test("memory is allocated only for data that the file can hold", () => {
   const head = parseHead(SMALL);
   const header = parseHeader(SMALL.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes), head);
   expect(fixedColumns(header)).toBe(18);

@@ -23,7 +23,7 @@ test.each([0, 1, 2, 257, 5000])("%i positions, from the farthest to the nearest,
   expect([...new DepthSorter().sort(means, num, row)]).toEqual(wanted);
 });
 
-test("fewer and more positions than before", () => {
+test("buffers are reused for fewer and for more positions", () => {
   const sorter = new DepthSorter();
   const means = drawn(300, 3);
   const first = sorter.sort(means, 300, [0, 0, 1, 0]);

@@ -2,7 +2,7 @@ import { expect, test } from "vitest";
 
 import { statusOf, statusText } from "../src/training";
 
-test("figures of a training", () => {
+test("status of a running training", () => {
   const status = statusOf({
     version: 3,
     stage: "textures",
@@ -20,15 +20,15 @@ test("figures of a training", () => {
   );
 });
 
-test("before the first figures, and in place of them", () => {
+test("status before the first figures, and a message in their place", () => {
   const [begins, staged, told] = [{}, { stage: "gaussians" }, { message: "cannot be shown" }].map((more) =>
     statusOf({ version: 0, ...more }),
   );
-  expect(begins && statusText(begins)).toBe("The training begins.");
-  expect(staged && statusText(staged)).toBe("gaussians begins.");
+  expect(begins && statusText(begins)).toBe("Training is starting.");
+  expect(staged && statusText(staged)).toBe("Stage gaussians is starting.");
   expect(told && statusText(told)).toBe("cannot be shown");
 });
 
-test.each([null, 3, "x", [], {}, { version: "1" }, { version: 0.5 }])("no status: %o", (value) => {
+test.each([null, 3, "x", [], {}, { version: "1" }, { version: 0.5 }])("values that are no status: %o", (value) => {
   expect(statusOf(value)).toBeNull();
 });
