@@ -12,7 +12,7 @@ export default defineConfig({
     outDir: "dist",
     reportCompressedSize: false,
   },
-  // No module: browsers start none of a blob on a page that comes from the disk.
+  // A classic script: on pages opened from disk, browsers do not start module workers from blobs.
   worker: { format: "iife" },
   plugins: [onefile()],
 });

@@ -1,4 +1,4 @@
-/** The machine's Chromium, and a server of a few files in memory. */
+/** Chromium and an in-memory web server for tests. */
 
 import { existsSync } from "node:fs";
 import { createServer } from "node:http";
@@ -10,13 +10,19 @@ import type { Browser } from "playwright-core";
 const PLACES = [process.env.CHROMIUM ?? "", "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
 export const CHROMIUM = PLACES.find((path) => path !== "" && existsSync(path));
 
-/** Headless, drawing WebGL 2 in software. */
+/** Launch Chromium headless, with WebGL 2 in software. */
 export function launch(): Promise<Browser> {
   return chromium.launch({
     executablePath: CHROMIUM,
     args: [
-      "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-      "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+      "--no-sandbox",
+      "--disable-quic",
+      "--no-first-run",
+      "--disable-background-networking",
+      "--disable-component-update",
+      "--disable-sync",
+      "--use-angle=swiftshader",
+      "--enable-unsafe-swiftshader",
     ],
   });
 }
@@ -26,19 +32,27 @@ export interface Served {
   close(): void;
 }
 
-/** Answers with files by path, such as "/scene.a2tgw", or with what a function makes each time. */
+/** Serve files by path, such as "/scene.a2tgw". A function is called for each request. */
 export function serve(files: Readonly<Record<string, Uint8Array | string | (() => string)>>): Promise<Served> {
   const server = createServer((request, response) => {
     const found = Object.entries(files).find(([path]) => path === request.url)?.[1];
     const body = typeof found === "function" ? found() : found;
     const isPage = request.url === "/";
-    response.writeHead(body === undefined ? 404 : 200, { "Content-Type": isPage ? "text/html" : "application/octet-stream" });
+    response.writeHead(body === undefined ? 404 : 200, {
+      "Content-Type": isPage ? "text/html" : "application/octet-stream",
+    });
     response.end(body);
   });
   return new Promise((resolve) => {
     server.listen(0, "127.0.0.1", () => {
       const { port } = server.address() as AddressInfo;
-      resolve({ address: `http://127.0.0.1:${port}/`, close: () => { server.close(); server.closeAllConnections(); } });
+      resolve({
+        address: `http://127.0.0.1:${port}/`,
+        close: () => {
+          server.close();
+          server.closeAllConnections();
+        },
+      });
     });
   });
 }

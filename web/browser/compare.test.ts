@@ -1,6 +1,7 @@
 /**
- * Pictures of the page beside those of the JAX renderer: A2TG_CASES is a folder with a folder for each scene, which
- * holds scene.a2tgw, views.json, and of each view i the colours as float32, i.f32 (tests/viewer_cases.py writes it).
+ * Comparison of the page with the JAX renderer. A2TG_CASES is a folder with one folder per scene. Each holds
+ * scene.a2tgw, views.json and, for view i, the renderer's colours as float32 in i.f32. tests/viewer_cases.py writes
+ * these files.
  */
 
 import { existsSync, readFileSync, readdirSync } from "node:fs";
@@ -9,59 +10,69 @@ import { join } from "node:path";
 import type { Browser } from "playwright-core";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
 
+import { at } from "../src/arrays";
+import type { Intrinsics, Viewmat } from "../src/camera";
+import type { Vec2, Vec3 } from "../src/math";
 import { CHROMIUM, launch, serve } from "./chromium";
 
 interface CaseView {
-  readonly viewmat: number[];
-  readonly K: number[];
-  readonly size: [number, number];
+  readonly viewmat: Viewmat;
+  readonly K: Intrinsics;
+  readonly size: Vec2;
   readonly mode: string;
-  /** Whose picture it is: the model's, which the file was made of, or that of what the file holds. */
+  /** Source of the renderer's picture: the original model, or the model decoded from the file. */
   readonly of: "the model" | "the file";
 }
 
 interface Case {
-  readonly background: [number, number, number];
+  readonly background: Vec3;
   readonly views: CaseView[];
 }
 
 const FOLDER = process.env.A2TG_CASES ?? "";
 const NAMES = FOLDER !== "" && existsSync(FOLDER) ? readdirSync(FOLDER) : [];
-/** Mean absolute differences in 1/255: of the model's picture, and of what the file holds, where nothing was rounded. */
+/** Largest mean absolute differences in 1/255. The model's limit includes the rounding of the file. */
 const LIMITS = { "the model": 1, "the file": 0.15 } as const;
-/** Of depths and normals, which half floats hold less finely than colours in [0, 1]. */
+/** Limit for depths and normals, for which half floats are coarser than for colours in [0, 1]. */
 const GEOMETRY_LIMIT = 0.5;
 const PAGE = new URL("../../a2tg_jax/web/viewer.html", import.meta.url);
 
-/** Colours over the background, as a screen shows them: [h, w, 3]. */
-function composited(found: Float32Array, background: readonly number[]): Float32Array {
+/** Composite colours over the background: [h, w, 3]. */
+function composited(found: Float32Array, background: Vec3): Float32Array {
   const num = found.length / 4;
   const colors = new Float32Array(3 * num);
   for (let i = 0; i < num; i++) {
-    for (let k = 0; k < 3; k++) colors[3 * i + k] = found[4 * i + k] + (1 - found[4 * i + 3]) * background[k];
+    const rest = 1 - at(found, 4 * i + 3);
+    for (const [k, behind] of background.entries()) colors[3 * i + k] = at(found, 4 * i + k) + rest * behind;
   }
   return colors;
 }
 
-/** Weighted sums as they are, without alpha: [h, w, 3]. */
+/** Drop alpha and keep the weighted sums: [h, w, 3]. */
 const withoutAlpha = (found: Float32Array): Float32Array => found.filter((_, i) => i % 4 !== 3);
 
 const clipped = (x: number): number => Math.min(Math.max(x, 0), 1);
 
 describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows what the JAX renderer shows", () => {
   let browser: Browser;
-  beforeAll(async () => { browser = await launch(); });
-  afterAll(async () => { await browser.close(); });
+  beforeAll(async () => {
+    browser = await launch();
+  });
+  afterAll(async () => {
+    await browser.close();
+  });
 
   test.each(NAMES)("%s", async (name) => {
     const folder = join(FOLDER, name);
     const { background, views } = JSON.parse(readFileSync(join(folder, "views.json"), "utf8")) as Case;
     const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgw": readFileSync(join(folder, "scene.a2tgw")) });
-    // The canvas itself is drawn besides, slowly in software: a small one.
+    // The canvas is drawn too, slowly in software, so keep it small.
     const page = await browser.newPage({ viewport: { width: 160, height: 120 } });
     const errors: string[] = [];
     page.on("pageerror", (error) => errors.push(error.message));
-    page.on("console", (message) => { if (message.type() === "error") errors.push(message.text()); });
+    page.on("console", (message) => {
+      if (message.type() === "error") errors.push(message.text());
+    });
     await page.goto(served.address);
     await page.evaluate(() => window.a2tg?.loaded);
     for (const [index, view] of views.entries()) {
@@ -80,14 +91,16 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
       expect(found.length).toBe(wanted.length);
       let [sum, largest, far] = [0, 0, 0];
       found.forEach((x, i) => {
-        const difference = isColor ? Math.abs(clipped(x) - clipped(wanted[i])) : Math.abs(x - wanted[i]);
+        const difference = isColor ? Math.abs(clipped(x) - clipped(at(wanted, i))) : Math.abs(x - at(wanted, i));
         sum += difference;
         largest = Math.max(largest, difference);
         if (difference > 8 / 255) far++;
       });
       const mean = (255 * sum) / found.length;
-      console.log(`${name}, ${view.of}, ${index} ${view.mode}: mean ${mean.toFixed(4)}/255, largest ${(255 * largest).toFixed(1)}/255, ` +
-        `${((100 * far) / found.length).toFixed(3)}% beyond 8/255`);
+      console.log(
+        `${name}, ${view.of}, ${index} ${view.mode}: mean ${mean.toFixed(4)}/255, largest ${(255 * largest).toFixed(1)}/255, ` +
+          `${((100 * far) / found.length).toFixed(3)}% beyond 8/255`,
+      );
       expect(mean).toBeLessThan(isColor ? LIMITS[view.of] : GEOMETRY_LIMIT);
     }
     expect(errors.filter((error) => !error.includes("404"))).toEqual([]);

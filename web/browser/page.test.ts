@@ -1,4 +1,4 @@
-/** The page in Chromium: what it says, how it is steered, what it refuses. */
+/** The page in Chromium: its texts, its controls and its error messages. */
 
 import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
@@ -8,6 +8,12 @@ import { pathToFileURL } from "node:url";
 import type { Browser, Page } from "playwright-core";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
 
+import { at } from "../src/arrays";
+import { target } from "../src/camera";
+import type { Pose } from "../src/camera";
+import { norm, subtract } from "../src/math";
+import type { Vec3 } from "../src/math";
+import { expectClose } from "../test/close";
 import { CHROMIUM, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
@@ -26,22 +32,37 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     served.close();
   });
 
-  /** A page that has loaded, of a size, at the end of an address; it counts what it asks of others. */
+  /** Open the page and wait for the scene. `elsewhere` collects requests to other servers. */
   async function opened(hash = "", size = { width: 640, height: 480 }): Promise<{ page: Page; elsewhere: string[] }> {
     const page = await browser.newPage({ viewport: size });
     const elsewhere: string[] = [];
     page.on("request", (request) => {
-      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address)) elsewhere.push(request.url());
+      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address))
+        elsewhere.push(request.url());
     });
     await page.goto(served.address + hash);
     await page.evaluate(() => window.a2tg?.loaded);
     return { page, elsewhere };
   }
 
-  const position = (page: Page): Promise<readonly number[]> =>
-    page.evaluate(() => [...(window.a2tg?.viewer.pose.position ?? [])]);
+  async function poseOn(page: Page): Promise<Pose> {
+    const pose = await page.evaluate(() => window.a2tg?.viewer.pose);
+    if (pose === undefined) throw new Error("The page has no viewer.");
+    return pose;
+  }
 
-  test("names are text, and nothing is fetched from elsewhere", async () => {
+  /** Resolve when the camera is farther than `distance` from a position. */
+  async function movedFrom(page: Page, from: Vec3, distance: number): Promise<void> {
+    await page.waitForFunction(
+      ([x, y, z, least]) => {
+        const position = window.a2tg?.viewer.pose.position;
+        return position !== undefined && Math.hypot(position[0] - x, position[1] - y, position[2] - z) > least;
+      },
+      [...from, distance] as const,
+    );
+  }
+
+  test("names are shown as text and nothing is fetched from other servers", async () => {
     const { page, elsewhere } = await opened();
     expect(await page.title()).toBe("small · a2tg view");
     expect(await page.textContent("#note")).toBe("a note");
@@ -52,7 +73,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("scripts that someone puts in do not run", async () => {
+  test("injected scripts do not run", async () => {
     const { page } = await opened();
     const isRun = await page.evaluate(async () => {
       const script = document.createElement("script");
@@ -65,44 +86,40 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("keys choose modes and cameras, and fly", async () => {
+  test("keys select modes and cameras, and fly", async () => {
     const { page } = await opened();
     await page.focus("#view");
     await page.keyboard.press("5");
     expect(await page.inputValue("#mode")).toBe("depth");
     expect(await page.textContent("#legend")).toContain("near");
-    const before = await position(page);
+    const before = await poseOn(page);
     await page.keyboard.down("w");
-    await page.waitForFunction((from) => Math.hypot(...(window.a2tg?.viewer.pose.position ?? []).map((x, i) => x - from[i])) > 0.01, before);
+    await movedFrom(page, before.position, 0.01);
     await page.keyboard.up("w");
     expect(await page.inputValue("#camera")).toBe("-1");
     await page.keyboard.press(".");
     expect(await page.inputValue("#camera")).toBe("0");
-    expect(await position(page)).toEqual(before);
+    expect((await poseOn(page)).position).toEqual(before.position);
     await page.close();
   });
 
-  test("dragging turns around the target, the wheel comes nearer to it", async () => {
+  test("dragging orbits the target and the wheel zooms", async () => {
     const { page } = await opened();
-    const target = (): Promise<number[]> => page.evaluate(() => {
-      const { position: at, rotation, focus } = window.a2tg?.viewer.pose ?? { position: [], rotation: [[], [], []], focus: 0 };
-      return at.map((x, i) => x + focus * rotation[2][i]);
-    });
-    const [before, from] = [await target(), await position(page)];
+    const before = await poseOn(page);
     await page.mouse.move(200, 200);
     await page.mouse.down();
     await page.mouse.move(260, 220, { steps: 4 });
     await page.mouse.up();
-    (await target()).forEach((x, i) => { expect(x).toBeCloseTo(before[i], 5); });
-    const turned = await position(page);
-    expect(Math.hypot(...turned.map((x, i) => x - from[i]))).toBeGreaterThan(0.1);
+    const turned = await poseOn(page);
+    expectClose(target(turned), target(before), 5);
+    expect(norm(subtract(turned.position, before.position))).toBeGreaterThan(0.1);
     await page.mouse.wheel(0, -300);
-    await page.waitForFunction((at) => window.a2tg?.viewer.pose.position.some((x, i) => Math.abs(x - at[i]) > 1e-3), turned);
-    (await target()).forEach((x, i) => { expect(x).toBeCloseTo(before[i], 5); });
+    await movedFrom(page, turned.position, 2e-3);
+    expectClose(target(await poseOn(page)), target(before), 5);
     await page.close();
   });
 
-  test("the address carries the view", async () => {
+  test("the address preserves the view", async () => {
     const { page } = await opened();
     await page.mouse.move(200, 200);
     await page.mouse.down();
@@ -112,15 +129,14 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.waitForFunction(() => location.hash.includes("mode=normals"));
     const hash = new URL(page.url()).hash;
     const other = await opened(hash);
-    (await position(other.page)).forEach((x, i, all) => { expect(x).toBeCloseTo(all[i], 5); });
-    const [here, there] = [await position(page), await position(other.page)];
-    here.forEach((x, i) => { expect(there[i]).toBeCloseTo(x, 4); });
+    const [here, there] = [await poseOn(page), await poseOn(other.page)];
+    expectClose(there.position, here.position, 4);
     expect(await other.page.inputValue("#mode")).toBe("normals");
     await page.close();
     await other.page.close();
   });
 
-  test("photographs lie behind a slider, where there are some", async () => {
+  test("a slider shows the camera's photograph", async () => {
     const { page } = await opened();
     await page.waitForSelector("#wipe");
     await page.fill("#wipe", "0.5");
@@ -142,26 +158,44 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("views that were kept are saved as a path", async () => {
+  test("kept views are saved as a path", async () => {
     const { page } = await opened();
     expect(await page.isDisabled("#save")).toBe(true);
     await page.click("#keep");
     await page.click("#keep");
     const [download] = await Promise.all([page.waitForEvent("download"), page.click("#save")]);
-    const path = JSON.parse(readFileSync(await download.path(), "utf8")) as { format: string; version: number; views: unknown[] };
+    const path = JSON.parse(readFileSync(await download.path(), "utf8")) as {
+      format: string;
+      version: number;
+      views: { viewmat: number[]; K: number[]; size: number[] }[];
+    };
     expect([path.format, path.version, path.views.length]).toEqual(["a2tg-jax path", 1, 2]);
-    const { viewmat, K, size } = path.views[0] as { viewmat: number[]; K: number[]; size: number[] };
+    const { viewmat, K, size } = at(path.views, 0);
     const camera = await page.evaluate(() => window.a2tg?.viewer.splats?.header.cameras[0]);
-    viewmat.forEach((x, i) => { expect(x).toBeCloseTo(camera?.viewmat[i] ?? NaN, 5); });
+    expectClose(viewmat, camera?.viewmat ?? [], 5);
     expect([K, size]).toEqual([camera?.K, camera?.size]);
     await page.close();
   });
 
   test("a training is followed, paused and resumed", async () => {
-    const status = { version: 0, stage: "textures", iteration: 20, iterations: 100, loss: 0.1, psnr: 20, num: 300, bytes: 9e4, is_paused: false };
+    const status = {
+      version: 0,
+      stage: "textures",
+      iteration: 20,
+      iterations: 100,
+      loss: 0.1,
+      psnr: 20,
+      num: 300,
+      bytes: 9e4,
+      is_paused: false,
+    };
     const tell = (is_paused: boolean): string => JSON.stringify(Object.assign(status, { is_paused }));
     const other = await serve({
-      "/": PAGE, "/scene.a2tgw": SCENE, "/training.json": () => tell(status.is_paused), "/pause": () => tell(true), "/resume": () => tell(false),
+      "/": PAGE,
+      "/scene.a2tgw": SCENE,
+      "/training.json": () => tell(status.is_paused),
+      "/pause": () => tell(true),
+      "/resume": () => tell(false),
     });
     const page = await browser.newPage({ viewport: { width: 640, height: 480 } });
     await page.goto(other.address);
@@ -185,7 +219,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
-  test("a phone's screen holds all of it", async () => {
+  test("the panel fits on a phone's screen", async () => {
     const { page } = await opened("", { width: 390, height: 844 });
     expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBe(390);
     const closed = await page.locator("#panel").boundingBox();
@@ -203,15 +237,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   test("every control has a name", async () => {
     const { page } = await opened();
     const unnamed = await page.evaluate(() =>
-      [...document.querySelectorAll("input, select, button, canvas, progress")].filter((found) => {
-        const labels = found instanceof HTMLInputElement || found instanceof HTMLSelectElement ? (found.labels?.length ?? 0) : 0;
-        return labels === 0 && (found.getAttribute("aria-label") ?? found.textContent) === "";
-      }).map((found) => found.id));
+      [...document.querySelectorAll("input, select, button, canvas, progress")]
+        .filter((found) => {
+          const labels =
+            found instanceof HTMLInputElement || found instanceof HTMLSelectElement ? (found.labels?.length ?? 0) : 0;
+          return labels === 0 && (found.getAttribute("aria-label") ?? found.textContent) === "";
+        })
+        .map((found) => found.id),
+    );
     expect(unnamed).toEqual([]);
     await page.close();
   });
 
-  async function message(files: Record<string, Uint8Array | string>, prepare?: (page: Page) => Promise<unknown>): Promise<string | null> {
+  async function message(
+    files: Record<string, Uint8Array | string>,
+    prepare?: (page: Page) => Promise<unknown>,
+  ): Promise<string | null> {
     const other = await serve({ "/": PAGE, ...files });
     const page = await browser.newPage();
     await prepare?.(page);
@@ -222,24 +263,32 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     return found;
   }
 
-  test("a damaged scene is said to be", async () => {
+  test("damaged scenes give clear errors", async () => {
     expect(await message({ "/scene.a2tgw": SCENE.subarray(0, SCENE.length - 100) })).toContain("cut off");
-    expect(await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) })).toContain("damaged");
+    expect(
+      await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) }),
+    ).toContain("damaged");
     expect(await message({ "/scene.a2tgw": "<script>alert(1)</script> and more text" })).toContain("not a scene");
     expect(await message({})).toContain("no scene.a2tgw");
   });
 
-  test("a browser without WebGL 2 is said to lack it", async () => {
+  test("a browser without WebGL 2 gives a clear error", async () => {
     const found = await message({ "/scene.a2tgw": SCENE }, (page) =>
-      page.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; }));
+      page.addInitScript(() => {
+        HTMLCanvasElement.prototype.getContext = () => null;
+      }),
+    );
     expect(found).toContain("no WebGL 2");
   });
 
-  test("a single file opens from the disk, and the page alone says that it cannot", async () => {
+  test("a single file opens from disk and the bare page explains why it cannot", async () => {
     const folder = mkdtempSync(join(tmpdir(), "a2tg-"));
     const data = `<script type="text/plain" id="scene-data">${Buffer.from(SCENE).toString("base64")}</script>`;
     const path = join(folder, "one.html");
-    writeFileSync(path, PAGE.replace('<script type="module">', () => `${data}\n<script type="module">`));
+    writeFileSync(
+      path,
+      PAGE.replace('<script type="module">', () => `${data}\n<script type="module">`),
+    );
     const page = await browser.newPage();
     await page.goto(pathToFileURL(path).href);
     await page.evaluate(() => window.a2tg?.loaded);

@@ -1,4 +1,4 @@
-/** Makes one page of what Vite builds: script and style inside, and a policy that allows nothing else. */
+/** Vite plugin that inlines script and style into one page, with a content security policy that allows no other. */
 
 import { createHash } from "node:crypto";
 import type { Plugin } from "vite";
@@ -18,6 +18,14 @@ function policy(script: string, style: string): string {
   ].join("; ");
 }
 
+/** Return the only element. Throws an Error if there are none or several. */
+function only<T>(found: readonly T[], what: string): T {
+  const [first] = found;
+  if (first === undefined || found.length > 1)
+    throw new Error(`Expected one ${what} in the build, found ${found.length}.`);
+  return first;
+}
+
 export function onefile(): Plugin {
   return {
     name: "onefile",
@@ -25,13 +33,15 @@ export function onefile(): Plugin {
     generateBundle(_, bundle) {
       const files = Object.values(bundle);
       const scripts = files.filter((file) => file.type === "chunk");
-      const styles = files.filter((file) => file.type === "asset" && file.fileName.endsWith(".css"));
-      const page = files.find((file) => file.fileName === "index.html");
-      if (scripts.length !== 1 || styles.length !== 1 || page?.type !== "asset") {
-        throw new Error("one script, one style sheet and one page are wanted");
-      }
-      const script = `\n${scripts[0].code.replaceAll("</script", "<\\/script").trim()}\n`;
-      const style = `\n${String((styles[0] as { source: unknown }).source).trim()}\n`;
+      const assets = files.filter((file) => file.type === "asset");
+      const styles = assets.filter((file) => file.fileName.endsWith(".css"));
+      const [code, sheet] = [only(scripts, "script").code, only(styles, "style sheet").source];
+      const page = only(
+        assets.filter((file) => file.fileName === "index.html"),
+        "page",
+      );
+      const script = `\n${code.replaceAll("</script", "<\\/script").trim()}\n`;
+      const style = `\n${String(sheet).trim()}\n`;
       const inside = [
         `<meta http-equiv="Content-Security-Policy" content="${policy(script, style)}" />`,
         `<style>${style}</style>`,

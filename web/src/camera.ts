@@ -1,9 +1,9 @@
-/** Where the viewer looks from, and what leads from the world to pixels. */
+/** The camera: pose, lens, projection from the world to pixels, and motions. */
 
 import { add, cross, dot, lookingAlong, normalize, orthonormal, scale, subtract, turned } from "./math";
-import type { Mat3, Row4, Vec3 } from "./math";
+import type { Mat3, Row4, Vec2, Vec3 } from "./math";
 
-/** Pinhole intrinsics in pixels of an image of width × height; pixel centres lie at +0.5. */
+/** Pinhole intrinsics in pixels for an image of width × height. Pixel centres lie at +0.5. */
 export interface Lens {
   readonly fx: number;
   readonly fy: number;
@@ -14,20 +14,25 @@ export interface Lens {
   readonly height: number;
 }
 
+/** Intrinsics K row by row: fx, skew, cx, 0, fy, cy, 0, 0, 1. */
+export type Intrinsics = readonly [...Vec3, ...Vec3, ...Vec3];
+/** World-to-camera matrix row by row. */
+export type Viewmat = readonly [...Row4, ...Row4, ...Row4, ...Row4];
+
 export interface Pose {
   readonly position: Vec3;
-  /** Rows: right, down, forward, in the world. */
+  /** Camera axes in the world, one a row: right, down, forward. */
   readonly rotation: Mat3;
-  /** Distance to the point that one turns around. */
+  /** Distance to the target, the centre of orbits. */
   readonly focus: number;
 }
 
-/** Rows of K·[R | t]: from a position in the world to homogeneous pixels; the last one gives the depth. */
+/** Rows of K·[R | t], which maps world positions to homogeneous pixels. The last row gives the depth. */
 export type Projection = readonly [Row4, Row4, Row4];
 
 export const target = (pose: Pose): Vec3 => add(pose.position, scale(pose.rotation[2], pose.focus));
 
-/** The lens for a canvas: the lens' whole image is seen, as large as it fits, in the middle. */
+/** Scale and centre the lens so that its whole image just fits a canvas. */
 export function fitted(lens: Lens, width: number, height: number): Lens {
   const s = Math.min(width / lens.width, height / lens.height);
   return {
@@ -42,35 +47,57 @@ export function fitted(lens: Lens, width: number, height: number): Lens {
 }
 
 export function projection(pose: Pose, lens: Lens): Projection {
-  const view = pose.rotation.map((axis): Row4 => [...axis, -dot(axis, pose.position)]) as [Row4, Row4, Row4];
-  const combined = (a: number, b: number, c: number): Row4 =>
-    [0, 1, 2, 3].map((k) => a * view[0][k] + b * view[1][k] + c * view[2][k]) as unknown as Row4;
-  return [combined(lens.fx, lens.skew, lens.cx), combined(0, lens.fy, lens.cy), view[2]];
+  const row = (axis: Vec3): Row4 => [...axis, -dot(axis, pose.position)];
+  const [x, y, z] = [row(pose.rotation[0]), row(pose.rotation[1]), row(pose.rotation[2])];
+  const combined = (a: number, b: number, c: number): Row4 => {
+    const entry = (k: 0 | 1 | 2 | 3): number => a * x[k] + b * y[k] + c * z[k];
+    return [entry(0), entry(1), entry(2), entry(3)];
+  };
+  return [combined(lens.fx, lens.skew, lens.cx), combined(0, lens.fy, lens.cy), z];
 }
 
-/** The pose of a world-to-camera matrix, 16 numbers row by row. */
-export function poseOf(viewmat: readonly number[], focus: number): Pose {
-  const row = (i: number): Vec3 => [viewmat[4 * i], viewmat[4 * i + 1], viewmat[4 * i + 2]];
-  const rotation: Mat3 = [row(0), row(1), row(2)];
-  const t: Vec3 = [viewmat[3], viewmat[7], viewmat[11]];
-  const position: Vec3 = [0, 1, 2].map((k) => -(rotation[0][k] * t[0] + rotation[1][k] * t[1] + rotation[2][k] * t[2])) as unknown as Vec3;
-  return { position, rotation, focus };
+/** Build a lens from intrinsics and `size` = [width, height]. */
+export function lensOf(K: Intrinsics, size: Vec2): Lens {
+  const [fx, skew, cx, , fy, cy] = K;
+  return { fx, fy, cx, cy, skew, width: size[0], height: size[1] };
 }
 
-/** The world-to-camera matrix of a pose, 16 numbers row by row. */
-export function viewmatOf(pose: Pose): number[] {
-  const rows = pose.rotation.flatMap((axis) => [...axis, -dot(axis, pose.position)]);
-  return [...rows, 0, 0, 0, 1];
+export function intrinsicsOf({ fx, fy, cx, cy, skew }: Lens): Intrinsics {
+  return [fx, skew, cx, 0, fy, cy, 0, 0, 1];
 }
 
-/** Turned around the target: by `yaw` about `up`, then by `pitch` about the camera's right; never over the top. */
+/** Convert a world-to-camera matrix to a pose. */
+export function poseOf(viewmat: Viewmat, focus: number): Pose {
+  const [xx, xy, xz, tx, yx, yy, yz, ty, zx, zy, zz, tz] = viewmat;
+  const position: Vec3 = [
+    -(xx * tx + yx * ty + zx * tz),
+    -(xy * tx + yy * ty + zy * tz),
+    -(xz * tx + yz * ty + zz * tz),
+  ];
+  return {
+    position,
+    rotation: [
+      [xx, xy, xz],
+      [yx, yy, yz],
+      [zx, zy, zz],
+    ],
+    focus,
+  };
+}
+
+/** Convert a pose to its world-to-camera matrix. */
+export function viewmatOf({ position, rotation: [x, y, z] }: Pose): Viewmat {
+  return [...x, -dot(x, position), ...y, -dot(y, position), ...z, -dot(z, position), 0, 0, 0, 1];
+}
+
+/** Orbit the target: `yaw` about `up`, then `pitch` about the camera's right axis. Stops short of the poles. */
 export function orbited(pose: Pose, up: Vec3, yaw: number, pitch: number): Pose {
   const centre = target(pose);
   const rotation = looked(pose.rotation, up, yaw, pitch);
   return { ...pose, rotation, position: subtract(centre, scale(rotation[2], pose.focus)) };
 }
 
-/** Turned on the spot. */
+/** Turn the camera in place. */
 export function panned(pose: Pose, up: Vec3, yaw: number, pitch: number): Pose {
   return { ...pose, rotation: looked(pose.rotation, up, yaw, pitch) };
 }
@@ -88,26 +115,26 @@ function looked(rotation: Mat3, up: Vec3, yaw: number, pitch: number): Mat3 {
   return orthonormal(isOver ? level : pitched);
 }
 
-/** Moved along the camera's own axes, right, down and forward, in units of the world. */
+/** Move the camera along its own axes (right, down, forward) in world units. */
 export function moved(pose: Pose, by: Vec3): Pose {
   const [x, y, z] = pose.rotation;
   return { ...pose, position: add(pose.position, add(add(scale(x, by[0]), scale(y, by[1])), scale(z, by[2]))) };
 }
 
-/** Nearer to the target by a factor. */
+/** Multiply the distance to the target by `factor`, but keep it at or above `least`. */
 export function dollied(pose: Pose, factor: number, least: number): Pose {
   const focus = Math.max(pose.focus * factor, least);
   return { ...pose, focus, position: subtract(target(pose), scale(pose.rotation[2], focus)) };
 }
 
-/** The same direction, levelled, around another target. */
+/** Move the camera so that `at` becomes the target. The rotation and the depth of `at` stay the same. */
 export function aimed(pose: Pose, at: Vec3): Pose {
   const offset = subtract(at, pose.position);
   const focus = Math.max(dot(offset, pose.rotation[2]), 1e-6);
   return { ...pose, focus, position: subtract(at, scale(pose.rotation[2], focus)) };
 }
 
-/** A first view of points around a centre. */
+/** Return an initial view of a scene with this centre and radius. */
 export function overview(centre: Vec3, radius: number, up: Vec3): Pose {
   const side = Math.abs(up[0]) < 0.9 ? cross(up, [1, 0, 0]) : cross(up, [0, 1, 0]);
   const forward = normalize(subtract(scale(normalize(side), 1), scale(up, 0.35)));

@@ -1,9 +1,9 @@
-/** The body of a scene, chunk after chunk, as bytes arrive. */
+/** Streaming reader for the body of a scene file. */
 
 import { SceneError, fixedColumns } from "./format";
 import type { Header } from "./format";
 
-/** The columns of some rows, as they lie in the file. */
+/** Columns of consecutive rows, encoded as in the file. */
 export interface Chunk {
   /** Index of the first row. */
   readonly start: number;
@@ -12,17 +12,17 @@ export interface Chunk {
   readonly means: Uint8Array;
   /** [9, n] log-scales u, v; quaternion x, y, z; opacity; degree 0: red − green, green, blue − green. */
   readonly numbers: Uint8Array;
-  /** [n] of the spherical harmonics. */
+  /** [n] degrees of the spherical harmonics. */
   readonly degrees: Uint8Array;
-  /** [2, n] Tv, Tu; zeros without textures. */
+  /** [2, n] texture sizes Tv, Tu; zeros without textures. */
   readonly sizes: Uint8Array;
-  /** Band l > 0 at l − 1: [3, 2l + 1, m], red − green, green, blue − green of the rows of that degree or more. */
+  /** Band l ≥ 1 at index l − 1: [3, 2l + 1, m] red − green, green, blue − green of the m rows of degree ≥ l. */
   readonly bands: readonly Uint8Array[];
   /** [4, t]: red − green, green, blue − green, alpha. */
   readonly texels: Uint8Array;
 }
 
-/** Takes bytes as they come and gives whole chunks. */
+/** Splits a stream of bytes into chunks. */
 export class ChunkReader {
   private readonly header: Header;
   private row = 0;
@@ -36,17 +36,17 @@ export class ChunkReader {
     this.buffer = new Uint8Array(this.fixedBytes);
   }
 
-  /** The chunks that are whole with these bytes. */
+  /** Return the chunks that these bytes complete. */
   push(bytes: Uint8Array): Chunk[] {
     const found: Chunk[] = [];
     let place = 0;
     while (place < bytes.length) {
-      if (this.row >= this.header.num) throw new SceneError("The scene is damaged: it holds more than its rows.");
+      if (this.row >= this.header.num) throw new SceneError("The scene is damaged: there is data after the last row.");
       const taken = Math.min(bytes.length - place, this.buffer.length - this.filled);
       this.buffer.set(bytes.subarray(place, place + taken), this.filled);
       place += taken;
       this.filled += taken;
-      // Twice where nothing but fixed columns follows.
+      // The second part of a chunk may be empty, and is then complete at once.
       for (let i = 0; i < 2 && this.filled === this.buffer.length && this.row < this.header.num; i++) {
         const chunk = this.advance();
         if (chunk !== null) found.push(chunk);
@@ -55,10 +55,10 @@ export class ChunkReader {
     return found;
   }
 
-  /** Throws unless all rows have come. */
+  /** Throw a SceneError if rows are missing. */
   end(): void {
     if (this.row < this.header.num || this.numRead !== this.header.bytes) {
-      throw new SceneError("The scene is cut off: not all of its rows are there.");
+      throw new SceneError("The scene is cut off: rows are missing.");
     }
   }
 
@@ -70,14 +70,15 @@ export class ChunkReader {
     return fixedColumns(this.header) * this.numRows;
   }
 
-  /** The buffer is full: fixed columns make room for the rest, the rest makes a chunk. */
+  /** Handle a full buffer. The fixed columns give the size of the second part; the second part completes a chunk. */
   private advance(): Chunk | null {
     this.numRead += this.filled;
     const full = this.buffer;
     if (this.fixed === null) {
       this.fixed = full;
       const rest = this.restBytes(full);
-      if (this.numRead + rest > this.header.bytes) throw new SceneError("The scene is damaged: its rows do not fit.");
+      if (this.numRead + rest > this.header.bytes)
+        throw new SceneError("The scene is damaged: a chunk is larger than the rest of the body.");
       this.room(rest);
       return null;
     }
@@ -107,15 +108,18 @@ export class ChunkReader {
     const { degrees, sizes } = this.parts(fixed);
     const { baseDegree, numBands } = this.header;
     if (degrees.some((degree) => degree < baseDegree || degree >= numBands)) {
-      throw new SceneError("The scene is damaged: a degree is impossible.");
+      throw new SceneError("The scene is damaged: a spherical harmonics degree is out of range.");
     }
     return this.bandLengths(degrees).reduce((a, b) => a + b, 0) + 4 * numTexelsOf(sizes, this.numRows);
   }
 
   private bandLengths(degrees: Uint8Array): number[] {
-    const counts = [0, 0, 0, 0];
-    for (const degree of degrees) for (let l = 1; l <= degree; l++) counts[l]++;
-    return Array.from({ length: this.header.numBands - 1 }, (_, i) => 3 * (2 * i + 3) * counts[i + 1]);
+    const counted = (least: number): number => {
+      let count = 0;
+      for (const degree of degrees) if (degree >= least) count++;
+      return count;
+    };
+    return Array.from({ length: this.header.numBands - 1 }, (_, i) => 3 * (2 * i + 3) * counted(i + 1));
   }
 
   private chunkOf(fixed: Uint8Array, rest: Uint8Array): Chunk {
@@ -133,9 +137,9 @@ export class ChunkReader {
 function numTexelsOf(sizes: Uint8Array, num: number): number {
   let total = 0;
   for (let i = 0; i < num; i++) {
-    const [height, width] = [sizes[i], sizes[num + i]];
+    const [height, width] = [sizes[i]!, sizes[num + i]!];
     if (height > 16 || width > 16 || (height === 0) !== (width === 0)) {
-      throw new SceneError("The scene is damaged: a texture's size is impossible.");
+      throw new SceneError("The scene is damaged: a texture size is out of range.");
     }
     total += height * width;
   }

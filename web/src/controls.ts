@@ -1,16 +1,17 @@
-/** Mouse, touch and keys, as motions of a pose. */
+/** Camera control by mouse, touch and keyboard. */
 
 import type { Lens, Pose } from "./camera";
 import { dollied, moved, orbited, panned } from "./camera";
-import type { Vec3 } from "./math";
+import { scale } from "./math";
+import type { Vec2, Vec3 } from "./math";
 
-/** What motions need to know, and change. */
+/** State that the controls read and change. */
 export interface Steered {
   pose: Pose;
   readonly up: Vec3;
-  /** Of the scene: how fast one flies, and how near one comes. */
+  /** Size of the scene, which sets the flying speed and the smallest distance to the target. */
   readonly extent: number;
-  /** For the canvas, in its pixels as the page counts them. */
+  /** Lens for the canvas, in CSS pixels. */
   readonly lens: Lens;
   onMove(): void;
   onAim(x: number, y: number): void;
@@ -18,10 +19,18 @@ export interface Steered {
 
 const TURN = 1 / 250;
 const FLIGHT: Readonly<Record<string, Vec3>> = {
-  KeyW: [0, 0, 1], KeyS: [0, 0, -1], KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyE: [0, -1, 0], KeyQ: [0, 1, 0],
+  KeyW: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  KeyE: [0, -1, 0],
+  KeyQ: [0, 1, 0],
 };
-const TURNS: Readonly<Record<string, readonly [number, number]>> = {
-  ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1],
+const TURNS: Readonly<Record<string, Vec2>> = {
+  ArrowLeft: [1, 0],
+  ArrowRight: [-1, 0],
+  ArrowUp: [0, 1],
+  ArrowDown: [0, -1],
 };
 
 export class Controls {
@@ -36,16 +45,16 @@ export class Controls {
   constructor(canvas: HTMLElement, steered: Steered) {
     this.canvas = canvas;
     this.steered = steered;
-    canvas.addEventListener("pointerdown", (event) => { this.press(event); });
-    canvas.addEventListener("pointermove", (event) => { this.drag(event); });
+    canvas.addEventListener("pointerdown", (event) => this.press(event));
+    canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"] as const) {
       canvas.addEventListener(kind, (event) => this.pointers.delete(event.pointerId));
     }
-    canvas.addEventListener("wheel", (event) => { this.wheel(event); }, { passive: false });
-    canvas.addEventListener("contextmenu", (event) => { event.preventDefault(); });
-    canvas.addEventListener("keydown", (event) => { this.pressKey(event); });
+    canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("keydown", (event) => this.pressKey(event));
     canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
-    canvas.addEventListener("blur", () => { this.keys.clear(); });
+    canvas.addEventListener("blur", () => this.keys.clear());
   }
 
   private press(event: PointerEvent): void {
@@ -94,7 +103,10 @@ export class Controls {
       this.keys.add(event.code);
       if (!this.isFlying) {
         this.isFlying = true;
-        requestAnimationFrame((time) => { this.time = time; this.fly(time, event.shiftKey); });
+        requestAnimationFrame((time) => {
+          this.time = time;
+          this.fly(time, event.shiftKey);
+        });
       }
     } else if (event.key === "+" || event.key === "=") {
       this.zoom(1 / 1.1);
@@ -106,22 +118,26 @@ export class Controls {
   private fly(time: number, isFast: boolean): void {
     const seconds = Math.min((time - this.time) / 1000, 0.1);
     this.time = time;
-    if (this.keys.size === 0) { this.isFlying = false; return; }
+    if (this.keys.size === 0) {
+      this.isFlying = false;
+      return;
+    }
     const speed = this.steered.extent * (isFast ? 1.5 : 0.5) * seconds;
     let { pose } = this.steered;
     for (const key of this.keys) {
-      if (key in FLIGHT) pose = moved(pose, FLIGHT[key].map((x) => x * speed) as unknown as Vec3);
-      if (key in TURNS) pose = panned(pose, this.steered.up, TURNS[key][0] * seconds, TURNS[key][1] * seconds);
+      const [flight, turn] = [FLIGHT[key], TURNS[key]];
+      if (flight !== undefined) pose = moved(pose, scale(flight, speed));
+      if (turn !== undefined) pose = panned(pose, this.steered.up, turn[0] * seconds, turn[1] * seconds);
     }
     this.change(pose);
-    requestAnimationFrame((next) => { this.fly(next, isFast); });
+    requestAnimationFrame((next) => this.fly(next, isFast));
   }
 
   private zoom(factor: number): void {
     this.change(dollied(this.steered.pose, factor, 1e-3 * this.steered.extent));
   }
 
-  /** The target goes along with the pointer. */
+  /** Move the camera so that the target follows the pointer. */
   private shift(dx: number, dy: number): void {
     const { pose, lens } = this.steered;
     this.change(moved(pose, [(-dx * pose.focus) / lens.fx, (-dy * pose.focus) / lens.fy, 0]));

@@ -1,4 +1,9 @@
-/** The frame and the header of *.a2tgw (docs/formats.md): nothing is believed that was not checked. */
+/** Head and header of *.a2tgw files (docs/formats.md). Every value is checked before use. */
+
+import type { Intrinsics, Viewmat } from "./camera";
+import { crc32 } from "./crc32";
+import { isVector } from "./math";
+import type { Vec2, Vec3 } from "./math";
 
 export const MAGIC = [0x61, 0x32, 0x74, 0x67, 0x77, 0x0d, 0x0a, 0x1a];
 export const VERSION = 1;
@@ -8,7 +13,7 @@ const LARGEST_HEADER = 1 << 24;
 const LARGEST_RATIO = 64;
 const FREE_ROOM = 1 << 20;
 
-/** What is wrong with a file, in words for its reader. */
+/** An error whose message is shown to the user as it is. */
 export class SceneError extends Error {
   override name = "SceneError";
 }
@@ -22,17 +27,21 @@ export interface Head {
 export interface SceneCamera {
   readonly name: string;
   readonly isTest: boolean;
-  readonly size: readonly number[];
-  readonly viewmat: readonly number[];
-  readonly K: readonly number[];
+  readonly size: Vec2;
+  readonly viewmat: Viewmat;
+  readonly K: Intrinsics;
 }
 
+/** Affine map from codes to values: low + step · code. */
 export interface Ends {
   readonly low: number;
   readonly step: number;
 }
 
-/** Centre, spread, and the first and last step of an axis of the means. */
+/** Quantized values, as the header names them. */
+export type Quantity = "log_scales" | "quats" | "opacities" | "sh_0" | "sh_1" | "sh_2" | "sh_3" | "colors" | "alphas";
+
+/** Quantization of one axis of the means: centre, spread, first and last step. */
 export type Axis = readonly [number, number, number, number];
 
 export interface Header {
@@ -42,46 +51,42 @@ export interface Header {
   readonly chunk: number;
   readonly baseDegree: number;
   readonly numBands: number;
-  /** null: splats have no textures. */
+  /** Total number of texels; null without textures. */
   readonly numTexels: number | null;
   readonly bytes: number;
   readonly nearPlane: number;
   readonly maxAlpha: number;
   readonly uv: "texel-centre" | "align-corners";
   readonly outside: "clamp" | "identity";
-  readonly means: readonly Axis[];
-  readonly ends: Readonly<Record<string, Ends>>;
-  readonly background: readonly number[];
+  readonly means: readonly [Axis, Axis, Axis];
+  readonly ends: Readonly<Record<Quantity, Ends>>;
+  readonly background: Vec3;
   readonly cameras: readonly SceneCamera[];
 }
 
-const BITS: Readonly<Record<string, number>> = {
-  log_scales: 8, quats: 8, opacities: 8, sh_0: 8, sh_1: 7, sh_2: 6, sh_3: 6, colors: 8, alphas: 8,
-};
-
-/** What the first 22 bytes say. */
+/** Read the first 22 bytes. Throws a SceneError unless they start a scene file of this version. */
 export function parseHead(bytes: Uint8Array): Head {
   if (bytes.length < HEAD_BYTES || MAGIC.some((byte, i) => bytes[i] !== byte)) {
-    throw new SceneError("This is not a scene of a2tg view (*.a2tgw).");
+    throw new SceneError("This is not a scene file of a2tg view (*.a2tgw).");
   }
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const version = view.getUint16(8, true);
   if (version !== VERSION) {
-    throw new SceneError(`The scene is of version ${version}; this viewer reads version ${VERSION}.`);
+    throw new SceneError(`The scene file has version ${version}; this viewer reads version ${VERSION}.`);
   }
   const head = {
     headerBytes: view.getUint32(10, true),
     bodyBytes: view.getUint32(14, true),
     checksum: view.getUint32(18, true),
   };
-  if (head.headerBytes > LARGEST_HEADER) throw damaged(`a header of ${head.headerBytes} bytes`);
+  if (head.headerBytes > LARGEST_HEADER) throw damaged(`its header claims ${head.headerBytes} bytes`);
   return head;
 }
 
-/** The header's text, of which every number is looked at. */
+/** Read and check the header. Throws a SceneError if a field is missing or out of range. */
 export function parseHeader(text: Uint8Array, head: Head): Header {
-  if (crc32(text) !== head.checksum) throw damaged("the checksum of the header differs");
-  const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "header");
+  if (crc32(text) !== head.checksum) throw damaged("the checksum of its header does not match");
+  const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "the header");
   const header: Header = {
     title: raw.text("title"),
     note: raw.text("note"),
@@ -95,26 +100,41 @@ export function parseHeader(text: Uint8Array, head: Head): Header {
     maxAlpha: raw.between("max_alpha", 0, 1),
     uv: raw.oneOf("uv", ["texel-centre", "align-corners"]),
     outside: raw.oneOf("outside", ["clamp", "identity"]),
-    means: raw.list("means", 3).map((axis, i) => floats(axis, 4, `means[${i}]`) as unknown as Axis),
+    means: meansOf(raw.list("means", 3)),
     ends: endsOf(raw.fields("ends")),
-    background: floats(raw.list("background", 3), 3, "background"),
+    background: vector<Vec3>(raw.list("background"), 3, "background"),
     cameras: raw.isNull("cameras") ? [] : raw.list("cameras").map(cameraOf),
   };
-  if (header.bytes < 16 * header.num + 4 * (header.numTexels ?? 0)) throw damaged("it announces more rows than bytes");
-  if (header.baseDegree >= header.numBands) throw damaged("its degrees contradict each other");
+  if (header.bytes < 16 * header.num + 4 * (header.numTexels ?? 0))
+    throw damaged("its header claims more rows than bytes");
+  if (header.baseDegree >= header.numBands) throw damaged("base_degree is not below num_bands");
   return header;
 }
 
-/** Columns of bytes per row that come first in each chunk: 6 of means, 9 of numbers, degree, and sizes. */
+/** Return the bytes per row in the first part of a chunk: 6 of means, 9 of numbers, degree, texture sizes. */
 export const fixedColumns = (header: Header): number => (header.numTexels === null ? 16 : 18);
 
-function endsOf(raw: Fields): Record<string, Ends> {
-  const found: Record<string, Ends> = {};
-  for (const [name, bits] of Object.entries(BITS)) {
-    const [low, high] = raw.has(name) ? floats(raw.list(name, 2), 2, name) : [0, 0];
-    found[name] = { low, step: (high - low) / (2 ** bits - 1) };
-  }
-  return found;
+function meansOf(axes: readonly unknown[]): Header["means"] {
+  const axis = (i: number): Axis => vector<Axis>(axes[i], 4, `means[${i}]`);
+  return [axis(0), axis(1), axis(2)];
+}
+
+function endsOf(raw: Fields): Header["ends"] {
+  const ends = (name: Quantity, bits: number): Ends => {
+    const [low, high] = raw.has(name) ? vector<Vec2>(raw.list(name), 2, name) : [0, 0];
+    return { low, step: (high - low) / (2 ** bits - 1) };
+  };
+  return {
+    log_scales: ends("log_scales", 8),
+    quats: ends("quats", 8),
+    opacities: ends("opacities", 8),
+    sh_0: ends("sh_0", 8),
+    sh_1: ends("sh_1", 7),
+    sh_2: ends("sh_2", 6),
+    sh_3: ends("sh_3", 6),
+    colors: ends("colors", 8),
+    alphas: ends("alphas", 8),
+  };
 }
 
 function cameraOf(value: unknown, index: number): SceneCamera {
@@ -122,33 +142,30 @@ function cameraOf(value: unknown, index: number): SceneCamera {
   const camera = {
     name: raw.text("name"),
     isTest: raw.flag("is_test"),
-    size: floats(raw.list("size", 2), 2, "size"),
-    viewmat: floats(raw.list("viewmat", 16), 16, "viewmat"),
-    K: floats(raw.list("K", 9), 9, "K"),
+    size: vector<Vec2>(raw.list("size"), 2, "size"),
+    viewmat: vector<Viewmat>(raw.list("viewmat"), 16, "viewmat"),
+    K: vector<Intrinsics>(raw.list("K"), 9, "K"),
   };
   if (!(camera.size[0] >= 1 && camera.size[1] >= 1 && camera.K[0] > 0 && camera.K[4] > 0)) {
-    throw damaged(`camera ${index} has no size`);
+    throw damaged(`the size or focal length of camera ${index} is out of range`);
   }
   return camera;
 }
 
-function floats(values: unknown, length: number, name: string): number[] {
-  if (!Array.isArray(values) || values.length !== length) throw damaged(`${name} must be ${length} numbers`);
-  if (!values.every((value): value is number => typeof value === "number" && Number.isFinite(value))) {
-    throw damaged(`${name} holds what is no number`);
-  }
+function vector<T extends readonly number[]>(values: unknown, length: T["length"], name: string): T {
+  if (!isVector<T>(values, length)) throw damaged(`${name} must be ${length} finite numbers`);
   return values;
 }
 
 const damaged = (what: string): SceneError => new SceneError(`The scene is damaged: ${what}.`);
 
-/** JSON of which nothing is known. */
+/** An untrusted JSON object whose fields are checked as they are read. */
 class Fields {
   private readonly values: Readonly<Record<string, unknown>>;
   private readonly where: string;
 
   constructor(value: unknown, where: string) {
-    if (typeof value !== "object" || value === null || Array.isArray(value)) throw damaged(`${where} is no object`);
+    if (typeof value !== "object" || value === null || Array.isArray(value)) throw damaged(`${where} is not an object`);
     this.values = value as Readonly<Record<string, unknown>>;
     this.where = where;
   }
@@ -201,19 +218,6 @@ class Fields {
   }
 
   private wrong(name: string): never {
-    throw damaged(`${name} in its ${this.where} is missing or impossible`);
+    throw damaged(`${name} in ${this.where} is missing or out of range`);
   }
-}
-
-const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
-  let c = n;
-  for (let k = 0; k < 8; k++) c = c & 1 ? 0xedb88320 ^ (c >>> 1) : c >>> 1;
-  return c;
-});
-
-/** CRC-32 as zlib's. */
-export function crc32(bytes: Uint8Array): number {
-  let c = 0xffffffff;
-  for (const byte of bytes) c = CRC_TABLE[(c ^ byte) & 255] ^ (c >>> 8);
-  return (c ^ 0xffffffff) >>> 0;
 }

@@ -1,8 +1,8 @@
-/** Small pieces of WebGL 2. */
+/** WebGL 2 building blocks: programs, arrays in textures, offscreen targets. */
 
 import { SceneError } from "./format";
 
-/** A program and where its uniforms lie. */
+/** A linked program with a cache of uniform locations. */
 export class Program {
   readonly handle: WebGLProgram;
   private readonly gl: WebGL2RenderingContext;
@@ -11,19 +11,22 @@ export class Program {
   constructor(gl: WebGL2RenderingContext, vertex: string, fragment: string) {
     this.gl = gl;
     this.handle = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]] as const) {
+    for (const [kind, text] of [
+      [gl.VERTEX_SHADER, vertex],
+      [gl.FRAGMENT_SHADER, fragment],
+    ] as const) {
       const shader = gl.createShader(kind);
-      if (shader === null) throw new Error("WebGL made no shader");
+      if (shader === null) throw new Error("WebGL could not create a shader.");
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
       if (gl.getShaderParameter(shader, gl.COMPILE_STATUS) !== true && !gl.isContextLost()) {
-        throw new Error(`The graphics driver refuses a shader: ${gl.getShaderInfoLog(shader) ?? ""}`);
+        throw new Error(`The graphics driver rejected a shader: ${gl.getShaderInfoLog(shader) ?? ""}`);
       }
       gl.attachShader(this.handle, shader);
     }
     gl.linkProgram(this.handle);
     if (gl.getProgramParameter(this.handle, gl.LINK_STATUS) !== true && !gl.isContextLost()) {
-      throw new Error(`The graphics driver refuses a program: ${gl.getProgramInfoLog(this.handle) ?? ""}`);
+      throw new Error(`The graphics driver rejected a program: ${gl.getProgramInfoLog(this.handle) ?? ""}`);
     }
   }
 
@@ -37,7 +40,7 @@ export class Program {
   }
 }
 
-/** One long array in a texture, filled from its beginning; four numbers a texel. */
+/** An append-only array in a 2D texture, four numbers a texel. */
 export class LongTexture {
   readonly handle: WebGLTexture;
   private readonly gl: WebGL2RenderingContext;
@@ -45,14 +48,14 @@ export class LongTexture {
   private readonly isWords: boolean;
   private place = 0;
 
-  /** Room for `num` texels in rows of 2^widthBits. */
+  /** Allocate `num` texels in rows of 2^widthBits. Throws a SceneError if the GPU's limit is lower. */
   constructor(gl: WebGL2RenderingContext, num: number, widthBits: number, isWords: boolean, what: string) {
     this.gl = gl;
     this.width = 1 << widthBits;
     this.isWords = isWords;
     const height = Math.max(Math.ceil(num / this.width), 1);
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
-    if (height > most) throw new SceneError(`The scene has more ${what} than this graphics processor takes.`);
+    if (height > most) throw new SceneError(`The scene has more ${what} than this GPU supports.`);
     this.handle = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, this.handle);
     gl.texStorage2D(gl.TEXTURE_2D, 1, isWords ? gl.RGBA32UI : gl.RGBA8, this.width, height);
@@ -61,7 +64,7 @@ export class LongTexture {
     }
   }
 
-  /** Adds [n, 4] numbers. */
+  /** Append [n, 4] numbers. */
   append(data: Uint32Array | Uint8Array): void {
     const { gl, width } = this;
     gl.bindTexture(gl.TEXTURE_2D, this.handle);
@@ -86,14 +89,14 @@ export class LongTexture {
   }
 }
 
-/** A picture to draw into, in the finest format that blends. */
+/** An offscreen picture: half floats if the GPU can draw to them, else bytes. */
 export class Target {
   width = 0;
   height = 0;
   readonly framebuffer: WebGLFramebuffer;
   texture: WebGLTexture | null = null;
   private readonly gl: WebGL2RenderingContext;
-  /** Whether colours beyond 0 and 1 are kept while splats are added. */
+  /** Whether the picture holds half floats, which are not clamped to [0, 1]. */
   readonly isFloat: boolean;
 
   constructor(gl: WebGL2RenderingContext) {
@@ -122,7 +125,7 @@ export class Target {
     [this.width, this.height] = [width, height];
   }
 
-  /** Red, green, blue (or what the mode draws), alpha of a rectangle, [h, w, 4], rows from the top. */
+  /** Read a rectangle as [h, w, 4], rows from the top: red, green, blue (or the mode's values), alpha. */
   read(x: number, y: number, width: number, height: number): Float32Array {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
@@ -133,6 +136,6 @@ export class Target {
     }
     const bytes = new Uint8Array(found.length);
     gl.readPixels(x, y, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-    return found.map((_, i) => bytes[i] / 255);
+    return Float32Array.from(bytes, (byte) => byte / 255);
   }
 }

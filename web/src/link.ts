@@ -1,7 +1,7 @@
-/** A view as the end of an address, and back. */
+/** Conversion between views and URL fragments. */
 
 import type { Lens, Pose } from "./camera";
-import { orthonormal } from "./math";
+import { isVector, orthonormal } from "./math";
 import type { Vec3 } from "./math";
 import { MODES } from "./shaders";
 import type { Mode } from "./shaders";
@@ -12,27 +12,45 @@ export interface View {
   readonly mode: Mode;
 }
 
-const LENGTH = 17;
+/** Position, right, forward; focus; fx, fy, cx, cy, skew, width, height. */
+type ViewNumbers = readonly [...Vec3, ...Vec3, ...Vec3, number, ...Vec3, ...Vec3, number];
 
-/** Such as #view=…&mode=depth: position, right, forward, focus, and the lens. */
+/** Return the fragment of a view, such as #view=…&mode=depth. */
 export function linkOf({ pose, lens, mode }: View): string {
-  const numbers = [
-    ...pose.position, ...pose.rotation[0], ...pose.rotation[2], pose.focus,
-    lens.fx, lens.fy, lens.cx, lens.cy, lens.skew, lens.width, lens.height,
+  const numbers: ViewNumbers = [
+    ...pose.position,
+    ...pose.rotation[0],
+    ...pose.rotation[2],
+    pose.focus,
+    lens.fx,
+    lens.fy,
+    lens.cx,
+    lens.cy,
+    lens.skew,
+    lens.width,
+    lens.height,
   ];
   const view = numbers.map((x) => Number(x.toPrecision(7)).toString()).join(",");
   return mode === "full" ? `#view=${view}` : `#view=${view}&mode=${mode}`;
 }
 
-/** null where it says no view. */
+/** Parse a fragment. Returns null if it holds no valid view. */
 export function viewOf(hash: string): View | null {
   const fields = new URLSearchParams(hash.replace(/^#/, ""));
-  const numbers = (fields.get("view") ?? "").split(",").map(Number);
-  if (numbers.length !== LENGTH || !numbers.every((x) => Number.isFinite(x) && Math.abs(x) < 1e9)) return null;
-  const vector = (i: number): Vec3 => [numbers[i], numbers[i + 1], numbers[i + 2]];
-  const [fx, fy, cx, cy, skew, width, height] = numbers.slice(10);
-  if (!(fx > 0 && fy > 0 && width >= 1 && height >= 1 && numbers[9] > 0)) return null;
-  const rotation = orthonormal([vector(3), [0, 0, 0], vector(6)]);
+  const numbers: readonly number[] = (fields.get("view") ?? "").split(",").map(Number);
+  if (!isVector<ViewNumbers>(numbers, 17) || numbers.some((x) => Math.abs(x) >= 1e9)) return null;
+  const [x, y, z, rightX, rightY, rightZ, forwardX, forwardY, forwardZ, focus, ...image] = numbers;
+  const [fx, fy, cx, cy, skew, width, height] = image;
+  if (!(fx > 0 && fy > 0 && width >= 1 && height >= 1 && focus > 0)) return null;
+  const rotation = orthonormal([
+    [rightX, rightY, rightZ],
+    [0, 0, 0],
+    [forwardX, forwardY, forwardZ],
+  ]);
   const mode = MODES.find((name) => name === fields.get("mode")) ?? "full";
-  return { pose: { position: vector(0), rotation, focus: numbers[9] }, lens: { fx, fy, cx, cy, skew, width, height }, mode };
+  return {
+    pose: { position: [x, y, z], rotation, focus },
+    lens: { fx, fy, cx, cy, skew, width, height },
+    mode,
+  };
 }

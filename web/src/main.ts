@@ -1,10 +1,11 @@
-/** The page: a scene is read, shown as it comes, and steered. */
+/** Entry point: loads the scene, shows it as it arrives, and connects panel and viewer. */
 
 import "./style.css";
 
-import type { Lens } from "./camera";
-import { poseOf } from "./camera";
+import { lensOf, poseOf } from "./camera";
+import type { Intrinsics, Viewmat } from "./camera";
 import { SceneError } from "./format";
+import type { Vec2 } from "./math";
 import { bytesText, countText, element, setFigures, showMessage } from "./page";
 import { Panel } from "./panel";
 import { MODES } from "./shaders";
@@ -14,20 +15,22 @@ import type { Splats } from "./splats";
 import { followTraining } from "./training";
 import { Viewer } from "./viewer";
 
-/** What other scripts of a page may ask for, tests among them. */
+/** Interface for other scripts, such as tests, as window.a2tg. */
 export interface PageApi {
-  /** Resolves when all of the scene is there. */
+  /** Promise that resolves when the whole scene is loaded. */
   readonly loaded: Promise<void>;
   readonly viewer: Viewer;
-  /** A picture as numbers, [h, w, 4]: colours times alpha, and alpha; rows from the top. */
-  render(viewmat: readonly number[], K: readonly number[], size: readonly number[], mode: string): Promise<Float32Array>;
+  /** Render a view to [h, w, 4], rows from the top: premultiplied colours and alpha. */
+  render(viewmat: Viewmat, K: Intrinsics, size: Vec2, mode: string): Promise<Float32Array>;
 }
 
 declare global {
-  interface Window { a2tg?: PageApi }
+  interface Window {
+    a2tg?: PageApi;
+  }
 }
 
-/** While a scene comes it is drawn again when there is so much more of it. */
+/** Growth of a loading scene after which it is sorted and drawn again. */
 const GROWTH = 1.7;
 
 async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void> {
@@ -53,7 +56,7 @@ async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void>
       }
       if (splats.num < GROWTH * numShown && splats.num < splats.header.num) return;
       viewer.sort(splats);
-      // The first rows are on the screen before more is read; another scene waits until it is whole.
+      // Show the first rows before reading on. A later scene replaces the current one only when complete.
       if (numShown === 0 && isFirst) await splats.settled().then(nextFrame);
       numShown = splats.num;
     },
@@ -64,7 +67,7 @@ async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void>
   await last.settled();
 }
 
-/** Resolves after the next picture; soon in a window that is hidden and draws none. */
+/** Resolve after the next frame, or after 200 ms if the window is hidden and draws none. */
 function nextFrame(): Promise<void> {
   return new Promise((resolve) => {
     requestAnimationFrame(() => setTimeout(resolve));
@@ -75,10 +78,13 @@ function nextFrame(): Promise<void> {
 function tell(splats: Splats, numBytes: number): void {
   const { header } = splats;
   const figures: [string, string][] = [
-    ["Gaussians", splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num)],
+    [
+      "Gaussians",
+      splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num),
+    ],
     ["Texels", countText(header.numTexels ?? 0)],
     ["File", bytesText(numBytes)],
-    ["On the GPU", bytesText(splats.numBytes)],
+    ["GPU memory", bytesText(splats.numBytes)],
   ];
   setFigures(figures);
 }
@@ -91,17 +97,19 @@ async function findPhotographs(panel: Panel): Promise<void> {
   if (Array.isArray(found)) panel.setPhotographs(found.filter((x): x is number => Number.isInteger(x)));
 }
 
-function lensOf(K: readonly number[], size: readonly number[]): Lens {
-  return { fx: K[0], skew: K[1], cx: K[2], fy: K[4], cy: K[5], width: size[0], height: size[1] };
-}
-
 function begin(): void {
   const viewer = new Viewer(element("view", HTMLCanvasElement));
   const panel = new Panel(viewer);
-  viewer.onFail = (reason) => { showMessage(`This browser could not sort the scene: ${reason}`); };
-  const show = async (): Promise<void> => { await load(viewer, panel, await openScene()); };
+  viewer.onFail = (reason) => {
+    showMessage(`Sorting failed in this browser: ${reason}`);
+  };
+  const show = async (): Promise<void> => {
+    await load(viewer, panel, await openScene());
+  };
   const isHeld = document.getElementById("scene-data") !== null;
-  const loaded = (isHeld ? Promise.resolve(false) : followTraining(show)).then((isLive) => isLive ? undefined : show());
+  const loaded = (isHeld ? Promise.resolve(false) : followTraining(show)).then((isLive) =>
+    isLive ? undefined : show(),
+  );
   loaded.catch(fail);
   void findPhotographs(panel);
   window.a2tg = {
@@ -110,9 +118,11 @@ function begin(): void {
     render: (viewmat, K, size, mode) =>
       viewer.read(poseOf(viewmat, 1), lensOf(K, size), MODES.find((name) => name === mode) ?? "full"),
   };
-  viewer.canvas.addEventListener("webglcontextlost", () => {
-    showMessage("The graphics processor was lost, perhaps because its memory is full. Reload the page to try again.");
-  });
+  viewer.canvas.addEventListener("webglcontextlost", () =>
+    showMessage(
+      "The connection to the GPU was lost, possibly because its memory is full. Reload the page to try again.",
+    ),
+  );
 }
 
 function fail(error: unknown): void {

@@ -1,33 +1,36 @@
 /**
- * Rows of a chunk as the shader reads them. Of each row 32 bytes, two texels of four 32-bit words:
+ * Repacking of chunks for the shader. Each row takes 32 bytes, two texels of four 32-bit words:
  *
  *     x, y, z as floats | degree 0: red, green, blue; degree
  *     quaternion x, y, z; opacity | log-scale u, v; Tu, Tv | first texel of its texture | first word of its harmonics
  *
- * One word (red, green, blue, nothing) per coefficient above degree 0, in fours, and four bytes per texel.
+ * Each coefficient above degree 0 takes one word (red, green, blue, unused), padded to groups of four. Each texel takes
+ * four bytes.
  */
 
+import { at } from "./arrays";
 import type { Chunk } from "./chunks";
+import { fixedColumns } from "./format";
 import type { Axis, Header } from "./format";
 
 export const ROW_WORDS = 8;
-/** Groups of four words that the coefficients above degree 0 take, by degree. */
+/** Number of groups of four words for the coefficients above degree 0, by degree. */
 export const HARMONIC_TEXELS = [0, 1, 2, 4] as const;
 const COEFFICIENTS = [0, 3, 8, 15] as const;
 
 export interface Packed {
   readonly num: number;
-  /** [n, 3] */
+  /** [n, 3] positions. */
   readonly means: Float32Array<ArrayBuffer>;
-  /** [n, 8] */
+  /** [n, 8] words of rows. */
   readonly rows: Uint32Array;
-  /** [h, 4] */
+  /** [h, 4] words of harmonics. */
   readonly harmonics: Uint32Array;
-  /** [t, 4] */
+  /** [t, 4] red, green, blue, alpha. */
   readonly texels: Uint8Array;
 }
 
-/** Makes what the shader reads of chunks, one after the other. */
+/** Packs successive chunks, counting texels and harmonics across them. */
 export class Packer {
   private readonly header: Header;
   private numTexels = 0;
@@ -45,17 +48,17 @@ export class Packer {
     let texel = this.numTexels;
     let harmonic = this.numHarmonics;
     for (let i = 0; i < num; i++) {
-      const at = ROW_WORDS * i;
-      const byte = (column: number): number => numbers[column * num + i];
+      const place = ROW_WORDS * i;
+      const byte = (column: number): number => numbers[column * num + i]!;
       const green = byte(7);
-      floats.set(means.subarray(3 * i, 3 * i + 3), at);
-      rows[at + 3] = word(byte(6) + green, green, byte(8) + green, degrees[i]);
-      rows[at + 4] = word(byte(2), byte(3), byte(4), byte(5));
-      rows[at + 5] = word(byte(0), byte(1), sizes[num + i], sizes[i]);
-      rows[at + 6] = texel;
-      rows[at + 7] = harmonic;
-      texel += sizes[i] * sizes[num + i];
-      harmonic += HARMONIC_TEXELS[degrees[i]];
+      floats.set(means.subarray(3 * i, 3 * i + 3), place);
+      rows[place + 3] = word(byte(6) + green, green, byte(8) + green, degrees[i]!);
+      rows[place + 4] = word(byte(2), byte(3), byte(4), byte(5));
+      rows[place + 5] = word(byte(0), byte(1), sizes[num + i]!, sizes[i]!);
+      rows[place + 6] = texel;
+      rows[place + 7] = harmonic;
+      texel += sizes[i]! * sizes[num + i]!;
+      harmonic += HARMONIC_TEXELS[degrees[i]!]!;
     }
     const packed = {
       num,
@@ -70,14 +73,14 @@ export class Packer {
   }
 }
 
-/** At most so many groups of four words of harmonics are in a file of these bytes. */
+/** Return an upper bound on the groups of four harmonics words in a file. */
 export function mostHarmonics(header: Header): number {
-  const most = HARMONIC_TEXELS[header.numBands - 1];
-  const fixed = (header.numTexels === null ? 16 : 18) * header.num + 4 * (header.numTexels ?? 0);
+  const most = at(HARMONIC_TEXELS, header.numBands - 1);
+  const fixed = fixedColumns(header) * header.num + 4 * (header.numTexels ?? 0);
   return Math.min(most * header.num, Math.ceil(Math.max(header.bytes - fixed, 0) / 9));
 }
 
-/** Four bytes as one word, the first lowest, each modulo 256. */
+/** Pack four numbers modulo 256 into a word, the first one lowest. */
 function word(a: number, b: number, c: number, d: number): number {
   return ((a & 255) | ((b & 255) << 8) | ((c & 255) << 16) | ((d & 255) << 24)) >>> 0;
 }
@@ -88,21 +91,21 @@ function positions(chunk: Chunk, axes: readonly Axis[]): Float32Array<ArrayBuffe
   axes.forEach(([centre, spread, low, high], k) => {
     const step = (high - low) / 65535;
     for (let i = 0; i < num; i++) {
-      const code = means[k * num + i] | (means[(3 + k) * num + i] << 8);
+      const code = means[k * num + i]! | (means[(3 + k) * num + i]! << 8);
       found[3 * i + k] = centre + spread * Math.sinh(low + code * step);
     }
   });
   return found;
 }
 
-/** Coefficients by row, where the file has them by band, colour and coefficient. */
+/** Reorder coefficients by row. The file orders them by band, colour and coefficient. */
 function harmonicsOf(chunk: Chunk, numGroups: number): Uint32Array {
   const words = new Uint32Array(4 * numGroups);
   const places = new Uint32Array(chunk.num);
   let place = 0;
   for (let i = 0; i < chunk.num; i++) {
     places[i] = place;
-    place += 4 * HARMONIC_TEXELS[chunk.degrees[i]];
+    place += 4 * HARMONIC_TEXELS[chunk.degrees[i]!]!;
   }
   chunk.bands.forEach((band, index) => {
     const degree = index + 1;
@@ -110,11 +113,11 @@ function harmonicsOf(chunk: Chunk, numGroups: number): Uint32Array {
     const count = band.length / (3 * size);
     let j = 0;
     for (let i = 0; i < chunk.num; i++) {
-      if (chunk.degrees[i] < degree) continue;
+      if (chunk.degrees[i]! < degree) continue;
       for (let k = 0; k < size; k++) {
-        const green = band[(size + k) * count + j];
-        const to = places[i] + COEFFICIENTS[degree - 1] + k;
-        words[to] = word(band[k * count + j] + green, green, band[(2 * size + k) * count + j] + green, 0);
+        const green = band[(size + k) * count + j]!;
+        const to = places[i]! + COEFFICIENTS[degree - 1]! + k;
+        words[to] = word(band[k * count + j]! + green, green, band[(2 * size + k) * count + j]! + green, 0);
       }
       j++;
     }
@@ -126,11 +129,11 @@ function texelsOf(planes: Uint8Array): Uint8Array {
   const num = planes.length / 4;
   const found = new Uint8Array(planes.length);
   for (let i = 0; i < num; i++) {
-    const green = planes[num + i];
-    found[4 * i] = planes[i] + green;
+    const green = planes[num + i]!;
+    found[4 * i] = planes[i]! + green;
     found[4 * i + 1] = green;
-    found[4 * i + 2] = planes[2 * num + i] + green;
-    found[4 * i + 3] = planes[3 * num + i];
+    found[4 * i + 2] = planes[2 * num + i]! + green;
+    found[4 * i + 3] = planes[3 * num + i]!;
   }
   return found;
 }

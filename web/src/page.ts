@@ -1,8 +1,8 @@
-/** The page's elements, by their ids. All text goes in as text: nothing of a file becomes markup. */
+/** Access to the page's elements by id. Text from files is set as text, never as markup. */
 
 export function element<T extends HTMLElement>(id: string, kind: new () => T): T {
   const found = document.getElementById(id);
-  if (!(found instanceof kind)) throw new Error(`the page lacks #${id}`);
+  if (!(found instanceof kind)) throw new Error(`The page has no #${id} of the right type.`);
   return found;
 }
 
@@ -17,7 +17,7 @@ export function showMessage(text: string): void {
   element("progress", HTMLProgressElement).hidden = true;
 }
 
-/** Pairs of a name and a figure, in place of those before. */
+/** Replace the list of figures with these pairs of name and value. */
 export function setFigures(figures: readonly (readonly [string, string])[]): void {
   const list = element("figures", HTMLElement);
   const terms = figures.flatMap(([name, value]) => {

@@ -1,26 +1,28 @@
-/** The panel beside the picture: what is shown, the cameras with their photographs, the link, the path. */
+/** The side panel: display mode, cameras and their photographs, link, path. */
 
-import { viewmatOf } from "./camera";
+import { intrinsicsOf, viewmatOf } from "./camera";
+import type { Intrinsics, Viewmat } from "./camera";
 import type { Header } from "./format";
 import { linkOf, viewOf } from "./link";
+import type { Vec2 } from "./math";
 import { element, setText } from "./page";
 import { MODES } from "./shaders";
 import type { Mode } from "./shaders";
 import type { Viewer } from "./viewer";
 
 const LEGENDS: Partial<Record<Mode, string>> = {
-  texture: "What textures add to the colour; grey is nothing.",
-  resolution: "Square textures are blue, others red; the more texels, the deeper. Dark: one texel.",
-  depth: "Bright is near.",
-  normals: "Red, green and blue are x, y and z of the normal.",
-  ellipses: "Each Gaussian out to 1.4 standard deviations.",
+  texture: "Colour added by textures. Grey means none.",
+  resolution: "Square textures are blue, others red. More texels give a deeper colour. Dark means one texel or none.",
+  depth: "Bright is near, dark is far.",
+  normals: "Red, green and blue show x, y and z of the normal.",
+  ellipses: "Each Gaussian is drawn out to 1.4 standard deviations.",
 };
 
-/** A view of a path, as a2tg render --path reads it. */
+/** View in a path file, in the format of a2tg render --path. */
 interface KeptView {
-  readonly viewmat: readonly number[];
-  readonly K: readonly number[];
-  readonly size: readonly number[];
+  readonly viewmat: Viewmat;
+  readonly K: Intrinsics;
+  readonly size: Vec2;
 }
 
 export class Panel {
@@ -39,26 +41,30 @@ export class Panel {
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
-    this.mode.addEventListener("change", () => { this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full"); });
-    this.divide.addEventListener("change", () => { this.setDivided(); });
-    this.divider.addEventListener("input", () => { this.setDivided(); });
-    this.camera.addEventListener("change", () => { this.goTo(Number(this.camera.value)); });
-    this.wipe.addEventListener("input", () => { this.placePhotograph(); });
-    this.onClick("before", () => { this.step(-1); });
-    this.onClick("after", () => { this.step(1); });
-    this.onClick("start", () => { this.restart(); });
-    this.onClick("link", () => { void this.copyLink(); });
-    this.onClick("fullscreen", () => { void toggleFullScreen(); });
-    this.onClick("keep", () => { this.keep(); });
-    this.onClick("save", () => { this.save(); });
-    viewer.onLeave = () => { this.leave(); };
-    addEventListener("keydown", (event) => { this.pressKey(event); });
-    addEventListener("resize", () => { this.placePhotograph(); });
-    addEventListener("hashchange", () => { this.followLink(); });
+    this.mode.addEventListener("change", () => this.setMode(MODES.find((mode) => mode === this.mode.value) ?? "full"));
+    this.divide.addEventListener("change", () => this.setDivided());
+    this.divider.addEventListener("input", () => this.setDivided());
+    this.camera.addEventListener("change", () => this.goTo(Number(this.camera.value)));
+    this.wipe.addEventListener("input", () => this.placePhotograph());
+    this.onClick("before", () => this.step(-1));
+    this.onClick("after", () => this.step(1));
+    this.onClick("start", () => this.restart());
+    this.onClick("link", () => {
+      void this.copyLink();
+    });
+    this.onClick("fullscreen", () => {
+      void toggleFullScreen();
+    });
+    this.onClick("keep", () => this.keep());
+    this.onClick("save", () => this.save());
+    viewer.onLeave = () => this.leave();
+    addEventListener("keydown", (event) => this.pressKey(event));
+    addEventListener("resize", () => this.placePhotograph());
+    addEventListener("hashchange", () => this.followLink());
     if (matchMedia("(max-width: 600px)").matches) element("panel", HTMLDetailsElement).open = false;
   }
 
-  /** A scene has begun. */
+  /** Show the title, cameras and modes of a new scene. */
   begin(header: Header): void {
     this.header = header;
     const title = header.title === "" ? "a2tg view" : header.title;
@@ -66,7 +72,9 @@ export class Panel {
     document.title = `${title} · a2tg view`;
     setText("note", header.note);
     element("cameras", HTMLElement).hidden = header.cameras.length === 0;
-    const choices = header.cameras.map((camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)));
+    const choices = header.cameras.map(
+      (camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)),
+    );
     this.camera.replaceChildren(new Option("free", "-1"), ...choices);
     const hasTextures = (header.numTexels ?? 0) > 0;
     element("compare", HTMLElement).hidden = !hasTextures;
@@ -75,12 +83,12 @@ export class Panel {
     }
   }
 
-  /** The scene stands: goes where the address says, or to its first camera. */
+  /** Go to the view in the address, or to the first camera. */
   ready(): void {
     if (!this.followLink()) this.restart();
   }
 
-  /** The cameras of which there is a photograph beside the page. */
+  /** Set which cameras have a photograph beside the page. */
   setPhotographs(indices: readonly number[]): void {
     this.photographs = new Set(indices);
     this.showPhotograph();
@@ -145,12 +153,12 @@ export class Panel {
     this.photograph.hidden = !isThere;
     if (isThere) {
       this.photograph.src = `photographs/${index}.jpg`;
-      this.photograph.alt = `Photograph ${this.header?.cameras[index].name ?? ""}`;
+      this.photograph.alt = `Photograph ${this.header?.cameras[index]?.name ?? ""}`;
       this.placePhotograph();
     }
   }
 
-  /** Where the camera's image lies on the canvas, wiped to the slider's share. */
+  /** Align the photograph with the camera's image and clip it at the slider's share of the width. */
   private placePhotograph(): void {
     const { image, lens } = this.viewer;
     const s = lens.fx / image.fx;
@@ -167,8 +175,12 @@ export class Panel {
   private noteLink(): void {
     clearTimeout(this.linkTimer);
     this.linkTimer = window.setTimeout(() => {
-      // The address of a page that opens from the disk may not be changed everywhere.
-      try { history.replaceState(null, "", this.link); } catch { /* then it stays */ }
+      // Some browsers forbid changing the address of a page opened from disk.
+      try {
+        history.replaceState(null, "", this.link);
+      } catch {
+        /* then it stays */
+      }
     }, 400);
   }
 
@@ -185,9 +197,11 @@ export class Panel {
       button.textContent = "Copied";
     } catch {
       location.hash = this.link;
-      button.textContent = "In the address";
+      button.textContent = "See address bar";
     }
-    window.setTimeout(() => { button.textContent = "Copy link"; }, 1500);
+    window.setTimeout(() => {
+      button.textContent = "Copy link";
+    }, 1500);
   }
 
   private followLink(): boolean {
@@ -205,8 +219,7 @@ export class Panel {
 
   private keep(): void {
     const { pose, image } = this.viewer;
-    const K = [image.fx, image.skew, image.cx, 0, image.fy, image.cy, 0, 0, 1];
-    this.kept.push({ viewmat: viewmatOf(pose), K, size: [image.width, image.height] });
+    this.kept.push({ viewmat: viewmatOf(pose), K: intrinsicsOf(image), size: [image.width, image.height] });
     this.tellKept();
   }
 

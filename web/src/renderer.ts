@@ -1,14 +1,15 @@
-/** Draws splats: sorted back to front into a picture of half floats, then that onto the canvas. */
+/** Draws sorted splats back to front into an offscreen picture, then copies it to the canvas. */
 
 import type { Lens, Pose } from "./camera";
 import { projection } from "./camera";
 import type { Ends } from "./format";
 import { Program, Target } from "./gl";
+import type { Vec2 } from "./math";
 import { MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from "./shaders";
 import type { Mode } from "./shaders";
 import type { Splats } from "./splats";
 
-/** What is drawn of the picture's columns. */
+/** Range of columns that is drawn in one mode. */
 interface Part {
   readonly mode: Mode;
   readonly from: number;
@@ -23,7 +24,7 @@ export class Renderer {
   private readonly vertices: WebGLVertexArrayObject;
   private readonly nothing: WebGLVertexArrayObject;
 
-  /** Throws where shaders are refused. */
+  /** Throws an Error if the driver rejects a shader. */
   constructor(gl: WebGL2RenderingContext) {
     this.gl = gl;
     this.target = new Target(gl);
@@ -33,7 +34,7 @@ export class Renderer {
     this.nothing = gl.createVertexArray();
   }
 
-  /** The picture of a pose, of the lens' size; `divided`: left of that share of the width with textures, right without. */
+  /** Draw a pose at the lens' size. Right of the share `divided` of the width, textures are left out. */
   draw(splats: Splats, pose: Pose, lens: Lens, mode: Mode, divided: number | null = null): void {
     const { gl, target } = this;
     target.resize(lens.width, lens.height);
@@ -52,8 +53,8 @@ export class Renderer {
     gl.disable(gl.BLEND);
   }
 
-  /** The picture on the canvas. */
-  present(splats: Splats, mode: Mode, depths: readonly [number, number], divided: number | null = null): void {
+  /** Copy the picture to the canvas. */
+  present(splats: Splats, mode: Mode, depths: Vec2, divided: number | null = null): void {
     const { gl, screen } = this;
     const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -86,14 +87,14 @@ export class Renderer {
       gl.bindTexture(gl.TEXTURE_2D, texture.handle);
       gl.uniform1i(splat.at(name), unit);
     });
-    const ends = (name: string, { low, step }: Ends): void => { gl.uniform2f(splat.at(name), low, step); };
-    ends("scaleEnds", header.ends.log_scales);
-    ends("quatEnds", header.ends.quats);
-    ends("opacityEnds", header.ends.opacities);
-    ends("colorEnds", header.ends.colors);
-    ends("alphaEnds", header.ends.alphas);
-    for (let l = 0; l < 4; l++) ends(`harmonicEnds[${l}]`, header.ends[`sh_${l}`]);
-    const { alphas } = header.ends;
+    const ends = (name: string, { low, step }: Ends): void => gl.uniform2f(splat.at(name), low, step);
+    const { log_scales, quats, opacities, sh_0, sh_1, sh_2, sh_3, colors, alphas } = header.ends;
+    ends("scaleEnds", log_scales);
+    ends("quatEnds", quats);
+    ends("opacityEnds", opacities);
+    ends("colorEnds", colors);
+    ends("alphaEnds", alphas);
+    for (const [l, band] of [sh_0, sh_1, sh_2, sh_3].entries()) ends(`harmonicEnds[${l}]`, band);
     gl.uniform1f(splat.at("peak"), header.numTexels === null ? 1 : Math.max(1, alphas.low + 255 * alphas.step));
     gl.uniform1f(splat.at("nearPlane"), header.nearPlane);
     gl.uniform1f(splat.at("maxAlpha"), header.maxAlpha);

@@ -1,6 +1,6 @@
 /**
- * What a splat shows at a pixel, as a2tg_jax/pixel.py and a2tg_jax/geometry.py say it. Pictures are drawn upside down:
- * gl_FragCoord then counts pixels as cameras do, y downwards, centres at +0.5.
+ * Shaders that draw splats as a2tg_jax/rasterize/pixel.py and a2tg_jax/core/geometry.py define them. Pictures are drawn
+ * upside down, so that gl_FragCoord has the cameras' pixel coordinates: y down, centres at +0.5.
  */
 
 export const MODES = ["full", "plain", "texture", "resolution", "depth", "normals", "ellipses"] as const;
@@ -58,7 +58,7 @@ vec4 bytesOf(uint word) {
 
 vec4 values(uint word, vec2 ends) { return ends.x + bytesOf(word) * ends.y; }
 
-// Coefficient k of 1 to 15, of those that begin at "first".
+// Coefficient k, 1 to 15, from the words of one row.
 vec3 coefficient(uvec4 words[4], int k, vec2 ends) { return values(words[(k - 1) >> 2][(k - 1) & 3], ends).rgb; }
 
 vec3 colorOf(vec3 base, uint first, int degree, vec3 d) {
@@ -94,7 +94,7 @@ vec3 colorOf(vec3 base, uint first, int degree, vec3 d) {
   return max(sum + 0.5, 0.0);
 }
 
-// The columns of the rotation of a unit quaternion, w not negative.
+// Rotation matrix, by columns, of the unit quaternion with vector part q and w >= 0.
 mat3 rotationOf(vec3 q) {
   float squares = min(dot(q, q), 1.0);
   vec4 p = normalize(vec4(q, sqrt(1.0 - squares)));
@@ -105,7 +105,7 @@ mat3 rotationOf(vec3 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// The corner of the box around a disc of which a part lies behind the near plane.
+// A corner of the box around a disc that crosses the near plane.
 vec2 clippedCorner(vec3 M[3], float reach, vec2 middle, float radius, vec2 side) {
   vec2 low = middle - radius, high = middle + radius;
   const int SIDES = 8;
@@ -131,8 +131,8 @@ vec2 clippedCorner(vec3 M[3], float reach, vec2 middle, float radius, vec2 side)
   return mix(max(low - margin, -1.0), min(high + margin, size + 1.0), side);
 }
 
-// The corner of the smallest turned box around an ellipse and the low-pass filter's circle, and whether all of these lie
-// beside the picture.
+// A corner of the smallest rotated box around an ellipse and the low-pass filter's circle. isBeside tells whether both
+// lie outside the picture.
 vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side, out bool isBeside) {
   isBeside = false;
   float depth = M[2].z;
@@ -185,7 +185,7 @@ void main() {
   if (isBeside) return;
   gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);
 
-  // Seen from the projected mean, p0 = depth (b.y, -a.y, 0), p1 = depth (-b.x, a.x, 0), p2 = depth plane.
+  // Relative to the projected mean: p0 = depth (b.y, -a.y, 0), p1 = depth (-b.x, a.x, 0), p2 = depth plane.
   vec2 last = M[2].xy, a = M[0].xy - middle.x * last, b = M[1].xy - middle.y * last;
   axes = vec4(b.y, -a.y, -b.x, a.x);
   plane = vec3(b.x * last.y - b.y * last.x, last.x * a.y - last.y * a.x, a.x * b.y - a.y * b.x) / depth;
@@ -297,7 +297,7 @@ uniform int mode;
 uniform float divider;
 out vec4 fragment;
 
-// Near is bright, far is dark.
+// Colour ramp: near is bright, far is dark.
 vec3 ramp(float t) {
   vec3 a = vec3(0.99, 0.90, 0.60), b = vec3(0.86, 0.35, 0.35), c = vec3(0.22, 0.10, 0.42), d = vec3(0.02, 0.02, 0.08);
   return t < 0.33 ? mix(a, b, t / 0.33) : t < 0.66 ? mix(b, c, (t - 0.33) / 0.33) : mix(c, d, (t - 0.66) / 0.34);

@@ -1,23 +1,24 @@
-/** Keeps the positions and answers with orders, so that drawing need not wait for sorting. */
+/** Worker that keeps the positions and sorts them off the main thread. */
 
+import type { Row4 } from "./math";
 import { DepthSorter } from "./sort";
 
 export interface AddMessage {
   readonly kind: "add";
-  /** [n, 3] further positions. */
+  /** [n, 3] positions to append. */
   readonly means: Float32Array<ArrayBuffer>;
-  /** How many there will be. */
+  /** Number of positions in the whole scene. */
   readonly total: number;
 }
 
 export interface SortMessage {
   readonly kind: "sort";
-  readonly row: readonly number[];
+  readonly row: Row4;
 }
 
 export interface OrderMessage {
   readonly order: Uint32Array<ArrayBuffer>;
-  readonly row: readonly number[];
+  readonly row: Row4;
 }
 
 const sorter = new DepthSorter();

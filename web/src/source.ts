@@ -1,4 +1,4 @@
-/** Where a scene comes from: within the page, or beside it; and how its bytes arrive. */
+/** Loading of a scene, embedded in the page or in a file beside it, as a stream of bytes. */
 
 import { ChunkReader } from "./chunks";
 import type { Chunk } from "./chunks";
@@ -9,23 +9,23 @@ export const SCENE_FILE = "scene.a2tgw";
 
 export interface Source {
   readonly bytes: ReadableStream<Uint8Array<ArrayBuffer>>;
-  /** Of the whole file; null where that is not known before it has come. */
+  /** Length of the whole file in bytes; null if unknown in advance. */
   readonly length: number | null;
 }
 
-/** The scene that the page holds, or the file beside it. */
+/** Open the scene embedded in the page, else the file beside it. Throws a SceneError if there is neither. */
 export async function openScene(): Promise<Source> {
   const held = document.getElementById("scene-data");
-  if (held !== null) return fromBytes(fromBase64((held.textContent).trim()));
+  if (held !== null) return fromBytes(fromBase64(held.textContent.trim()));
   let response: Response;
   try {
     response = await fetch(SCENE_FILE);
   } catch {
     throw new SceneError(
       location.protocol === "file:"
-        ? "This page must come from a web server: browsers let no page read the files beside it. " +
-          "a2tg export RUN --web OUT --single-file makes one that opens from the disk."
-        : `The scene could not be fetched: ${SCENE_FILE}.`,
+        ? "Serve this page from a web server: browsers do not let a page opened from disk read other files. " +
+            "To get a page that opens from disk, run a2tg export RUN --web OUT --single-file."
+        : `The scene file ${SCENE_FILE} could not be fetched.`,
     );
   }
   if (!response.ok || response.body === null) throw new SceneError(`There is no ${SCENE_FILE} beside this page.`);
@@ -42,18 +42,18 @@ function fromBase64(text: string): Uint8Array<ArrayBuffer> {
   try {
     return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
   } catch {
-    throw new SceneError("The scene within this page is damaged.");
+    throw new SceneError("The scene embedded in this page is damaged.");
   }
 }
 
 export interface Listener {
-  /** First of all, once. */
+  /** Called once, before any chunk. */
   readonly onHeader: (header: Header, numBytes: number) => void;
-  /** What it returns is waited for before more is read. */
+  /** Called for each chunk. Reading continues when the promise resolves. */
   readonly onChunk: (chunk: Chunk, numBytesRead: number) => Promise<void>;
 }
 
-/** Reads a scene to its end. Throws a SceneError where it is damaged, before room is made for what is not there. */
+/** Read a whole scene. Throws a SceneError if it is damaged, before allocating memory for missing data. */
 export async function readScene(source: Source, listener: Listener): Promise<void> {
   const { bytes, length } = source.length === null ? await gathered(source.bytes) : source;
   const reader = bytes.getReader();
@@ -62,7 +62,7 @@ export async function readScene(source: Source, listener: Listener): Promise<voi
   const announced = HEAD_BYTES + head.headerBytes + head.bodyBytes;
   if (length !== announced) {
     await reader.cancel();
-    throw new SceneError(`The scene is cut off: it has ${length} bytes of ${announced}.`);
+    throw new SceneError(`The scene is cut off or damaged: it has ${length} bytes, but should have ${announced}.`);
   }
   const more = await firstBytes(reader, HEAD_BYTES + head.headerBytes, start);
   const header = headerOf(more.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes), head);
@@ -80,13 +80,21 @@ function headerOf(text: Uint8Array, head: ReturnType<typeof parseHead>): Header 
 
 type Reader = ReadableStreamDefaultReader<Uint8Array<ArrayBuffer>>;
 
-async function readBody(reader: Reader, first: Uint8Array<ArrayBuffer>, header: Header, listener: Listener): Promise<void> {
+async function readBody(
+  reader: Reader,
+  first: Uint8Array<ArrayBuffer>,
+  header: Header,
+  listener: Listener,
+): Promise<void> {
   let numRead = first.length;
   const coded = new ReadableStream<Uint8Array<ArrayBuffer>>({
-    start: (controller) => { controller.enqueue(first); },
+    start: (controller) => controller.enqueue(first),
     pull: async (controller) => {
       const { value, done } = await reader.read();
-      if (done) { controller.close(); return; }
+      if (done) {
+        controller.close();
+        return;
+      }
       numRead += value.length;
       controller.enqueue(value);
     },
@@ -99,13 +107,17 @@ async function readBody(reader: Reader, first: Uint8Array<ArrayBuffer>, header: 
       for (const chunk of chunks.push(piece.value)) await listener.onChunk(chunk, numRead);
     }
   } catch (error) {
-    throw error instanceof SceneError ? error : new SceneError("The scene is damaged: it does not unpack.");
+    throw error instanceof SceneError ? error : new SceneError("The scene is damaged: it cannot be decompressed.");
   }
   chunks.end();
 }
 
-/** At least so many bytes, what was read before included. */
-async function firstBytes(reader: Reader, num: number, before: Uint8Array = new Uint8Array(0)): Promise<Uint8Array<ArrayBuffer>> {
+/** Read until at least `num` bytes are there, counting those of `before`. */
+async function firstBytes(
+  reader: Reader,
+  num: number,
+  before: Uint8Array = new Uint8Array(0),
+): Promise<Uint8Array<ArrayBuffer>> {
   const pieces: Uint8Array[] = [before];
   let total = before.length;
   while (total < num) {

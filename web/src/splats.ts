@@ -1,11 +1,16 @@
-/** A scene on the graphics processor, and the worker that sorts it. */
+/** A scene in GPU memory and the worker that sorts it. */
 
-import { LongTexture } from "./gl";
-import type { Header } from "./format";
+import { at } from "./arrays";
 import type { Chunk } from "./chunks";
+import type { Header } from "./format";
+import { LongTexture } from "./gl";
+import type { Row4, Vec3 } from "./math";
 import { Packer, mostHarmonics } from "./packing";
 import SortWorker from "./sort.worker?worker&inline";
 import type { AddMessage, OrderMessage, SortMessage } from "./sort.worker";
+
+/** Size at which the sample stops growing, and largest number of positions that one chunk adds to it. */
+const SAMPLE = 4096;
 
 export class Splats {
   readonly header: Header;
@@ -14,25 +19,25 @@ export class Splats {
   readonly texels: LongTexture;
   readonly order: WebGLBuffer;
   readonly widthBits: number;
-  /** Rows that have come. */
+  /** Number of rows received. */
   num = 0;
-  /** Rows in the order that is drawn. */
+  /** Number of rows in the current order. */
   numDrawn = 0;
   numTexels = 0;
   numBytes = 0;
-  /** Positions of the first rows, which show most: to find a place to stand. */
-  readonly sample: number[] = [];
-  /** Called when there is another order to draw. */
+  /** Positions of the first rows, the most visible ones, from which the initial view is found. */
+  readonly sample: Vec3[] = [];
+  /** Handler for a new order. */
   onOrder: () => void = () => undefined;
-  /** Called when the worker cannot work. */
+  /** Handler for errors of the worker. */
   onFail: (reason: string) => void = () => undefined;
 
   private readonly gl: WebGL2RenderingContext;
   private readonly packer: Packer;
   private readonly worker: Worker;
   private isSorting = false;
-  private wanted: readonly number[] | null = null;
-  private sorted: { row: readonly number[]; num: number } | null = null;
+  private wanted: Row4 | null = null;
+  private sorted: { row: Row4; num: number } | null = null;
   private waiting: (() => void)[] = [];
 
   constructor(gl: WebGL2RenderingContext, header: Header) {
@@ -45,8 +50,8 @@ export class Splats {
     this.order = gl.createBuffer();
     this.packer = new Packer(header);
     this.worker = new SortWorker();
-    this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => { this.receive(event.data); });
-    this.worker.addEventListener("error", (event) => { this.onFail(event.message); });
+    this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => this.receive(event.data));
+    this.worker.addEventListener("error", (event) => this.onFail(event.message));
   }
 
   add(chunk: Chunk): void {
@@ -57,19 +62,19 @@ export class Splats {
     this.numBytes += packed.rows.byteLength + packed.harmonics.byteLength + packed.texels.byteLength;
     this.num += packed.num;
     this.numTexels += packed.texels.length / 4;
-    if (this.sample.length < 3 * 4096) this.sample.push(...packed.means.subarray(0, 3 * 4096));
+    if (this.sample.length < SAMPLE) this.sample.push(...pointsOf(packed.means.subarray(0, 3 * SAMPLE)));
     const message: AddMessage = { kind: "add", means: packed.means, total: this.header.num };
     this.worker.postMessage(message, [packed.means.buffer]);
   }
 
-  /** Asks for the order of these depths, row · (x, y, z, 1); the last one asked for wins. */
-  sort(row: readonly number[]): void {
+  /** Request a sort by the depth row · (x, y, z, 1). A later request replaces a pending one. */
+  sort(row: Row4): void {
     if (this.sorted !== null && this.sorted.num === this.num && row.every((x, i) => x === this.sorted?.row[i])) return;
     this.wanted = row;
     this.next();
   }
 
-  /** Resolves when the order asked for last is there. */
+  /** Resolve when the last request is done. */
   async settled(): Promise<void> {
     if (!this.isSorting && this.wanted === null) return;
     await new Promise<void>((resolve) => this.waiting.push(resolve));
@@ -101,4 +106,13 @@ export class Splats {
     this.next();
     this.onOrder();
   }
+}
+
+/** Split [x, y, z, …] into positions. */
+function pointsOf(means: Float32Array): Vec3[] {
+  return Array.from({ length: means.length / 3 }, (_, i) => [
+    at(means, 3 * i),
+    at(means, 3 * i + 1),
+    at(means, 3 * i + 2),
+  ]);
 }

@@ -1,27 +1,27 @@
-/** A training that runs: its figures beside the picture, a new scene when there is one, pause and resume. */
+/** Live training: shows its progress, loads new scenes, pauses and resumes it. */
 
 import { bytesText, countText, element, setText } from "./page";
 
 const STATUS_FILE = "training.json";
 const PERIOD = 1000;
 
-/** What the server tells of it. */
+/** Status of the training, as the server reports it. */
 export interface Status {
-  /** Counts the scenes; 0 before the first. */
+  /** Number of scenes so far. */
   readonly version: number;
   readonly message: string;
   readonly stage: string;
   readonly isPaused: boolean;
   readonly iterations: number;
   readonly iteration: number;
-  /** NaN before the first tenth iteration, as the following. */
+  /** NaN before iteration 10, like the fields below. */
   readonly loss: number;
   readonly psnr: number;
   readonly num: number;
   readonly bytes: number;
 }
 
-/** null where that is no status. */
+/** Parse a status. Returns null if `value` is none. */
 export function statusOf(value: unknown): Status | null {
   if (typeof value !== "object" || value === null) return null;
   const fields = value as Readonly<Record<string, unknown>>;
@@ -47,10 +47,13 @@ export function statusOf(value: unknown): Status | null {
 
 export function statusText(status: Status): string {
   if (status.message !== "") return status.message;
-  if (Number.isNaN(status.loss)) return status.stage === "" ? "The training begins." : `${status.stage} begins.`;
+  if (Number.isNaN(status.loss))
+    return status.stage === "" ? "Training is starting." : `Stage ${status.stage} is starting.`;
   const state = status.isPaused ? ", paused" : "";
-  return `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
-    `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`;
+  return (
+    `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
+    `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`
+  );
 }
 
 async function ask(path: string, method: "GET" | "POST"): Promise<Status | null> {
@@ -63,9 +66,9 @@ async function ask(path: string, method: "GET" | "POST"): Promise<Status | null>
 }
 
 /**
- * Follows a training while there is one; resolves at once to false where there is none.
+ * Follow a training until it ends. Resolves to false at once if there is none.
  *
- * @param show shows the scene beside the page, which is another each time.
+ * @param show - loads and shows the current scene
  */
 export async function followTraining(show: () => Promise<void>): Promise<boolean> {
   let status = await ask(STATUS_FILE, "GET");
@@ -74,7 +77,9 @@ export async function followTraining(show: () => Promise<void>): Promise<boolean
   const button = element("pause", HTMLButtonElement);
   button.addEventListener("click", () => {
     const isPaused = button.dataset.paused === "yes";
-    void ask(isPaused ? "resume" : "pause", "POST").then((found) => { if (found !== null) tell(found); });
+    void ask(isPaused ? "resume" : "pause", "POST").then((found) => {
+      if (found !== null) tell(found);
+    });
   });
   for (let version = 0; status !== null; status = await ask(STATUS_FILE, "GET")) {
     tell(status);
@@ -85,7 +90,7 @@ export async function followTraining(show: () => Promise<void>): Promise<boolean
     await new Promise((resolve) => setTimeout(resolve, PERIOD));
   }
   button.disabled = true;
-  setText("state", "The training has ended, or this page is cut off from it. a2tg view shows what it left.");
+  setText("state", "The training has ended or cannot be reached. To see the result, run a2tg view.");
   return true;
 }
 

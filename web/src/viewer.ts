@@ -1,13 +1,14 @@
-/** A scene on a canvas: what is looked at, from where, and when it is drawn anew. */
+/** The viewer: a scene, the current view of it, and when to redraw the canvas. */
 
-import { aimed, fitted, overview, poseOf, projection } from "./camera";
+import { at } from "./arrays";
+import { aimed, fitted, lensOf, overview, poseOf, projection } from "./camera";
 import type { Lens, Pose } from "./camera";
 import { Controls } from "./controls";
 import type { Steered } from "./controls";
 import { SceneError } from "./format";
 import type { Header, SceneCamera } from "./format";
 import { add, dot, norm, scale, subtract } from "./math";
-import type { Vec3 } from "./math";
+import type { Row4, Vec2, Vec3 } from "./math";
 import { Renderer } from "./renderer";
 import type { Mode } from "./shaders";
 import { Splats } from "./splats";
@@ -15,25 +16,25 @@ import { Splats } from "./splats";
 const SLOW = 45;
 const QUICK = 18;
 const COARSEST = 0.25;
-/** Milliseconds without a motion, after which the picture is drawn in full. */
+/** Milliseconds after the last motion until the picture is drawn at full resolution. */
 const REST = 160;
 
 export class Viewer implements Steered {
   readonly canvas: HTMLCanvasElement;
   splats: Splats | null = null;
   pose: Pose = overview([0, 0, 0], 1, [0, 0, 1]);
-  /** Of the picture that one looks at; the canvas shows all of it, and more beside it. */
+  /** Lens of the current view. The canvas shows its whole image and, if wider or higher, more around it. */
   image: Lens = { fx: 600, fy: 600, cx: 400, cy: 300, skew: 0, width: 800, height: 600 };
   up: Vec3 = [0, 0, 1];
   extent = 1;
   mode: Mode = "full";
-  /** Textures are shown left of this share of the width; null: everywhere. */
+  /** Share of the width left of which textures are shown; null shows them everywhere. */
   divided: number | null = null;
-  /** Called after each picture. */
+  /** Handler called after each frame. */
   onFrame: (milliseconds: number) => void = () => undefined;
-  /** Called when the scene cannot be drawn. */
+  /** Handler called when the scene cannot be drawn. */
   onFail: (reason: string) => void = () => undefined;
-  /** Called when one has moved away from where one was put. */
+  /** Handler called when the user has moved the camera. */
   onLeave: () => void = () => undefined;
 
   private readonly gl: WebGL2RenderingContext;
@@ -44,23 +45,23 @@ export class Viewer implements Steered {
   private drawnAt = 0;
   private isSettled = true;
 
-  /** Throws a SceneError where there is no WebGL 2. */
+  /** Throws a SceneError if the browser has no WebGL 2. */
   constructor(canvas: HTMLCanvasElement) {
     this.canvas = canvas;
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
     if (gl === null) {
       throw new SceneError(
-        "This browser offers no WebGL 2, which the viewer draws with. Another browser, or hardware acceleration " +
-          "switched on in this one's settings, may help.",
+        "This browser has no WebGL 2, which the viewer needs. Turn on hardware acceleration in its settings, or try " +
+          "another browser.",
       );
     }
     this.gl = gl;
     this.renderer = new Renderer(gl);
     new Controls(canvas, this);
-    new ResizeObserver(() => { this.draw(); }).observe(canvas);
+    new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
-  /** Begins a scene; it takes the place of the one before once all of it is sorted. */
+  /** Start a scene, which replaces the current one once it is completely sorted. */
   begin(header: Header): Splats {
     const splats = new Splats(this.gl, header);
     splats.onOrder = () => {
@@ -70,35 +71,35 @@ export class Viewer implements Steered {
       }
       this.draw();
     };
-    splats.onFail = (reason) => { this.onFail(reason); };
+    splats.onFail = (reason) => this.onFail(reason);
     return splats;
   }
 
-  /** Sorts a scene for the present view. */
+  /** Sort a scene for the current view. */
   sort(splats: Splats): void {
     splats.sort(this.depthRow);
   }
 
-  /** Finds out how large the scene is and which way is up, and goes to its first camera. */
+  /** Estimate the extent and up direction of a scene, and go to its first camera. */
   settle(splats: Splats): void {
     const { cameras } = splats.header;
     const { centre, radius } = middleOf(splats.sample);
-    this.up = cameras.length > 0 ? [0, 0, 1] : [0, -1, 0];
-    this.extent = cameras.length > 0 ? 1 : radius;
-    if (cameras.length > 0) this.goTo(cameras[0]);
+    const [first] = cameras;
+    this.up = first !== undefined ? [0, 0, 1] : [0, -1, 0];
+    this.extent = first !== undefined ? 1 : radius;
+    if (first !== undefined) this.goTo(first);
     else this.pose = overview(centre, radius, this.up);
   }
 
   goTo(camera: SceneCamera): void {
-    const [fx, skew, cx, , fy, cy] = camera.K;
-    this.image = { fx, fy, cx, cy, skew, width: camera.size[0], height: camera.size[1] };
+    this.image = lensOf(camera.K, camera.size);
     const pose = poseOf(camera.viewmat, 1);
-    // What one turns around lies near the middle of the scene.
+    // Cameras carry no target: use the point on the optical axis nearest to the origin, the middle of the scene.
     this.pose = { ...pose, focus: Math.max(-dot(pose.position, pose.rotation[2]), 0.2 * this.extent) };
     this.draw();
   }
 
-  /** The lens for the canvas, in pixels as the page counts them. */
+  /** Lens for the canvas, in CSS pixels. */
   get lens(): Lens {
     return fitted(this.image, Math.max(this.canvas.clientWidth, 1), Math.max(this.canvas.clientHeight, 1));
   }
@@ -109,14 +110,15 @@ export class Viewer implements Steered {
     this.draw();
   }
 
-  /** Turns around what is seen at a point of the canvas. */
+  /** Make the surface at a point of the canvas the target. */
   onAim(x: number, y: number): void {
     const { lens, splats } = this;
     if (splats === null) return;
     this.renderer.draw(splats, this.pose, lens, "depth");
     const column = Math.min(Math.max(Math.floor(x), 0), lens.width - 1);
     const row = Math.min(Math.max(Math.floor(y), 0), lens.height - 1);
-    const [depth, , , alpha] = this.renderer.target.read(column, row, 1, 1);
+    const pixel = this.renderer.target.read(column, row, 1, 1);
+    const [depth, alpha] = [at(pixel, 0), at(pixel, 3)];
     if (alpha > 0.1) {
       const z = depth / alpha;
       const [right, down, forward] = this.pose.rotation;
@@ -127,17 +129,17 @@ export class Viewer implements Steered {
     this.onMove();
   }
 
-  /** Draws at the next occasion. */
+  /** Request a redraw with the next frame. */
   draw(): void {
     if (this.isWaiting) return;
     this.isWaiting = true;
-    requestAnimationFrame((time) => { this.frame(time); });
+    requestAnimationFrame((time) => this.frame(time));
   }
 
-  /** The picture of a pose and a lens as numbers, [h, w, 4], rows from the top: colours times alpha, and alpha. */
+  /** Render a view to [h, w, 4], rows from the top: premultiplied colours and alpha. */
   async read(pose: Pose, lens: Lens, mode: Mode): Promise<Float32Array> {
     const { splats } = this;
-    if (splats === null) throw new SceneError("There is no scene yet.");
+    if (splats === null) throw new SceneError("No scene is loaded yet.");
     splats.sort(projection(pose, lens)[2]);
     await splats.settled();
     this.renderer.draw(splats, pose, lens, mode);
@@ -146,7 +148,7 @@ export class Viewer implements Steered {
     return found;
   }
 
-  private get depthRow(): readonly number[] {
+  private get depthRow(): Row4 {
     return projection(this.pose, this.lens)[2];
   }
 
@@ -170,28 +172,35 @@ export class Viewer implements Steered {
     if (isMoving) this.draw();
   }
 
-  /** Fewer pixels while one moves, where pictures are slow to come. */
+  /** Adapt the resolution during motion to the time between frames. */
   private adapt(milliseconds: number): void {
     if (milliseconds > SLOW) this.coarseness = Math.max(this.coarseness * 0.8, COARSEST);
     else if (milliseconds < QUICK) this.coarseness = Math.min(this.coarseness * 1.05, 1);
   }
 
-  /** From where to where depths are told apart. */
-  private get depths(): readonly [number, number] {
+  /** Nearest and farthest depth of the depth mode's colour ramp. */
+  private get depths(): Vec2 {
     return [0.3 * this.pose.focus, 5 * this.pose.focus];
   }
 }
 
-/** Where most of the positions [x, y, z, …] lie. */
-function middleOf(positions: readonly number[]): { centre: Vec3; radius: number } {
-  if (positions.length === 0) return { centre: [0, 0, 0], radius: 1 };
-  const axis = (k: number): number[] => positions.filter((_, i) => i % 3 === k);
-  const centre = [0, 1, 2].map((k) => quantile(axis(k), 0.5)) as unknown as Vec3;
-  const [xs, ys, zs] = [axis(0), axis(1), axis(2)];
-  const distances = xs.map((x, i) => norm(subtract([x, ys[i], zs[i]], centre)));
+/** Return the median position and the radius around it that holds three quarters of the points. */
+function middleOf(points: readonly Vec3[]): { centre: Vec3; radius: number } {
+  if (points.length === 0) return { centre: [0, 0, 0], radius: 1 };
+  const median = (k: 0 | 1 | 2): number =>
+    quantile(
+      points.map((point) => point[k]),
+      0.5,
+    );
+  const centre: Vec3 = [median(0), median(1), median(2)];
+  const distances = points.map((point) => norm(subtract(point, centre)));
   return { centre, radius: Math.max(quantile(distances, 0.75), 1e-6) };
 }
 
+/** Return a quantile of one or more values, which are sorted in place. */
 function quantile(values: number[], share: number): number {
-  return values.sort((a, b) => a - b)[Math.floor(share * (values.length - 1))];
+  return at(
+    values.sort((a, b) => a - b),
+    Math.floor(share * (values.length - 1)),
+  );
 }

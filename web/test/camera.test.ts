@@ -4,61 +4,60 @@ import { aimed, dollied, fitted, moved, orbited, overview, poseOf, projection, t
 import type { Lens, Pose } from "../src/camera";
 import { linkOf, viewOf } from "../src/link";
 import { cross, dot, norm, orthonormal, subtract } from "../src/math";
-import type { Vec3 } from "../src/math";
+import type { Row4, Vec3 } from "../src/math";
+import { expectClose } from "./close";
 
 const LENS: Lens = { fx: 500, fy: 510, cx: 320.5, cy: 230, skew: 0.5, width: 640, height: 480 };
 const UP: Vec3 = [0, 0, 1];
 const POSE: Pose = overview([0.3, -0.2, 0.1], 1.3, UP);
 
-const closeTo = (found: readonly number[], wanted: readonly number[]): void => {
-  found.forEach((x, i) => { expect(x).toBeCloseTo(wanted[i], 9); });
-};
-
 function pixel(pose: Pose, lens: Lens, point: Vec3): [number, number, number] {
-  const [x, y, z] = projection(pose, lens).map((row) => dot([row[0], row[1], row[2]], point) + row[3]);
+  const along = ([a, b, c, d]: Row4): number => dot([a, b, c], point) + d;
+  const [first, second, third] = projection(pose, lens);
+  const [x, y, z] = [along(first), along(second), along(third)];
   return [x / z, y / z, z];
 }
 
 function expectRotation(pose: Pose): void {
   const [x, y, z] = pose.rotation;
   for (const axis of pose.rotation) expect(norm(axis)).toBeCloseTo(1, 9);
-  closeTo(cross(x, y), z);
+  expectClose(cross(x, y), z);
 }
 
 test("the target lies in the middle, at the focus", () => {
-  closeTo(pixel(POSE, LENS, target(POSE)), [LENS.cx, LENS.cy, POSE.focus]);
+  expectClose(pixel(POSE, LENS, target(POSE)), [LENS.cx, LENS.cy, POSE.focus]);
 });
 
-test("what is up in the world is up on the screen", () => {
+test("the world's up direction is up on the screen", () => {
   const above = pixel(POSE, LENS, [0.3, -0.2, 0.6]);
   expect(above[1]).toBeLessThan(LENS.cy);
   expectRotation(POSE);
 });
 
-test("a world-to-camera matrix and back", () => {
+test("a pose survives conversion to a matrix and back", () => {
   const viewmat = viewmatOf(POSE);
   const again = poseOf(viewmat, POSE.focus);
-  closeTo(again.position, POSE.position);
-  closeTo(viewmatOf(again), viewmat);
+  expectClose(again.position, POSE.position);
+  expectClose(viewmatOf(again), viewmat);
 });
 
 test("orbits keep the target and its distance", () => {
   let pose = POSE;
   for (let i = 0; i < 50; i++) {
     pose = orbited(pose, UP, 0.3, 0.2);
-    closeTo(target(pose), target(POSE));
+    expectClose(target(pose), target(POSE));
     expect(norm(subtract(pose.position, target(pose)))).toBeCloseTo(POSE.focus, 9);
     expectRotation(pose);
     expect(Math.abs(dot(pose.rotation[2], UP))).toBeLessThan(0.9999);
   }
 });
 
-test("dollies keep the target, to a least distance", () => {
-  closeTo(target(dollied(POSE, 0.5, 0.01)), target(POSE));
+test("dollies keep the target and a minimum distance", () => {
+  expectClose(target(dollied(POSE, 0.5, 0.01)), target(POSE));
   expect(dollied(POSE, 1e-9, 0.25).focus).toBe(0.25);
 });
 
-test("moves go along the camera's own axes", () => {
+test("moves follow the camera's own axes", () => {
   const by = subtract(moved(POSE, [0, 0, 2]).position, POSE.position);
   expect(dot(by, POSE.rotation[2])).toBeCloseTo(2, 9);
 });
@@ -66,28 +65,45 @@ test("moves go along the camera's own axes", () => {
 test("aiming puts a point in the middle", () => {
   const at: Vec3 = [0.5, 0.1, -0.3];
   const found = pixel(aimed(POSE, at), LENS, at);
-  closeTo(found.slice(0, 2), [LENS.cx, LENS.cy]);
+  expectClose(found.slice(0, 2), [LENS.cx, LENS.cy]);
 });
 
-test.each([[1280, 480], [390, 844], [640, 480]])("a canvas of %i × %i shows the whole image", (width, height) => {
+test.each([
+  [1280, 480],
+  [390, 844],
+  [640, 480],
+])("a canvas of %i × %i shows the whole image", (width, height) => {
   const lens = fitted(LENS, width, height);
   const s = Math.min(width / 640, height / 480);
   expect(lens.cx - width / 2).toBeCloseTo(s * (LENS.cx - 320), 9);
   expect(lens.fy / lens.fx).toBeCloseTo(LENS.fy / LENS.fx, 9);
 });
 
-test("links carry a view", () => {
+test("links preserve a view", () => {
   const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth" }));
   expect(view?.mode).toBe("depth");
-  view?.pose.position.forEach((x, i) => { expect(x).toBeCloseTo(POSE.position[i], 5); });
-  view?.pose.rotation.flat().forEach((x, i) => { expect(x).toBeCloseTo(POSE.rotation.flat()[i], 5); });
+  expectClose(view?.pose.position ?? [], POSE.position, 5);
+  expectClose(view?.pose.rotation.flat() ?? [], POSE.rotation.flat(), 5);
   expect(view?.lens).toEqual(LENS);
 });
 
-test.each(["", "#view=", "#view=1,2,3", `#view=${"1,".repeat(16)}x`, `#view=${Array(17).fill("-1").join()}`, "#view=<b>", `#view=${Array(17).fill("1e99").join()}`])(
-  "other links carry none: %s", (hash) => { expect(viewOf(hash)).toBeNull(); });
+test.each([
+  "",
+  "#view=",
+  "#view=1,2,3",
+  `#view=${"1,".repeat(16)}x`,
+  `#view=${Array(17).fill("-1").join()}`,
+  "#view=<b>",
+  `#view=${Array(17).fill("1e99").join()}`,
+])("other links hold no view: %s", (hash) => {
+  expect(viewOf(hash)).toBeNull();
+});
 
-test("rows that are no rotation are made one", () => {
-  const [x, y, z] = orthonormal([[0, 0, 0], [0, 0, 0], [0, 0, 0]]);
-  closeTo(cross(x, y), z);
+test("degenerate rows become a rotation", () => {
+  const [x, y, z] = orthonormal([
+    [0, 0, 0],
+    [0, 0, 0],
+    [0, 0, 0],
+  ]);
+  expectClose(cross(x, y), z);
 });

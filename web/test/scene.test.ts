@@ -1,9 +1,11 @@
 import { expect, test } from "vitest";
 
+import { at } from "../src/arrays";
 import type { Chunk } from "../src/chunks";
 import { ChunkReader } from "../src/chunks";
-import { HEAD_BYTES, SceneError, crc32, fixedColumns, parseHead, parseHeader } from "../src/format";
-import type { Header } from "../src/format";
+import { crc32 } from "../src/crc32";
+import { HEAD_BYTES, SceneError, fixedColumns, parseHead, parseHeader } from "../src/format";
+import type { Header, Quantity } from "../src/format";
 import { HARMONIC_TEXELS, Packer, mostHarmonics } from "../src/packing";
 import { fromBytes, readScene } from "../src/source";
 import { NUMBERS, SMALL } from "./small";
@@ -14,14 +16,17 @@ async function read(bytes: Uint8Array<ArrayBuffer>): Promise<{ header: Header; c
   const chunks: Chunk[] = [];
   const headers: Header[] = [];
   await readScene(fromBytes(bytes), {
-    onHeader: (found) => { headers.push(found); },
-    onChunk: (chunk) => { chunks.push(chunk); return Promise.resolve(); },
+    onHeader: (found) => headers.push(found),
+    onChunk: (chunk) => {
+      chunks.push(chunk);
+      return Promise.resolve();
+    },
   });
   expect(headers.length).toBe(1);
-  return { header: headers[0], chunks };
+  return { header: at(headers, 0), chunks };
 }
 
-/** The small scene with another header. */
+/** Return the small scene with fields of its header replaced and `cut` bytes of its body removed. */
 function changed(changes: Record<string, unknown>, cut = 0): Uint8Array<ArrayBuffer> {
   const head = parseHead(SMALL);
   const text = new TextDecoder().decode(SMALL.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes));
@@ -30,32 +35,36 @@ function changed(changes: Record<string, unknown>, cut = 0): Uint8Array<ArrayBuf
   const bytes = new Uint8Array(HEAD_BYTES + header.length + body.length);
   bytes.set(SMALL.subarray(0, 10));
   const view = new DataView(bytes.buffer);
-  [header.length, body.length, crc32(header)].forEach((number, i) => { view.setUint32(10 + 4 * i, number, true); });
+  [header.length, body.length, crc32(header)].forEach((number, i) => {
+    view.setUint32(10 + 4 * i, number, true);
+  });
   bytes.set(header, HEAD_BYTES);
   bytes.set(body, HEAD_BYTES + header.length);
   return bytes;
 }
 
-const byteOf = (word: number, index: number): number => (word >>> (8 * index)) & 255;
+const SH = ["sh_0", "sh_1", "sh_2", "sh_3"] as const;
+const byteOf = (words: Uint32Array, place: number, index: number): number => (at(words, place) >>> (8 * index)) & 255;
 
-test("crc32 is zlib's", () => {
+test("crc32 equals zlib's", () => {
   expect(crc32(new TextEncoder().encode("123456789"))).toBe(0xcbf43926);
 });
 
-test("the header says what the file holds", async () => {
+test("the header describes the file", async () => {
   const { header, chunks } = await read(SMALL);
   expect(header.num).toBe(NUM);
-  expect([header.title, header.note, header.cameras[0].name]).toEqual(["small", "a note", "<b>a</b>.png"]);
+  expect([header.title, header.note, header.cameras[0]?.name]).toEqual(["small", "a note", "<b>a</b>.png"]);
   expect(header.background).toEqual([0.25, 0.5, 0.75]);
   expect(chunks.length).toBeGreaterThan(1);
   expect(chunks.reduce((sum, chunk) => sum + chunk.num, 0)).toBe(NUM);
 });
 
-test("rows are packed as another reader finds them", async () => {
+test("packed rows equal those of the Python reader", async () => {
   const { header, chunks } = await read(SMALL);
   const packer = new Packer(header);
-  const near = (found: number, wanted: number): void => { expect(Math.abs(found - wanted)).toBeLessThan(3e-5 * (1 + Math.abs(wanted))); };
-  const value = (name: string, code: number): number => header.ends[name].low + code * header.ends[name].step;
+  const near = (found: number, wanted: number): void =>
+    expect(Math.abs(found - wanted)).toBeLessThan(3e-5 * (1 + Math.abs(wanted)));
+  const value = (name: Quantity, code: number): number => header.ends[name].low + code * header.ends[name].step;
   let [row, texel, harmonic] = [0, 0, 0];
   for (const chunk of chunks) {
     const packed = packer.pack(chunk);
@@ -63,34 +72,35 @@ test("rows are packed as another reader finds them", async () => {
     for (let i = 0; i < packed.num; i++, row++) {
       const words = packed.rows.subarray(8 * i, 8 * i + 8);
       for (let k = 0; k < 3; k++) {
-        near(packed.means[3 * i + k], NUMBERS.means[3 * row + k]);
-        expect(floats[8 * i + k]).toBe(packed.means[3 * i + k]);
-        near(value("quats", byteOf(words[4], k)), NUMBERS.quats[4 * row + k + 1]);
-        if (row < 40) near(value("sh_0", byteOf(words[3], k)), NUMBERS.sh[48 * row + k]);
+        near(at(packed.means, 3 * i + k), at(NUMBERS.means, 3 * row + k));
+        expect(at(floats, 8 * i + k)).toBe(at(packed.means, 3 * i + k));
+        near(value("quats", byteOf(words, 4, k)), at(NUMBERS.quats, 4 * row + k + 1));
+        if (row < 40) near(value("sh_0", byteOf(words, 3, k)), at(NUMBERS.sh, 48 * row + k));
       }
-      const degree = byteOf(words[3], 3);
+      const degree = byteOf(words, 3, 3);
       expect(degree).toBe(NUMBERS.degrees[row]);
-      near(value("opacities", byteOf(words[4], 3)), NUMBERS.opacities[row]);
-      for (let k = 0; k < 2; k++) near(value("log_scales", byteOf(words[5], k)), NUMBERS.log_scales[2 * row + k]);
-      const [width, height] = [byteOf(words[5], 2), byteOf(words[5], 3)];
+      near(value("opacities", byteOf(words, 4, 3)), at(NUMBERS.opacities, row));
+      for (let k = 0; k < 2; k++) near(value("log_scales", byteOf(words, 5, k)), at(NUMBERS.log_scales, 2 * row + k));
+      const [width, height] = [byteOf(words, 5, 2), byteOf(words, 5, 3)];
       expect([height, width]).toEqual(NUMBERS.sizes.slice(2 * row, 2 * row + 2));
       expect([words[6], words[7]]).toEqual([texel, harmonic]);
       for (let k = 1; row < 40 && k < (degree + 1) ** 2; k++) {
-        const band = Math.floor(Math.sqrt(k));
-        const first = packed.rows[7];
-        const word = packed.harmonics[4 * (harmonic - first) + k - 1];
-        for (let c = 0; c < 3; c++) near(value(`sh_${band}`, byteOf(word, c)), NUMBERS.sh[48 * row + 3 * k + c]);
+        const band = at(SH, Math.floor(Math.sqrt(k)));
+        const place = 4 * (harmonic - at(packed.rows, 7)) + k - 1;
+        for (let c = 0; c < 3; c++) {
+          near(value(band, byteOf(packed.harmonics, place, c)), at(NUMBERS.sh, 48 * row + 3 * k + c));
+        }
       }
       for (let t = texel; t < Math.min(texel + width * height, 100); t++) {
-        const codes = packed.texels.subarray(4 * (t - packed.rows[6]));
+        const codes = packed.texels.subarray(4 * (t - at(packed.rows, 6)));
         for (let c = 0; c < 3; c++) {
-          const root = value("colors", codes[c]);
-          near(root * Math.abs(root), NUMBERS.texels[4 * t + c]);
+          const root = value("colors", at(codes, c));
+          near(root * Math.abs(root), at(NUMBERS.texels, 4 * t + c));
         }
-        near(value("alphas", codes[3]), NUMBERS.texels[4 * t + 3]);
+        near(value("alphas", at(codes, 3)), at(NUMBERS.texels, 4 * t + 3));
       }
       texel += width * height;
-      harmonic += HARMONIC_TEXELS[degree];
+      harmonic += at(HARMONIC_TEXELS, degree);
     }
   }
   expect(row).toBe(NUM);
@@ -98,7 +108,7 @@ test("rows are packed as another reader finds them", async () => {
   expect(harmonic).toBeLessThanOrEqual(mostHarmonics(header));
 });
 
-test.each([1, 7, 1000, 1e6])("bytes may come in pieces of %i", async (size) => {
+test.each([1, 7, 1000, 1e6])("bytes may arrive in pieces of %i", async (size) => {
   const { header, chunks } = await read(SMALL);
   const head = parseHead(SMALL);
   const coded = new Blob([SMALL.subarray(HEAD_BYTES + head.headerBytes)]).stream();
@@ -112,42 +122,76 @@ test.each([1, 7, 1000, 1e6])("bytes may come in pieces of %i", async (size) => {
   expect(() => reader.push(new Uint8Array(1))).toThrow(SceneError);
 });
 
-test("files that are cut off are refused", async () => {
+test("truncated files are rejected", async () => {
   for (const length of [0, 5, HEAD_BYTES, HEAD_BYTES + 30, SMALL.length >> 1, SMALL.length - 1]) {
     await expect(read(SMALL.slice(0, length))).rejects.toThrow(SceneError);
   }
   await expect(read(changed({}, 40))).rejects.toThrow(/damaged|cut off/);
 });
 
-test("every changed byte is noticed", async () => {
+test("every changed byte is detected", async () => {
   for (let place = 0; place < SMALL.length; place += 97) {
     const spoiled = SMALL.slice();
-    spoiled[place] ^= 0x55;
+    spoiled[place] = at(spoiled, place) ^ 0x55;
     await expect(read(spoiled), `byte ${place}`).rejects.toThrow(SceneError);
   }
 });
 
 test.each([
-  { num: 1 << 24 }, { num: -1 }, { num: 1.5 }, { num: "3" }, { num_texels: 1 << 25 }, { num_texels: -2 }, { chunk: 0 },
-  { bytes: 2 ** 40 }, { bytes: 10 }, { base_degree: 4 }, { num_bands: 0 }, { num_bands: 9 }, { means: [] },
-  { means: [[1, 2, 3, 4], [1, 2, 3, 4], [1, 2, 3, null]] }, { ends: 3 }, { ends: { colors: [0] } }, { cameras: [{}] },
-  { cameras: [3] }, { uv: "elsewhere" }, { outside: null }, { max_alpha: 2 }, { near_plane: 0 }, { background: "red" },
-  { title: 3 }, { note: null },
-])("a header that lies is refused: %o", async (changes) => {
+  { num: 1 << 24 },
+  { num: -1 },
+  { num: 1.5 },
+  { num: "3" },
+  { num_texels: 1 << 25 },
+  { num_texels: -2 },
+  { chunk: 0 },
+  { bytes: 2 ** 40 },
+  { bytes: 10 },
+  { base_degree: 4 },
+  { num_bands: 0 },
+  { num_bands: 9 },
+  { means: [] },
+  {
+    means: [
+      [1, 2, 3, 4],
+      [1, 2, 3, 4],
+      [1, 2, 3, null],
+    ],
+  },
+  { ends: 3 },
+  { ends: { colors: [0] } },
+  { cameras: [{}] },
+  { cameras: [3] },
+  { uv: "elsewhere" },
+  { outside: null },
+  { max_alpha: 2 },
+  { near_plane: 0 },
+  { background: "red" },
+  { title: 3 },
+  { note: null },
+])("invalid headers are rejected: %o", async (changes) => {
   await expect(read(changed(changes))).rejects.toThrow(SceneError);
 });
 
-test("rows that contradict the header are refused", async () => {
+test("rows that contradict the header are rejected", async () => {
   expect((await read(changed({}))).header.num).toBe(NUM);
-  for (const changes of [{ num: NUM - 1 }, { num: NUM + 1 }, { num_texels: null }, { num_bands: 3 }, { base_degree: 2 }]) {
+  for (const changes of [
+    { num: NUM - 1 },
+    { num: NUM + 1 },
+    { num_texels: null },
+    { num_bands: 3 },
+    { base_degree: 2 },
+  ]) {
     await expect(read(changed(changes))).rejects.toThrow(SceneError);
   }
 });
 
-test("room is made for what is announced only where it can be there", () => {
+test("memory is allocated only for data that the file can hold", () => {
   const head = parseHead(SMALL);
   const header = parseHeader(SMALL.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes), head);
   expect(fixedColumns(header)).toBe(18);
   expect(header.bytes).toBeLessThanOrEqual(1 << 24);
-  expect(() => parseHead(Uint8Array.from(SMALL.subarray(0, HEAD_BYTES), (byte, i) => (i >= 10 && i < 14 ? 255 : byte)))).toThrow(SceneError);
+  expect(() =>
+    parseHead(Uint8Array.from(SMALL.subarray(0, HEAD_BYTES), (byte, i) => (i >= 10 && i < 14 ? 255 : byte))),
+  ).toThrow(SceneError);
 });

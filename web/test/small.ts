@@ -1,4 +1,4 @@
-/** A small scene, and the numbers that another reader found in it (tests/viewer_cases.py). */
+/** A small scene and its contents as read in Python (tests/viewer_cases.py). */
 
 import { readFileSync } from "node:fs";
 

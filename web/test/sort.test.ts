@@ -1,5 +1,7 @@
 import { expect, test } from "vitest";
 
+import { at } from "../src/arrays";
+import type { Row4 } from "../src/math";
 import { DepthSorter } from "../src/sort";
 
 function drawn(num: number, seed: number): Float32Array {
@@ -12,14 +14,16 @@ function drawn(num: number, seed: number): Float32Array {
 
 test.each([0, 1, 2, 257, 5000])("%i positions, from the farthest to the nearest, ties from the last", (num) => {
   const means = drawn(num, num + 1);
-  const row = [0.25, -0.5, 1, 2];
-  const depths = Float32Array.from({ length: num }, (_, i) =>
-    row[0] * means[3 * i] + row[1] * means[3 * i + 1] + row[2] * means[3 * i + 2] + row[3]);
-  const wanted = [...depths.keys()].sort((a, b) => depths[b] - depths[a] || b - a);
+  const row: Row4 = [0.25, -0.5, 1, 2];
+  const depths = Float32Array.from({ length: num }, (_, i) => {
+    const [x, y, z] = [at(means, 3 * i), at(means, 3 * i + 1), at(means, 3 * i + 2)];
+    return row[0] * x + row[1] * y + row[2] * z + row[3];
+  });
+  const wanted = [...depths.keys()].sort((a, b) => at(depths, b) - at(depths, a) || b - a);
   expect([...new DepthSorter().sort(means, num, row)]).toEqual(wanted);
 });
 
-test("fewer and more positions than before", () => {
+test("buffers are reused for fewer and for more positions", () => {
   const sorter = new DepthSorter();
   const means = drawn(300, 3);
   const first = sorter.sort(means, 300, [0, 0, 1, 0]);

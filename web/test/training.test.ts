@@ -2,19 +2,33 @@ import { expect, test } from "vitest";
 
 import { statusOf, statusText } from "../src/training";
 
-test("figures of a training", () => {
+test("status of a running training", () => {
   const status = statusOf({
-    version: 3, stage: "textures", iteration: 120, iterations: 2000, loss: 0.12345, psnr: 21.5, num: 1500, bytes: 541792, is_paused: true,
+    version: 3,
+    stage: "textures",
+    iteration: 120,
+    iterations: 2000,
+    loss: 0.12345,
+    psnr: 21.5,
+    num: 1500,
+    bytes: 541792,
+    is_paused: true,
   });
   expect(status?.version).toBe(3);
-  expect(status && statusText(status)).toBe("textures: 120 of 2,000, paused. Loss 0.1235, 21.50 dB, 1,500 Gaussians, 542 kB.");
+  expect(status && statusText(status)).toBe(
+    "textures: 120 of 2,000, paused. Loss 0.1235, 21.50 dB, 1,500 Gaussians, 542 kB.",
+  );
 });
 
-test("before the first figures, and in place of them", () => {
-  const [begins, staged, told] = [{}, { stage: "gaussians" }, { message: "cannot be shown" }].map((more) => statusOf({ version: 0, ...more }));
-  expect(begins && statusText(begins)).toBe("The training begins.");
-  expect(staged && statusText(staged)).toBe("gaussians begins.");
+test("status before the first figures, and a message in their place", () => {
+  const [begins, staged, told] = [{}, { stage: "gaussians" }, { message: "cannot be shown" }].map((more) =>
+    statusOf({ version: 0, ...more }),
+  );
+  expect(begins && statusText(begins)).toBe("Training is starting.");
+  expect(staged && statusText(staged)).toBe("Stage gaussians is starting.");
   expect(told && statusText(told)).toBe("cannot be shown");
 });
 
-test.each([null, 3, "x", [], {}, { version: "1" }, { version: 0.5 }])("no status: %o", (value) => { expect(statusOf(value)).toBeNull(); });
+test.each([null, 3, "x", [], {}, { version: "1" }, { version: 0.5 }])("values that are no status: %o", (value) => {
+  expect(statusOf(value)).toBeNull();
+});
