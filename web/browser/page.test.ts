@@ -37,8 +37,9 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     const page = await browser.newPage({ viewport: size });
     const elsewhere: string[] = [];
     page.on("request", (request) => {
-      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address))
+      if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address)) {
         elsewhere.push(request.url());
+      }
     });
     await page.goto(served.address + hash);
     await page.evaluate(() => window.a2tg?.loaded);

@@ -21,8 +21,9 @@ function policy(script: string, style: string): string {
 /** Return the only element. Throws an Error if there are none or several. */
 function only<T>(found: readonly T[], what: string): T {
   const [first] = found;
-  if (first === undefined || found.length > 1)
+  if (first === undefined || found.length > 1) {
     throw new Error(`Expected one ${what} in the build, found ${found.length}.`);
+  }
   return first;
 }
 

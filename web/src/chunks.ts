@@ -77,8 +77,9 @@ export class ChunkReader {
     if (this.fixed === null) {
       this.fixed = full;
       const rest = this.restBytes(full);
-      if (this.numRead + rest > this.header.bytes)
+      if (this.numRead + rest > this.header.bytes) {
         throw new SceneError("The scene is damaged: a chunk is larger than the rest of the body.");
+      }
       this.room(rest);
       return null;
     }

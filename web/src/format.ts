@@ -105,8 +105,8 @@ export function parseHeader(text: Uint8Array, head: Head): Header {
     background: vector<Vec3>(raw.list("background"), 3, "background"),
     cameras: raw.isNull("cameras") ? [] : raw.list("cameras").map(cameraOf),
   };
-  if (header.bytes < 16 * header.num + 4 * (header.numTexels ?? 0))
-    throw damaged("its header claims more rows than bytes");
+  const leastBytes = 16 * header.num + 4 * (header.numTexels ?? 0);
+  if (header.bytes < leastBytes) throw damaged("its header claims more rows than bytes");
   if (header.baseDegree >= header.numBands) throw damaged("base_degree is not below num_bands");
   return header;
 }

@@ -47,9 +47,9 @@ function fromBase64(text: string): Uint8Array<ArrayBuffer> {
 }
 
 export interface Listener {
-  /** Called once, before any chunk. */
+  /** Handler called once, before any chunk. */
   readonly onHeader: (header: Header, numBytes: number) => void;
-  /** Called for each chunk. Reading continues when the promise resolves. */
+  /** Handler called for each chunk. Reading continues when the promise resolves. */
   readonly onChunk: (chunk: Chunk, numBytesRead: number) => Promise<void>;
 }
 

@@ -47,8 +47,9 @@ export function statusOf(value: unknown): Status | null {
 
 export function statusText(status: Status): string {
   if (status.message !== "") return status.message;
-  if (Number.isNaN(status.loss))
+  if (Number.isNaN(status.loss)) {
     return status.stage === "" ? "Training is starting." : `Stage ${status.stage} is starting.`;
+  }
   const state = status.isPaused ? ", paused" : "";
   return (
     `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
