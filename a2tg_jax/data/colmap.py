@@ -49,7 +49,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     """
     model = find_model(path)
     if model is None:
-        raise FileNotFoundError(f"{path}: has no sparse model; sparse/0 with cameras, images and points3D is wanted")
+        raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
     lenses = {key: checked_lens(camera, f"{model}: camera {key}") for key, camera in reconstruction.cameras.items()}
@@ -139,7 +139,7 @@ def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
     for base in (path.resolve(), model, *model.parents[:2]):
         if (base / "images").is_dir() or (downscale > 1 and (base / f"images_{downscale}").is_dir()):
             return base / "images"
-    raise FileNotFoundError(f"{path}: has no folder 'images'; put the photographs of the model there")
+    raise FileNotFoundError(f"{path}: has no folder 'images'; put the model's photographs there")
 
 
 def _log_unregistered(images_folder: Path, num_registered: int) -> None:

@@ -83,7 +83,7 @@ def _check_records(cursor: _Cursor) -> None:
 def _check_camera(cursor: _Cursor) -> None:
     _, model, _, _ = cursor.take(CAMERA)
     if model not in num_params_by_model():
-        raise cursor.error(f"is of the model {model}, which COLMAP does not know")
+        raise cursor.error(f"has the model {model}, which COLMAP does not know")
     cursor.skip(8 * num_params_by_model()[model])
 
 

@@ -75,7 +75,7 @@ def _check_size(path: str | os.PathLike, image: Image.Image) -> None:
     width, height = image.size
     if width * height > MAX_PIXELS:
         raise PictureRefused(
-            f"{path}: has {width}x{height} pixels, and {MAX_PIXELS // 10**6} megapixels are the most that is read; "
+            f"{path}: has {width}x{height} pixels, and {MAX_PIXELS // 10**6} megapixels is the limit; "
             "make it smaller, or put smaller copies of all images beside them (images_2 and --downscale 2)"
         )
 

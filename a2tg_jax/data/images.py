@@ -60,9 +60,7 @@ def check_inside(folder: Path, name: str) -> None:
             "move it there, or put a link there to where it is, and name that"
         )
     if len(name) > LONGEST_NAME:
-        raise ValueError(
-            f"{folder}: {shortened(name)} is too long a name, of {len(name)} letters; give it a shorter one"
-        )
+        raise ValueError(f"{folder}: {shortened(name)} is too long a name ({len(name)} letters); shorten it")
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -57,7 +57,7 @@ class Lens:
             raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera") from None
         K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
         if not self._is_seen_in_order(K, *size):
-            raise ValueError(f"{self.camera.model.name} has a distortion that folds or loses the image")
+            raise ValueError(f"{self.camera.model.name} has a distortion that folds the image or leaves it")
         return K, size
 
     def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:

@@ -46,7 +46,7 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
     """
     found = _at_scale(path.parent, path.name, downscale)
     if found is None:
-        raise FileNotFoundError(f"{path}: no such mask, but the scene names it; put it there or remove its mask_path")
+        raise FileNotFoundError(f"{path}: no such mask, but the scene names it; add the mask or remove its mask_path")
     return found
 
 
@@ -131,4 +131,6 @@ def _at_scale(folder: Path, name: str, downscale: int) -> tuple[Path, int] | Non
 
 def _check_left(mask: Mask, name: str, source: str) -> None:
     if mask.num == 0:
-        raise ValueError(f"{source}: the mask of {name} excludes every pixel; remove the photograph or mend the mask")
+        raise ValueError(
+            f"{source}: the mask of {name} excludes every pixel; remove the photograph or correct the mask"
+        )

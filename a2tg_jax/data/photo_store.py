@@ -116,7 +116,7 @@ def _decoded_again(source: Path, pixels: np.ndarray) -> Picture:
     def read() -> np.ndarray:
         again = np.ascontiguousarray(read_pixels(source))
         if zlib.crc32(again.data) != checksum:
-            raise ValueError(f"{source}: has changed since the scene was loaded; put it back as it was, or start anew")
+            raise ValueError(f"{source}: has changed since the scene was loaded; restore it or start again")
         return again
 
     return Picture(pixels.shape, read)

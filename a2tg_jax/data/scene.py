@@ -236,10 +236,12 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     if len(shots) < 2:
         raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
     if num_train < 1:
-        raise ValueError(f"{source}: keeps every view for testing; choose another test_every, or 0 for no test views")
+        raise ValueError(
+            f"{source}: holds out every view for testing; choose another test_every, or 0 for no test views"
+        )
     for shot, following in itertools.pairwise(shots):
         if shot.name == following.name:
-            raise ValueError(f"{source}: lists {shot.name} twice; remove one of the two")
+            raise ValueError(f"{source}: lists {shot.name} twice; remove one")
 
 
 def _check_distances(shots: Sequence[Shot], source: str) -> None:

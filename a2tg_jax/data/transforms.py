@@ -100,7 +100,7 @@ def _read_json(file: Path) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
-        raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is wanted")
+        raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")
     for number, frame in enumerate(meta["frames"]):
         if not isinstance(frame, dict):
             raise ValueError(f"{file}: frame {number} must be an object; got {shortened(frame)}")
@@ -222,7 +222,7 @@ def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
         return model, [values[key] for key in FISHEYE_KEYS]
     if model not in PERSPECTIVE_MODELS:
         wanted = "a perspective one or OPENCV_FISHEYE"
-        raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is wanted")
+        raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
     if values["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
     return "FULL_OPENCV", [*(values[key] for key in OPENCV_KEYS), values["k3"], 0.0, 0.0, 0.0]

@@ -36,7 +36,7 @@ def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
     if min(spread, distance) <= zero:
-        raise ValueError("all the cameras stand at one place; photographs from different positions are needed")
+        raise ValueError("all cameras stand at one place; photographs from different positions are needed")
     return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)
 
 

@@ -47,7 +47,7 @@ def config_from_dict(
     optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
         if name not in data and name not in optional:
-            raise ValueError(f"{_within(where, name)} is missing; it was written by another version")
+            raise ValueError(f"{_within(where, name)} is missing; another version wrote it")
     values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names if name in data}
     return kind(**values, **given)
 

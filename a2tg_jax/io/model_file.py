@@ -120,7 +120,7 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
     if back != appearance:
-        raise ValueError(f"the options of {kind.__name__} do not come back from JSON: {options}")
+        raise ValueError(f"the options of {kind.__name__} do not survive JSON: {options}")
     return {**described, "options": options}
 
 
@@ -148,7 +148,7 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
     if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
         return found
     raise ValueError(
-        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
+        f"shows the appearance {name} of the module {module}, which is unknown here: import that module first, or "
         f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
     )
 

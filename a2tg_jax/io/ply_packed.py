@@ -65,7 +65,7 @@ def read_packed(file: BinaryIO, path: Path) -> np.ndarray:
 def _check(headers: Mapping[str, VertexHeader], path: Path) -> None:
     chunk, vertex = headers["chunk"], headers["vertex"]
     if vertex.encoding != "binary_little_endian":
-        raise ValueError(f"{path}: is a packed PLY in {vertex.encoding}; binary_little_endian is wanted")
+        raise ValueError(f"{path}: is a packed PLY in {vertex.encoding}; binary_little_endian is expected")
     chunk.require(BOUNDS, "a PLY as SuperSplat packs it")
     vertex.require(PACKED, "a PLY as SuperSplat packs it")
     if any(vertex.fields[name] != "u4" for name in PACKED):

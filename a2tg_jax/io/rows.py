@@ -64,7 +64,7 @@ def rows_of(model: Model) -> Rows:
     shown = model.appearance.arrays(model.params, model.layout)
     for name, values in (*fields.items(), *shown.items()):
         if not np.isfinite(values).all():
-            raise ValueError(f"model.{name} must be finite; some are NaN or infinite")
+            raise ValueError(f"model.{name} must be finite; some values are NaN or infinite")
     sh = fields["sh"]
     bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
     degrees = np.full(gaussians.num, gaussians.sh_degree)

@@ -191,7 +191,7 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     except zlib.error as error:
         raise ValueError(f"is damaged: {error}") from error
     if len(body) != header["bytes"] or not reader.eof:
-        raise ValueError(f"does not unpack to the {header['bytes']} bytes that it announces")
+        raise ValueError(f"does not unpack to the announced {header['bytes']} bytes")
     return header, body
 
 

@@ -205,7 +205,7 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
         raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with --out")
     if not overwrite:
         raise FileExistsError(
-            f"{path} is not empty; add --resume to go on with it, --overwrite to start anew, or choose another --out"
+            f"{path} is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
         )
 
 

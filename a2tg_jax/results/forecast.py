@@ -96,7 +96,7 @@ class RunForecast:
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
         raise ValueError(
-            f"the run would take about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
+            f"the run would need about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
             f"used: change {OPTIONS[largest]}, or allow more with --max-memory"
         )
 

@@ -116,7 +116,7 @@ class RunRecord:
             except ValueError as error:
                 if system is self.system:
                     raise
-                raise ValueError(f"compare {label}, which has the options of {self.name}: {error}") from error
+                raise ValueError(f"compare {label}, with the options of {self.name}: {error}") from error
         plan_run(self.systems)
 
     def leaves(self) -> dict[str, Any]:

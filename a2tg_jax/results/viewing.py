@@ -71,7 +71,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
     if path.is_dir():
         return _source_of_run(open_run(path), name)
     if name is not None:
-        raise ValueError(f"--model is one of a run folder's models; {path} is no folder")
+        raise ValueError(f"--model needs a run folder; {path} is not a folder")
     if path.suffix == ".ply":
         return _source_of_ply(path)
     load = load_compact if path.suffix == ".a2tgz" else load_model
@@ -83,7 +83,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     planned = record.plan[record.plan.main[-1] if name is None else name]
     path = run.model(planned.name)
     if not is_regular(path):
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
 
     def load_scene() -> Scene | None:
         try:

@@ -47,9 +47,9 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
       ValueError: if browsers cannot show the model, or photographs are asked for where there are none, or in one file.
     """
     if single_file and photographs:
-        raise ValueError("--photographs lie in a folder beside the page: leave out --single-file")
+        raise ValueError("--photographs needs a folder beside the page: leave out --single-file")
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
-        raise ValueError(f"{out} holds a page that is not the viewer's; choose another folder with --web")
+        raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
     data = source.encoded
     files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
     for path, content in files.items():

@@ -121,4 +121,4 @@ def how_to_go_on(run: RunFolder) -> str:
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     if finished and not checkpoints:
         last = f"the last model is {finished[-1]}"
-    return f"{last}; go on with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"
+    return f"{last}; continue with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"

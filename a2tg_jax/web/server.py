@@ -123,5 +123,5 @@ def _listening(port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         found.close()
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"port {port} cannot be used: {reason}; leave --port out for a free one") from error
+        raise ValueError(f"port {port} cannot be used: {reason}; leave out --port for a free one") from error
     return found
