@@ -464,7 +464,7 @@ def test_a_second_signal_is_obeyed_at_once():
 def test_a_closed_pipe_is_quiet(tmp_path):
     run = filled(tmp_path / "run")
     run.model(NAME).unlink()
-    command = f"{sys.executable} -m a2tg_jax.cli.main info {run.path}; echo $? >&2"
+    command = f"{sys.executable} -m a2tg_jax.cli info {run.path}; echo $? >&2"
     done = subprocess.run(
         ["bash", "-c", f"({command}) | true"], capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
