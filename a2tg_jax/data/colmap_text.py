@@ -16,7 +16,7 @@ from a2tg_jax.host.text import shortened
 
 Words = list[bytes]
 LONGEST_LINE = 1 << 26
-"""Bytes; the points of an image of a million features take half of them."""
+"""Longest line in bytes. The points of an image with a million features take half of that."""
 ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
 """How many lines, or pairs of lines for images, there are: a comment of COLMAP's."""
 

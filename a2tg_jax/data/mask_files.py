@@ -17,9 +17,9 @@ from a2tg_jax.data.scene import Scene, Shot, View
 from a2tg_jax.host.regular_files import is_regular
 
 FOLDER = "masks"
-"""Beside the folder of images."""
+"""Folder of masks, beside the folder of images."""
 AlphaMeaning = Literal["transparency", "mask"]
-"""What the alpha channel of photographs is: how much of the background shows, or a mask."""
+"""Meaning of the alpha channel of photographs: transparency before a background, or a mask."""
 
 
 def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
@@ -39,7 +39,7 @@ def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | Non
 
 
 def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
-    """As `find_mask`, of a mask that a scene names.
+    """Read a mask that a scene names, as `find_mask` does.
 
     Raises:
       FileNotFoundError: if it is not there.

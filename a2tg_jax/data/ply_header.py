@@ -21,18 +21,18 @@ MOST_DIGITS = 20
 
 @dataclasses.dataclass(frozen=True)
 class VertexHeader:
-    """What a PLY says of its vertices."""
+    """Header of a PLY file's vertices."""
 
     path: Path
     encoding: str
     """One of `BYTE_ORDERS`."""
     count: int
     fields: dict[str, str]
-    """NumPy's name of the type of each property, in their order."""
+    """NumPy type name of each property, in order."""
 
     @property
     def dtype(self) -> np.dtype:
-        """Of one vertex in a binary file."""
+        """Bytes of one vertex in a binary file."""
         return np.dtype([(name, BYTE_ORDERS[self.encoding] + kind) for name, kind in self.fields.items()])
 
     def require(self, names: Iterable[str], wanted: str) -> None:

@@ -14,9 +14,9 @@ from a2tg_jax.host.text import shortened
 
 LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
-"""What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
+"""Bytes a file may unpack to beyond `LARGEST_RATIO` times its own size."""
 LONGEST_HEADER = 10_000
-"""Bytes of what an array says of itself."""
+"""Largest size in bytes of an array's header."""
 CHUNK = 1 << 24
 LONGEST_REASON = 200
 

@@ -1,4 +1,4 @@
-"""Whether what was read from a file is a model at all: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
+"""Checks that a file holds a valid model: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
 
 Native loops believe the layout that they are given. Both loaders, of models and of checkpoints, go through here first.
 """

@@ -1,4 +1,4 @@
-"""A compact file of a run's model, or of any: the smallest that loses little, and a table of what was tried."""
+"""Compression of a model: the smallest compact file within a loss, and a table of the choices tried."""
 
 import dataclasses
 import math
@@ -30,21 +30,21 @@ from a2tg_jax.results.summary import aligned
 
 SUFFIX = ".a2tgz"
 MOST_VIEWS = 16
-"""So many training views are measured, evenly chosen."""
+"""Largest number of training views measured, evenly chosen."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Compressed:
-    """A file that was written, and how it was chosen."""
+    """Compact file, and how it was chosen."""
 
     path: Path
     model: Model
-    """What it was made from."""
+    """Model before compression."""
     trials: Sequence[Trial]
-    """Each group at each of its steps."""
+    """Trial of each group at each precision."""
     chosen: Trial
     measures: tuple[str, ...]
-    """What the losses of the trials are."""
+    """Names of the loss measures of the trials."""
 
 
 def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -> Compressed:

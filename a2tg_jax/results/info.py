@@ -1,4 +1,4 @@
-"""What a run folder holds, in a few lines of text."""
+"""Summary of a run folder in a few lines of text."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What is looked at before anything is trained or written: options, weights, places, room on the disk."""
+"""Checks before anything is trained or written: options, weights, folders, room on the disk."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training.start import check_start, initial_number
 
 STATE_SIZE = 3
-"""A checkpoint holds parameters and two moments of each."""
+"""Arrays per parameter in a checkpoint: its value and two moments."""
 
 
 def check_new_run(

@@ -1,4 +1,4 @@
-"""Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
+"""Evaluation of a run's finished models: metrics, pictures, figures, point cloud, report."""
 
 import dataclasses
 import os

@@ -1,4 +1,4 @@
-"""Training in a run folder: stage after stage, with checkpoints, and from where an earlier attempt stopped."""
+"""Training in a run folder, stage after stage, with checkpoints to resume from."""
 
 import dataclasses
 import warnings
@@ -28,9 +28,9 @@ from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 
 LONGEST_WITHOUT_CHECKPOINT = 500
-"""Iterations."""
+"""Largest number of iterations between checkpoints."""
 MOST_RESTORED = 5
-"""So often a stage goes back because it diverged, each time with another order of the views."""
+"""Largest number of times a diverged stage is restored, each time with another order of the views."""
 
 
 def train_run(
@@ -147,7 +147,7 @@ class _Training:
 
 
 class _Keeper:
-    """Writes checkpoints. The first of a run that replaces another sets that one aside."""
+    """Writer of checkpoints. The first checkpoint of a replacing run sets the old run aside."""
 
     def __init__(self, run: RunFolder, name: str, replaced_by: RunRecord | None):
         self.run, self.name, self.replaced_by = run, name, replaced_by

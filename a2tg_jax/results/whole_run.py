@@ -1,4 +1,4 @@
-"""A run from its checks to its report: begun, or gone on with, by one process at a time."""
+"""Whole runs, from checks to report, begun or resumed by one process at a time."""
 
 import contextlib
 import shlex
@@ -20,7 +20,7 @@ from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
-"""Of a scene, somebody who looks at its training meanwhile."""
+"""Function that gives the watcher of a scene's training."""
 
 
 def unseen(scene: Scene) -> AbstractContextManager[Watch]:
