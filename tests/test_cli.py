@@ -337,7 +337,7 @@ def test_interrupted_run_says_how_to_go_on(tiny_run, tmp_path, monkeypatch, caps
     monkeypatch.setattr(run_training, "fit_stage", interrupt)
     assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 130
     error = capsys.readouterr().err
-    assert f"a2tg-textures.npz; go on with: a2tg train --out {copy.path} --resume" in error
+    assert f"a2tg-textures.npz; continue with: a2tg train --out {copy.path} --resume" in error
 
 
 def test_run_folder_is_complete(tiny_run):

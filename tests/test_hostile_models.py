@@ -126,11 +126,11 @@ def test_textures_lie_within_their_buckets_and_apart():
 
     check_places(textures, layout([0, 0, 1], [0, 3, 1]))
     for bucket, row, message in [
-        ([0, 0, 1], [0, 4, 1], "beyond theirs"),
-        ([0, 0, 1], [0, -1, 1], "beyond theirs"),
+        ([0, 0, 1], [0, 4, 1], "within the buckets; some do not"),
+        ([0, 0, 1], [0, -1, 1], "within the buckets; some do not"),
         ([0, 0, 2], [0, 1, 1], "layout.bucket must lie below 2"),
         ([0, -1, 1], [0, 1, 1], "layout.bucket must lie below 2"),
-        ([0, 0, 1], [2, 2, 0], "a row of its own"),
+        ([0, 0, 1], [2, 2, 0], "its own row"),
     ]:
         with pytest.raises(ValueError, match=message):
             check_places(textures, layout(bucket, row))

@@ -65,10 +65,10 @@ MISTAKES = {
     # Places and files
     "train nowhere --out new": "nowhere",
     "train photos --out new": "photos",
-    "train scene --out scene/run": "lie in each other",
+    "train scene --out scene/run": "overlap: choose an output folder",
     f"{SYNTHETIC[:-3]}photo.png": "photo.png is a file",
     f"{SYNTHETIC[:-3]}photos": "not a run folder",
-    f"{SYNTHETIC[:-3]}run": "add --resume to go on with it, --overwrite",
+    f"{SYNTHETIC[:-3]}run": "add --resume to continue it, --overwrite",
     "train --out nowhere --resume": "is not a run folder",
     f"{SYNTHETIC[:-3]}run --resume --overwrite": "give one of them",
     f"{SYNTHETIC[:-3]}run --resume --seed 5": "leave out --seed",
@@ -100,7 +100,7 @@ MISTAKES = {
     "export run --web site": "no finished",
     "sfm nowhere new": "nowhere",
     "sfm photos new": "holds 1 photographs",
-    "sfm many many/scene": "lie in each other",
+    "sfm many many/scene": "overlap: choose an output folder",
 }  # fmt: skip
 
 

@@ -177,7 +177,7 @@ def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(run_training, "save_checkpoint", save_and_stop)
         assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
-    assert f"{NAME}-0000000004.npz; go on with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
+    assert f"{NAME}-0000000004.npz; continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
     kept = old_run(run)
     assert kept is not None and kept.report.read_text() == "old report.html" and read_record(kept) == RECORD
     assert cli.main(["info", str(run.path)]) == 0
@@ -218,7 +218,7 @@ def test_an_unfinished_replacement_never_costs_the_finished_run(tmp_path):
 
 def test_the_run_folder_and_the_scene_lie_apart(tmp_path):
     for out, scene in ((tmp_path / "scene/run", tmp_path / "scene"), (tmp_path, tmp_path / "scene")):
-        with pytest.raises(ValueError, match="lie in each other"):
+        with pytest.raises(ValueError, match="overlap: choose an output folder"):
             check_apart(out, scene)
     check_apart(tmp_path / "scene-run", tmp_path / "scene")
 
@@ -227,7 +227,7 @@ def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
     usage = shutil.disk_usage(tmp_path)._replace(free=50_000)
     monkeypatch.setattr(checks.shutil, "disk_usage", lambda path: usage)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
-    assert "GB at least for models and checkpoints" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert "GB for models and checkpoints" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 # Checkpoints
@@ -264,7 +264,7 @@ def test_a_damaged_newest_checkpoint_is_said_and_the_one_before_used(scene, stop
     run, whole = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run")), stopped[1]
     *_, older, newest = run.checkpoints(NAME)
     newest.write_bytes(newest.read_bytes()[:1000])
-    with pytest.warns(UserWarning, match=rf"is damaged.* goes on from {older.name}"):
+    with pytest.warns(UserWarning, match=rf"is damaged.* continues from {older.name}"):
         train_run(run, scene, progress=False)
     assert_same(run, whole)
     assert not list((run.path / "checkpoints").glob("*"))
@@ -274,7 +274,9 @@ def test_without_a_checkpoint_that_can_be_read_nothing_begins_anew(scene, stoppe
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     for path in run.checkpoints(NAME):
         path.write_bytes(b"")
-    with pytest.raises(ValueError, match=rf"there is no other: delete it to train {NAME} from its beginning"):
+    with pytest.raises(
+        ValueError, match=rf"there is no other checkpoint: delete it to train {NAME} from its beginning"
+    ):
         train_run(run, scene, progress=False)
     assert run.checkpoints(NAME)
 
@@ -382,7 +384,7 @@ def test_the_state_before_a_divergence_is_a_file(scene, tmp_path):
 
 def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, monkeypatch):
     run = trapped_run(scene, tmp_path / "run", "restore")
-    with pytest.warns(UserWarning, match=r"goes back to iteration 10 and takes the views in another order \(1 of 5"):
+    with pytest.warns(UserWarning, match=r"restarts from iteration 10 with the views in another order \(1 of 5"):
         train_run(run, scene, progress=False)
     other, save, numbers = trapped_run(scene, tmp_path / "other", "restore"), save_checkpoint, []
 
@@ -409,7 +411,7 @@ def test_restoring_has_an_end(scene, tmp_path):
     run = trapped_run(scene, tmp_path / "run", "restore", always=True)
     with (
         pytest.warns(UserWarning),
-        pytest.raises(ValueError, match=f"went back {MOST_RESTORED} times already") as raised,
+        pytest.raises(ValueError, match=f"was restored {MOST_RESTORED} times already") as raised,
     ):
         train_run(run, scene, progress=False)
     assert isinstance(raised.value.__cause__, DivergedError)
@@ -443,7 +445,7 @@ def test_a_signal_in_training_keeps_the_state_of_that_moment(stopped, tmp_path, 
     told = capsys.readouterr().err.splitlines()[-1]
     assert told == (
         f"a2tg: interrupted; the last checkpoint is {run.checkpoint(NAME, 7)}; "
-        f"go on with: a2tg train --out {out} --resume"
+        f"continue with: a2tg train --out {out} --resume"
     )
     assert cli.main(["train", "--out", str(out), "--resume"]) == 0
     assert_same(run, stopped[1])
@@ -462,7 +464,7 @@ def test_a_second_signal_is_obeyed_at_once():
 def test_a_closed_pipe_is_quiet(tmp_path):
     run = filled(tmp_path / "run")
     run.model(NAME).unlink()
-    command = f"{sys.executable} -m a2tg_jax.cli.main info {run.path}; echo $? >&2"
+    command = f"{sys.executable} -m a2tg_jax.cli info {run.path}; echo $? >&2"
     done = subprocess.run(
         ["bash", "-c", f"({command}) | true"], capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -477,5 +479,5 @@ def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_training, "save_checkpoint", full)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "No space left on device; there is no checkpoint yet; go on with: a2tg train" in error
+    assert "No space left on device; there is no checkpoint yet; continue with: a2tg train" in error
     assert whole_run.how_to_go_on(RunFolder(tmp_path / "run")) in error

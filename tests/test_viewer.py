@@ -168,7 +168,7 @@ def test_missing_files(tmp_path, capsys, name):
 def test_a_model_is_chosen_in_run_folders_only(tmp_path, capsys):
     save_ply(tmp_path / "c.ply", some_gaussians())
     assert main(["view", str(tmp_path / "c.ply"), "--no-open", "--model", "a2tg-textures"]) == 2
-    assert "is no folder" in capsys.readouterr().err
+    assert "is not a folder" in capsys.readouterr().err
 
 
 def test_a_model_that_knows_no_scene_has_no_photographs():

@@ -152,7 +152,7 @@ class Train:
         if changed:
             flags = ", ".join("--" + name.replace("_", "-") for name in changed)
             advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
-            raise ValueError(f"--resume takes every number from {run.record}; {advice}")
+            raise ValueError(f"--resume takes every option from {run.record}; {advice}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
         record.check()

@@ -21,7 +21,7 @@ from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_k
 from a2tg_jax.host.regular_files import is_regular
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
-"""Where a scene folder, or the given part of one, keeps its model, in order of preference."""
+"""Folders of the model below a scene folder, in order of preference."""
 EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
 """A points3D file with no points in it."""
 
@@ -49,7 +49,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     """
     model = find_model(path)
     if model is None:
-        raise FileNotFoundError(f"{path}: has no sparse model; sparse/0 with cameras, images and points3D is wanted")
+        raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
     lenses = {key: checked_lens(camera, f"{model}: camera {key}") for key, camera in reconstruction.cameras.items()}
@@ -76,7 +76,8 @@ def read_points(reconstruction: Any) -> PointCloud:
 
 
 def viewmat_of(image: Any) -> np.ndarray:
-    """World-to-camera matrix [4, 4] of a registered pycolmap.Image (a method since pycolmap 4, a property before)."""
+    """Return the world-to-camera matrix [4, 4] of a registered pycolmap.Image (a method since pycolmap 4, before a
+    property)."""
     pose = image.cam_from_world
     viewmat = np.eye(4)
     viewmat[:3] = (pose() if callable(pose) else pose).matrix()
@@ -98,7 +99,7 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
 
 
 def _model_suffix(folder: Path) -> str | None:
-    """ ".bin" or ".txt", whichever a folder keeps a model in (COLMAP prefers .bin), or None."""
+    """Return ".bin" or ".txt", the format of the model in a folder (COLMAP prefers .bin), or None."""
     for suffix in EMPTY_POINTS:
         if all(is_regular(folder / f"{name}{suffix}") for name in ("cameras", "images")):
             return suffix
@@ -121,7 +122,7 @@ def _read_model(model: Path) -> Any:
 
 @contextmanager
 def _with_points_file(model: Path, suffix: str) -> Iterator[Path]:
-    """The model's folder, or, where points3D is missing, a temporary one like it with an empty points3D."""
+    """Return the model's folder, or a temporary copy with an empty points3D if that file is missing."""
     if is_regular(model / f"points3D{suffix}"):
         yield model
         return
@@ -139,7 +140,7 @@ def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
     for base in (path.resolve(), model, *model.parents[:2]):
         if (base / "images").is_dir() or (downscale > 1 and (base / f"images_{downscale}").is_dir()):
             return base / "images"
-    raise FileNotFoundError(f"{path}: has no folder 'images'; put the photographs of the model there")
+    raise FileNotFoundError(f"{path}: has no folder 'images'; put the model's photographs there")
 
 
 def _log_unregistered(images_folder: Path, num_registered: int) -> None:

@@ -28,7 +28,7 @@ SENSOR_SIZE, POSE_SIZE, FRAME_SIZE, DATA_SIZE = 8, 56, 64, 16
 
 
 class _Cursor:
-    """A place in a file that does not pass its end."""
+    """Position in a file that cannot pass its end."""
 
     def __init__(self, path: Path, data: mmap.mmap | bytes):
         self.path, self.data, self.at = path, data, 0
@@ -83,7 +83,7 @@ def _check_records(cursor: _Cursor) -> None:
 def _check_camera(cursor: _Cursor) -> None:
     _, model, _, _ = cursor.take(CAMERA)
     if model not in num_params_by_model():
-        raise cursor.error(f"is of the model {model}, which COLMAP does not know")
+        raise cursor.error(f"has the model {model}, which COLMAP does not know")
     cursor.skip(8 * num_params_by_model()[model])
 
 
@@ -123,12 +123,12 @@ RECORDS: dict[str, Callable[[_Cursor], None]] = {
     "rigs": _check_rig,
     "frames": _check_frame,
 }
-"""How one record of a file is passed."""
+"""Function that skips one record of a file, by file name."""
 
 
 @functools.cache
 def num_params_by_model() -> dict[int | str, int]:
-    """Parameters of COLMAP's camera models, by number and by name."""
+    """Return the number of parameters of COLMAP's camera models, by number and by name."""
     found: dict[int | str, int] = {}
     for name, model in pycolmap().CameraModelId.__members__.items():
         if name != "INVALID":

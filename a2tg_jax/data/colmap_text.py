@@ -16,7 +16,7 @@ from a2tg_jax.host.text import shortened
 
 Words = list[bytes]
 LONGEST_LINE = 1 << 26
-"""Bytes; the points of an image of a million features take half of them."""
+"""Longest line in bytes. The points of an image with a million features take half of that."""
 ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
 """How many lines, or pairs of lines for images, there are: a comment of COLMAP's."""
 
@@ -76,13 +76,13 @@ def _check_camera(words: Words) -> None:
 
 def _check_image(words: Words) -> None:
     if len(words) < 10:
-        raise ValueError(f"an image has an id, a pose, a camera and a name, 10 words; got {len(words)}")
+        raise ValueError(f"an image needs 10 words (id, pose, camera, name); got {len(words)}")
     _check_numbers((words[0], words[8]), words[1:8])
 
 
 def _check_point(words: Words) -> None:
     if len(words) < 8 or len(words) % 2:
-        raise ValueError(f"a point has 8 words, and pairs of its track; got {len(words)}")
+        raise ValueError(f"a point needs 8 words and pairs of its track; got {len(words)}")
     _check_numbers((words[0], *words[4:7], *words[8:]), words[1:4])
 
 
@@ -96,7 +96,7 @@ def _check_rig(words: Words) -> None:
         if len(pose) < 7 * has_pose or len(sensor) < 2:
             raise ValueError("it is cut off")
     if next(rest, None) is not None:
-        raise ValueError("it goes on where it should end")
+        raise ValueError("it continues past its end")
 
 
 def _check_frame(words: Words) -> None:
@@ -118,7 +118,7 @@ LINES: dict[str, Callable[[Words], None]] = {
 
 def _count(word: bytes, most: int) -> int:
     if not 0 <= int(word) <= most:
-        raise ValueError(f"it counts {int(word)} of what it lists")
+        raise ValueError(f"its count of {int(word)} does not match its list")
     return int(word)
 
 

@@ -1,4 +1,4 @@
-"""Decoding photographs that may be broken, or made to do harm.
+"""Decoding of photographs that may be broken or malicious.
 
 Only formats of photographs are tried (Pillow knows others, of which one starts a program), and nothing is decoded
 before its size and its bits are known. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
@@ -17,7 +17,7 @@ from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
 BITS_PER_SAMPLE = 258
-"""A tag of TIFF."""
+"""TIFF tag of the bits per sample."""
 LONGEST_REASON = 200
 MOST_BYTES = 1 << 30
 """Largest file of a picture: as many pixels, not compressed."""
@@ -26,7 +26,7 @@ MAX_PIXELS = 128_000_000
 
 
 class PictureRefused(ValueError):
-    """A sound picture that is not taken."""
+    """Error for an intact picture that is refused."""
 
 
 def read_pixels(path: str | os.PathLike) -> np.ndarray:
@@ -52,7 +52,7 @@ def check_picture(path: str | os.PathLike) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: str | os.PathLike) -> Iterator[Image.Image]:
-    """An image that may be decoded; whatever is wrong with it, then too, becomes one ValueError."""
+    """Open an image within the block; every decoding error becomes one ValueError."""
     with open_regular(path, MOST_BYTES) as file:
         yield from _decoded(path, file)
 
@@ -75,7 +75,7 @@ def _check_size(path: str | os.PathLike, image: Image.Image) -> None:
     width, height = image.size
     if width * height > MAX_PIXELS:
         raise PictureRefused(
-            f"{path}: has {width}x{height} pixels, and {MAX_PIXELS // 10**6} megapixels are the most that is read; "
+            f"{path}: has {width}x{height} pixels, and {MAX_PIXELS // 10**6} megapixels is the limit; "
             "make it smaller, or put smaller copies of all images beside them (images_2 and --downscale 2)"
         )
 
@@ -86,7 +86,8 @@ def _check_depth(path: str | os.PathLike, image: Image.Image) -> None:
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Pillow opens RGB of 16 bits a channel as RGB of 8 and drops the rest: only how it is stored tells."""
+    """Return whether an image has more than 8 bits per channel. Pillow reads RGB of 16 bits as 8, so the file's storage
+    decides."""
     arguments = [tile[-1] for tile in getattr(image, "tile", ())]
     if image.format == "TIFF":
         return max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8  # type: ignore[attr-defined]

@@ -13,9 +13,9 @@ from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
-"""Tried in this order on image paths written without a suffix."""
+"""Suffixes tried, in order, for image paths without one."""
 LONGEST_NAME = 1000
-"""Letters of the path of an image below its folder."""
+"""Largest number of letters of an image's path below its folder."""
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
 
@@ -60,9 +60,7 @@ def check_inside(folder: Path, name: str) -> None:
             "move it there, or put a link there to where it is, and name that"
         )
     if len(name) > LONGEST_NAME:
-        raise ValueError(
-            f"{folder}: {shortened(name)} is too long a name, of {len(name)} letters; give it a shorter one"
-        )
+        raise ValueError(f"{folder}: {shortened(name)} is too long a name ({len(name)} letters); shorten it")
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -96,7 +94,7 @@ def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> Non
 
 
 def scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int]) -> np.ndarray:
-    """K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
+    """Return K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
     return np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
 
 

@@ -14,11 +14,11 @@ from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsi
 PINHOLE_TOLERANCE = 1e-3
 """Pixels by which a camera may differ from a pinhole, anywhere in its image, and still be taken for one."""
 LARGEST_DISTORTION = 1e6
-"""Of one parameter; those of a telephoto lens, whose angles are small, are large."""
+"""Largest absolute value of one parameter. Telephoto lenses, with small angles, have large ones."""
 GRID, MARGIN = 9, 0.1
 """Points along an axis at which an undistorted image is looked at, and how far outside the photograph they may lie."""
 ROWS_AT_ONCE = 128
-"""Rows of an image that are undistorted together; bounds the memory."""
+"""Number of rows undistorted at a time, which bounds the memory."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Lens:
 
     @cached_property
     def is_pinhole(self) -> bool:
-        """Whether the camera projects as its calibration matrix does (models with zero distortion do)."""
+        """Whether the camera projects like its calibration matrix (models with zero distortion do)."""
         width, height = self.size
         grid = np.stack(np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5)), -1).reshape(-1, 2)
         rays = np.asarray(self.camera.cam_from_img(grid))
@@ -57,7 +57,7 @@ class Lens:
             raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera") from None
         K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
         if not self._is_seen_in_order(K, *size):
-            raise ValueError(f"{self.camera.model.name} has a distortion that folds or loses the image")
+            raise ValueError(f"{self.camera.model.name} has a distortion that folds the image or leaves it")
         return K, size
 
     def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
@@ -94,7 +94,7 @@ class Lens:
         return resize_pixels(pixels, *new_size), scaled_intrinsics(K, size, new_size)
 
     def _warp(self, pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Samples the photograph (bilinear) where the pixels of a pinhole image K of the given size see it."""
+        """Sample the photograph (bilinear) where the pixels of a pinhole image K of the given size see it."""
         width, height = size
         planes = _premultiplied(pixels)
         warped = np.empty((height, width, planes.shape[2]), np.float32)
@@ -106,7 +106,8 @@ class Lens:
         return _straight(warped)
 
     def _seen_at(self, K: np.ndarray, width: int, rows: range, image_size: tuple[int, int]) -> np.ndarray:
-        """Array coordinates (row, column) [2, rows, width] in a photograph of what a pinhole K sees at some rows."""
+        """Return array coordinates (row, column) [2, rows, width] in a photograph for some rows of a pinhole image
+        K."""
         x, y = np.meshgrid(np.arange(width) + 0.5, np.asarray(rows) + 0.5)
         rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ np.linalg.inv(K).T
         places = np.asarray(self.camera.img_from_cam(rays)) * np.divide(image_size, self.size) - 0.5
@@ -137,7 +138,7 @@ def _homogeneous(points: np.ndarray) -> np.ndarray:
 
 
 def _premultiplied(pixels: np.ndarray) -> np.ndarray:
-    """float32 pixels in which colour is multiplied by alpha, so that transparent neighbours do not bleed."""
+    """Return float32 pixels with colour multiplied by alpha, so that transparent neighbours do not bleed."""
     planes = pixels.astype(np.float32)
     if planes.shape[2] == 4:
         planes[..., :3] *= planes[..., 3:] / 255
@@ -145,7 +146,7 @@ def _premultiplied(pixels: np.ndarray) -> np.ndarray:
 
 
 def _straight(planes: np.ndarray) -> np.ndarray:
-    """uint8 pixels with straight alpha, the inverse of `_premultiplied`."""
+    """Return uint8 pixels with straight alpha, the inverse of `_premultiplied`."""
     if planes.shape[2] == 4:
         planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
     return np.clip(np.rint(planes), 0, 255).astype(np.uint8)

@@ -6,18 +6,18 @@ from scipy.ndimage import zoom
 from a2tg_jax.data.surfaces import Shape, Surface, nearest_hits
 
 LAMP = np.array([[-1.7], [-1.9], [3.1]], np.float32)
-"""Middle of a spherical lamp."""
+"""Centre of a spherical lamp."""
 LAMP_RADIUS = 0.35
 NUM_LAMP_RAYS, NUM_SKY_RAYS = 8, 16
 SKY_REACH = 0.8
-"""Surfaces farther away than this do not darken a point."""
+"""Largest distance at which a surface darkens a point."""
 SKY_LIGHT, LAMP_LIGHT = 0.48, 0.68
 TEXELS_PER_SAMPLE = 8
-"""Light is found on a grid this much coarser than a surface's image."""
+"""Factor by which the grid of light is coarser than a surface's image."""
 
 
 def light(colored: list[tuple[Shape, np.ndarray]], rng: np.random.Generator) -> list[Surface]:
-    """Surfaces whose images are the given colours in the light of a lamp with soft shadows, and of the sky.
+    """Return surfaces whose images show the given colours lit by a lamp with soft shadows and by the sky.
 
     Args:
       colored: shapes with their own colours [rows, columns, 3] float32 in [0, 1].
@@ -42,7 +42,7 @@ def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.rando
 
 
 def _lamp_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Cosine of the lamp's direction times the visible share of the lamp, [P]."""
+    """Return the cosine of the lamp's direction times the visible share of the lamp, [P]."""
     total = np.zeros(points.shape[1], np.float32)
     for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
         towards = LAMP + np.float32(LAMP_RADIUS) * offset[:, None] - points
@@ -53,7 +53,7 @@ def _lamp_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rn
 
 
 def _sky_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH, [P]."""
+    """Return the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH, [P]."""
     total = np.zeros(points.shape[1], np.float32)
     for offset in _unit_vectors(rng, NUM_SKY_RAYS):
         directions = normals + np.float32(0.999) * offset[:, None]

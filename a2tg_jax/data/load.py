@@ -1,4 +1,4 @@
-"""One function for every kind of scene on disk."""
+"""Loading of scenes in any known format."""
 
 import os
 from pathlib import Path
@@ -19,7 +19,7 @@ def load_scene(
     room: int | None = None,
     alpha: AlphaMeaning = "transparency",
 ) -> Scene:
-    """Read photographs, cameras and points, and normalises the world.
+    """Read photographs, cameras and points, and normalise the world.
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
     nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`).
@@ -50,7 +50,7 @@ def load_scene(
 
 
 def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scene:
-    """Return the scene as it lies on disk."""
+    """Load the scene as it lies on disk."""
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
     check_test_every(test_every)

@@ -17,9 +17,9 @@ from a2tg_jax.data.scene import Scene, Shot, View
 from a2tg_jax.host.regular_files import is_regular
 
 FOLDER = "masks"
-"""Beside the folder of images."""
+"""Folder of masks, beside the folder of images."""
 AlphaMeaning = Literal["transparency", "mask"]
-"""What the alpha channel of photographs is: how much of the background shows, or a mask."""
+"""Meaning of the alpha channel of photographs: transparency before a background, or a mask."""
 
 
 def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
@@ -39,14 +39,14 @@ def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | Non
 
 
 def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
-    """As `find_mask`, of a mask that a scene names.
+    """Read a mask that a scene names, as `find_mask` does.
 
     Raises:
       FileNotFoundError: if it is not there.
     """
     found = _at_scale(path.parent, path.name, downscale)
     if found is None:
-        raise FileNotFoundError(f"{path}: no such mask, but the scene names it; put it there or remove its mask_path")
+        raise FileNotFoundError(f"{path}: no such mask, but the scene names it; add the mask or remove its mask_path")
     return found
 
 
@@ -131,4 +131,6 @@ def _at_scale(folder: Path, name: str, downscale: int) -> tuple[Path, int] | Non
 
 def _check_left(mask: Mask, name: str, source: str) -> None:
     if mask.num == 0:
-        raise ValueError(f"{source}: the mask of {name} excludes every pixel; remove the photograph or mend the mask")
+        raise ValueError(
+            f"{source}: the mask of {name} excludes every pixel; remove the photograph or correct the mask"
+        )

@@ -1,4 +1,4 @@
-"""Which pixels of a photograph count, kept small in memory."""
+"""Masks: which pixels of a photograph count, kept small in memory."""
 
 import dataclasses
 import zlib
@@ -13,7 +13,7 @@ class Mask:
     shape: tuple[int, int]
     """(H, W)."""
     num: int
-    """Pixels that count."""
+    """Number of pixels that count."""
     data: bytes = dataclasses.field(repr=False)
 
     @staticmethod

@@ -42,7 +42,8 @@ def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray
 
 
 def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 2) -> np.ndarray:
-    """Smooth noise [rows, columns] of mean 0 within about ±1.5; the first octave has `cells` lattice cells a column."""
+    """Return smooth noise [rows, columns] of mean 0 within about ±1.5; the first octave has `cells` lattice cells a
+    column."""
     noise = np.zeros((rows, columns), np.float32)
     for octave in range(octaves):
         lattice = (cells << octave, max(1, round((cells << octave) * columns / rows)))
@@ -67,7 +68,7 @@ def bricks(rng: np.random.Generator, rows: int, columns: int, size: tuple[int, i
 
 
 def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
-    """Return a round mosaic: rings of nearly square stones, `ring` texels wide, in bands of zigzags, checks and
+    """Return a round mosaic of rings of nearly square stones, `ring` texels wide, in bands of zigzags, checks and
     stripes."""
     y, x = (np.indices((side, side), np.float32) + 0.5) - side / 2
     radius, angle = np.hypot(x, y) / ring, np.arctan2(y, x) / (2 * np.pi) + 0.5
@@ -89,7 +90,7 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
 
 
 def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
-    """Dark-veined stone."""
+    """Return dark-veined stone."""
     u, v = coordinates(rows, columns)
     phase = 9 * u + 5 * v + 1.6 * fractal_noise(rng, rows, columns, 4, octaves=5)
     veins = np.abs(np.sin(np.pi * phase)) ** 0.6
@@ -140,7 +141,7 @@ def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.n
 
 
 def lettering(text: str, rows: int, columns: int, height: float, ink: np.ndarray, paper: np.ndarray) -> np.ndarray:
-    """Text `height` texels high, centred on plain paper; repeated along the columns if it is shorter than they are."""
+    """Return text `height` texels high, centred on plain paper; short text repeats along the columns."""
     return mix(paper, ink, _text_mask(text, rows, columns, height, repeat=True))
 
 
@@ -158,7 +159,7 @@ def letter_block(letters: Sequence[str], side: int, colors: Sequence[np.ndarray]
 
 
 def _text_mask(text: str, rows: int, columns: int, height: float, *, repeat: bool) -> np.ndarray:
-    """Coverage [rows, columns] in [0, 1] of text in Pillow's own font, vertically centred."""
+    """Return the coverage [rows, columns] in [0, 1] of text in Pillow's own font, vertically centred."""
     font = ImageFont.load_default(height)
     canvas = Image.new("L", (columns, rows))
     draw = ImageDraw.Draw(canvas)

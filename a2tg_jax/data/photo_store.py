@@ -1,4 +1,4 @@
-"""Where photographs are kept: in memory while there is room, then on disk, from where they are read when needed."""
+"""Storage of photographs: in memory while there is room, beyond that on disk, read when needed."""
 
 import dataclasses
 import tempfile
@@ -16,7 +16,7 @@ from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.host.startup import cache_folder
 
 SHARE_OF_MEMORY = 0.25
-"""Of what the process may have; photographs beyond it stay on disk."""
+"""Share of the process's memory for photographs; those beyond it stay on disk."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Picture:
 
     @staticmethod
     def of(pixels: "np.ndarray | Picture") -> "Picture":
-        """Pixels that are held in memory; a picture is returned as it is."""
+        """Return a picture of pixels held in memory; a picture is returned unchanged."""
         return pixels if isinstance(pixels, Picture) else Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 
     @property
@@ -43,7 +43,7 @@ class Picture:
 
     @property
     def nbytes(self) -> int:
-        """Of its pixels, wherever they are."""
+        """Bytes of its pixels, in memory or on disk."""
         return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
 
 
@@ -82,7 +82,7 @@ class Shelf:
         return self._put(pixels) if source is None else _decoded_again(source, pixels)
 
     def _put(self, pixels: np.ndarray) -> Picture:
-        """Pixels in the file without a name."""
+        """Write pixels to the unnamed file."""
         folder, shape = cache_folder(), pixels.shape
         try:
             with self._lock:
@@ -116,7 +116,7 @@ def _decoded_again(source: Path, pixels: np.ndarray) -> Picture:
     def read() -> np.ndarray:
         again = np.ascontiguousarray(read_pixels(source))
         if zlib.crc32(again.data) != checksum:
-            raise ValueError(f"{source}: has changed since the scene was loaded; put it back as it was, or start anew")
+            raise ValueError(f"{source}: has changed since the scene was loaded; restore it or start again")
         return again
 
     return Picture(pixels.shape, read)

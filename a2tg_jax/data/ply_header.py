@@ -21,25 +21,25 @@ MOST_DIGITS = 20
 
 @dataclasses.dataclass(frozen=True)
 class VertexHeader:
-    """What a PLY says of its vertices."""
+    """Header of a PLY file's vertices."""
 
     path: Path
     encoding: str
     """One of `BYTE_ORDERS`."""
     count: int
     fields: dict[str, str]
-    """NumPy's name of the type of each property, in their order."""
+    """NumPy type name of each property, in order."""
 
     @property
     def dtype(self) -> np.dtype:
-        """Of one vertex in a binary file."""
+        """Bytes of one vertex in a binary file."""
         return np.dtype([(name, BYTE_ORDERS[self.encoding] + kind) for name, kind in self.fields.items()])
 
     def require(self, names: Iterable[str], wanted: str) -> None:
         """Raise ValueError unless the vertices have some properties."""
         missing = [name for name in names if name not in self.fields]
         if missing:
-            raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is wanted")
+            raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
 
     def read_binary(self, file: BinaryIO) -> np.ndarray:
         """Return the vertices [count] of a binary file, structured. ValueError: it is cut off."""
@@ -74,7 +74,7 @@ def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
             case ["element", name, number]:
                 elements.append(name)
                 if not number.isdecimal() or len(number) > MOST_DIGITS:
-                    raise ValueError(f"{path}: announces {shortened(number)} of {name}; a number is wanted")
+                    raise ValueError(f"{path}: announces {shortened(number)} of {name}; a number is expected")
                 count = int(number) if len(elements) == 1 else count
             case ["property", kind, name] if elements == ["vertex"] and kind in PLY_TYPES and name not in fields:
                 fields[name] = PLY_TYPES[kind]
@@ -100,7 +100,9 @@ def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
                 encoding = name
             case ["element", name, number]:
                 if not number.isdecimal() or len(number) > MOST_DIGITS:
-                    raise ValueError(f"{path}: announces {shortened(number)} of {shortened(name)}; a number is wanted")
+                    raise ValueError(
+                        f"{path}: announces {shortened(number)} of {shortened(name)}; a number is expected"
+                    )
                 found[name] = VertexHeader(path, encoding, int(number), {})
             case ["property", kind, name] if found and kind in PLY_TYPES:
                 list(found.values())[-1].fields[name] = PLY_TYPES[kind]

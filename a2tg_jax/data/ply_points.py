@@ -12,7 +12,7 @@ from a2tg_jax.host.regular_files import is_regular, open_regular
 
 COLORS = ("red", "green", "blue")
 LEAST_BYTES = 2
-"""Of a number in a text: a digit, and what separates it from the next."""
+"""Least number of bytes of a number in text: a digit and a separator."""
 
 
 def read_ply_points(path: Path) -> PointCloud:
@@ -53,7 +53,7 @@ def _read_ascii(file: BinaryIO, header: VertexHeader) -> np.ndarray:
 
 
 def _colors(columns: Mapping[str, np.ndarray], header: VertexHeader) -> np.ndarray:
-    """uint8 colours [P, 3] of the vertices."""
+    """Return uint8 colours [P, 3] of the vertices."""
     if not set(COLORS).issubset(columns):
         return np.full((header.count, 3), 128, np.uint8)
     colors = np.stack([columns[name] for name in COLORS], axis=-1)

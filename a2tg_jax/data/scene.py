@@ -1,4 +1,4 @@
-"""What every loader makes: a scene of photographs with exact pinhole cameras, and points, in the normalised world."""
+"""Scenes as loaders return them: photographs with exact pinhole cameras, and points, in the normalised world."""
 
 import dataclasses
 import itertools
@@ -17,7 +17,7 @@ from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
 FARTHEST = 1e5
-"""Of a camera from the middle of all, in units of their median."""
+"""Largest distance of a camera from the median centre, in units of the median distance."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,26 +31,26 @@ class View:
     picture: Picture
     """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given, too."""
     mask: Mask | None = None
-    """Which pixels count, in losses and metrics; None: all of them. An array [H, W] bool may be given, too."""
+    """Mask of the pixels that count in losses and metrics; None counts all. An array [H, W] bool may be given, too."""
 
     def __post_init__(self) -> None:
-        """Arrays become pictures that are held, and masks."""
+        """Convert arrays to pictures and masks."""
         object.__setattr__(self, "picture", Picture.of(self.picture))
         object.__setattr__(self, "mask", None if self.mask is None else Mask.of(self.mask))
 
     @property
     def image(self) -> np.ndarray:
-        """[H, W, 3] uint8. Read from disk where it is kept there: look once."""
+        """Pixels [H, W, 3] uint8. If they are kept on disk, each access reads them."""
         return np.ascontiguousarray(self.picture.read()[..., :3])
 
     @property
     def alpha(self) -> np.ndarray | None:
-        """[H, W] uint8 opacity (straight: `image` is not multiplied by it), or None where the photograph is opaque."""
+        """Opacity [H, W] uint8 (straight: `image` is not multiplied by it), or None for an opaque photograph."""
         return np.ascontiguousarray(self.picture.read()[..., 3]) if self.has_alpha else None
 
     @property
     def has_alpha(self) -> bool:
-        """Whether the photograph has an opacity; it is not read for that."""
+        """Whether the photograph has an opacity. This does not read it."""
         return self.picture.shape[2] == 4
 
 
@@ -62,13 +62,13 @@ class Scene:
     train: tuple[View, ...]
     """Views to train on, sorted by name; at least one."""
     test: tuple[View, ...]
-    """Views kept for testing, sorted by name; may be empty."""
+    """Held-out test views, sorted by name; may be empty."""
     points: np.ndarray
     """[P, 3] float32 surface points to start from, P >= 2."""
     colors: np.ndarray
     """[P, 3] float32 colours of the points in [0, 1]."""
     transform: Similarity
-    """Leads from the original world of the input to the normalised world; its inverse brings results back."""
+    """Similarity from the original world of the input to the normalised world; its inverse brings results back."""
     scale: float
     """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean."""
 
@@ -85,7 +85,7 @@ class Shot:
     pixels: Picture | np.ndarray
     """[H, W, 3] or [H, W, 4] uint8, with straight alpha."""
     mask: Mask | None = None
-    """Which pixels count; None: there is no mask."""
+    """Mask of the pixels that count; None without a mask."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def counted_pixels(views: Sequence[View]) -> np.ndarray:
 
 
 def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return the view's image as floats, over a background where it is transparent.
+    """Return the view's image as floats, over a background if it is transparent.
 
     Args:
       view: one view.
@@ -147,7 +147,7 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
 def assemble_scene(
     name: str, train: Sequence[Shot], test: Sequence[Shot], cloud: PointCloud | None, *, source: str
 ) -> Scene:
-    """Normalises the world and makes the scene.
+    """Normalise the world and assemble the scene.
 
     Args:
       name: of the scene.
@@ -236,14 +236,16 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     if len(shots) < 2:
         raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
     if num_train < 1:
-        raise ValueError(f"{source}: keeps every view for testing; choose another test_every, or 0 for no test views")
+        raise ValueError(
+            f"{source}: holds out every view for testing; choose another test_every, or 0 for no test views"
+        )
     for shot, following in itertools.pairwise(shots):
         if shot.name == following.name:
-            raise ValueError(f"{source}: lists {shot.name} twice; remove one of the two")
+            raise ValueError(f"{source}: lists {shot.name} twice; remove one")
 
 
 def _check_distances(shots: Sequence[Shot], source: str) -> None:
-    """Refuse a camera beyond all the others, which would move the origin to nowhere."""
+    """Raise if a camera lies so far out that it would move the origin."""
     centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     farthest = int(np.argmax(distances))
@@ -255,7 +257,7 @@ def _check_distances(shots: Sequence[Shot], source: str) -> None:
 
 
 def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
-    """Return the points that are somewhere, in both worlds; others are left out with a warning."""
+    """Return the finite points; others are left out with a warning."""
     is_usable = _are_somewhere(cloud.points)
     is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
     if is_usable.all():

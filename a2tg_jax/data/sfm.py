@@ -17,16 +17,16 @@ from a2tg_jax.data.images import map_in_threads
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_EXHAUSTIVE = 200
-"""With more photographs than this, only those near each other in the order of their names are matched."""
+"""Number of photographs beyond which only neighbours in name order are matched."""
 MIN_REGISTERED = 3
 
 
 class SfmSummary(NamedTuple):
-    """What came out of `run_sfm`."""
+    """Result of `run_sfm`."""
 
     num_photos: int
     num_registered: int
-    """Photographs that got a pose."""
+    """Number of photographs with a pose."""
     num_points: int
 
 
@@ -38,7 +38,7 @@ def run_sfm(
     camera_model: str = "SIMPLE_RADIAL",
     progress: bool = True,
 ) -> SfmSummary:
-    """Estimates poses and points and writes a scene folder that `load_scene` reads.
+    """Estimate poses and points, and write a scene folder that `load_scene` reads.
 
     Every pair of photographs is matched, or neighbours by name where there are more than 200. Photographs of one size
     share one camera. The largest model found is kept and undistorted. Runs on the CPU and uses the seed wherever COLMAP
@@ -92,7 +92,7 @@ def find_photos(folder: Path) -> list[str]:
 
 
 def _match(photos: Path, names: list[str], database: Path, seed: int, camera_model: str, bar: tqdm) -> None:
-    """Fills the database with features of the photographs and the matches between them."""
+    """Extract features of the photographs and matches between them into the database."""
     colmap = pycolmap()
     colmap.set_random_seed(seed)
     mode = colmap.CameraMode.SINGLE if _have_one_size(photos, names) else colmap.CameraMode.AUTO
@@ -142,7 +142,7 @@ def _check_model(model: Any, num_photos: int, photos: Path) -> None:
 
 
 def _write_scene(model: Any, photos: Path, work: Path, out: Path) -> None:
-    """Undistorts the photographs of the model and moves images and sparse model to their places."""
+    """Undistort the photographs of the model, and move images and sparse model to their places."""
     chosen, undistorted = work / "chosen", work / "undistorted"
     chosen.mkdir()
     model.write(chosen)

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 NEAR = 1e-3
-"""Hits at smaller t are the point itself."""
+"""Smallest t of a hit; nearer ones are the point itself."""
 Vector = tuple[float, float, float]
 
 
@@ -60,7 +60,7 @@ class Tube:
     """
 
     center: Vector
-    """Of its foot."""
+    """Centre of its foot."""
     radius: float
     height: float
     is_inward: bool = False
@@ -118,7 +118,7 @@ class Block:
     center: Vector
     half_side: float
     turn: float
-    """Radians counter-clockwise."""
+    """Angle in radians, counter-clockwise."""
 
     @property
     def axes(self) -> np.ndarray:
@@ -174,7 +174,7 @@ def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.nd
 
 
 def trace(surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and places of what rays from one point see.
+    """Return colours and places of what rays from one point see.
 
     Args:
       surfaces: the scene.

@@ -13,11 +13,11 @@ from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, check_t
 from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
 
 TARGET = np.array([0.0, 0.1, 0.45])
-"""The point all cameras look at."""
+"""Point that all cameras look at."""
 DISTANCE = 2.4
-"""Of the cameras from the target."""
+"""Distance of the cameras from the target."""
 FIELD_OF_VIEW = np.deg2rad(58.0)
-"""Across the longer side of the image."""
+"""Field of view across the longer side of the image."""
 SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
 """Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
 
@@ -68,7 +68,7 @@ def synthetic_scene(
 
 
 def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
-    """Shapes and their colours: a room, a round podium, and what stands on it. Lengths are about metres."""
+    """Return shapes and their colours: a room, a round podium, and the objects on it. Lengths are about metres."""
     wall = patterns.bricks(rng, 320, 2560, (14, 33))
     motto = "A2TG - ADAPTIVE ANISOTROPIC TEXTURED GAUSSIANS -"
     wall[142:206] = patterns.lettering(motto, 64, 2560, 50, patterns.CREAM, patterns.SLATE)
@@ -89,7 +89,7 @@ def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
 
 
 def camera_path(num_views: int) -> np.ndarray:
-    """Camera centres [V, 3] evenly along a closed figure of eight in front of the target, above its height."""
+    """Return camera centres [V, 3] evenly along a closed figure of eight in front of the target, above its height."""
     phase = 2 * np.pi * (np.arange(num_views) + 0.5) / num_views  # half a step beside the crossing
     azimuth = -0.5 * np.pi + np.deg2rad(40.0) * np.sin(phase)
     elevation = np.deg2rad(26.0) + np.deg2rad(11.0) * np.sin(2 * phase + 0.6)
@@ -98,7 +98,7 @@ def camera_path(num_views: int) -> np.ndarray:
 
 
 def look_at(center: np.ndarray) -> np.ndarray:
-    """World-to-camera matrix [4, 4] of a camera at `center` that looks at the target, +z being up."""
+    """Return the world-to-camera matrix [4, 4] of a camera at `center` that looks at the target, +z up."""
     forward = (TARGET - center) / np.linalg.norm(TARGET - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -109,7 +109,7 @@ def look_at(center: np.ndarray) -> np.ndarray:
 
 
 def intrinsics(width: int, height: int) -> np.ndarray:
-    """K [3, 3] of square pixels with the principal point in the middle."""
+    """Return K [3, 3] of square pixels with the principal point in the middle."""
     focal = max(width, height) / (2 * np.tan(FIELD_OF_VIEW / 2))
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
@@ -134,7 +134,7 @@ def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: i
 
 
 def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: np.random.Generator) -> PointCloud:
-    """Surface points under `count` random pixels of the shots, with the colours of those pixels."""
+    """Return surface points under `count` random pixels of the shots, with the colours of those pixels."""
     shares = np.bincount(rng.integers(len(shots), size=count), minlength=len(shots))
     points, colors = [], []
     for shot, share in zip(shots, shares, strict=True):
@@ -154,6 +154,6 @@ def _center(viewmat: np.ndarray) -> np.ndarray:
 
 
 def _directions(viewmat: np.ndarray, K: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """World directions [3, P] float32 of the rays through image points (x, y), any shape with P entries."""
+    """Return world directions [3, P] float32 of the rays through image points (x, y), any shape with P entries."""
     points = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float32)
     return (viewmat[:3, :3].T @ np.linalg.inv(K)).astype(np.float32) @ points

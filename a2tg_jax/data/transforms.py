@@ -27,7 +27,7 @@ from a2tg_jax.host.text import shortened
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
 BLENDER_HALF_SIDE = 1.3
-"""The objects of the NeRF-synthetic scenes fit into the cube of ± this."""
+"""Half the side of the cube that holds the objects of NeRF-synthetic scenes."""
 OPENCV_KEYS = ("k1", "k2", "p1", "p2")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 FILE_KEYS = ("file_path", "mask_path", "ply_file_path")
@@ -100,7 +100,7 @@ def _read_json(file: Path) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
-        raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is wanted")
+        raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")
     for number, frame in enumerate(meta["frames"]):
         if not isinstance(frame, dict):
             raise ValueError(f"{file}: frame {number} must be an object; got {shortened(frame)}")
@@ -163,7 +163,7 @@ def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -
 
 
 def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
-    """World to camera (OpenCV) from camera to world (OpenGL)."""
+    """Return world to camera (OpenCV) from camera to world (OpenGL)."""
     try:
         pose = np.asarray(transform_matrix, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -215,19 +215,20 @@ def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) ->
 
 
 def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
-    """COLMAP's model and its distortion parameters, which mean what nerfstudio's of the same names mean."""
+    """Return COLMAP's camera model and its distortion parameters, which mean the same as nerfstudio's of these
+    names."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
     values = {key: _number(frame, key, 0.0, what) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if model == "OPENCV_FISHEYE":
         return model, [values[key] for key in FISHEYE_KEYS]
     if model not in PERSPECTIVE_MODELS:
         wanted = "a perspective one or OPENCV_FISHEYE"
-        raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is wanted")
+        raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
     if values["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
     return "FULL_OPENCV", [*(values[key] for key in OPENCV_KEYS), values["k3"], 0.0, 0.0, 0.0]
 
 
 def _names(file_names: list[str]) -> set[str]:
-    """File names of a split, written as the shots' names are."""
+    """Return the file names of a split, written like the shots' names."""
     return {Path(name).as_posix() for name in file_names}

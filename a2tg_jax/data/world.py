@@ -11,9 +11,9 @@ from a2tg_jax.core.similarity import Similarity, camera_centers
 MIN_AXIS_SPREAD = 1e-3
 """Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""
 MIN_UP_LENGTH = 1e-3
-"""Shortest mean of the cameras' unit up vectors that still tells where up is."""
+"""Shortest mean of the cameras' unit up vectors that still defines up."""
 ZERO_SPREAD = 1e-9
-"""Cameras closer together than this, relative to their distance from the origin, stand at one place."""
+"""Distance below which cameras count as one place, relative to their distance from the origin."""
 
 
 def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
@@ -36,17 +36,18 @@ def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
     if min(spread, distance) <= zero:
-        raise ValueError("all the cameras stand at one place; photographs from different positions are needed")
+        raise ValueError("all cameras stand at one place; photographs from different positions are needed")
     return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)
 
 
 def scene_scale(centers: np.ndarray) -> float:
-    """1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning rate."""
+    """Return 1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning
+    rate."""
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 def _nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """argmin_x Σ |(I - d·dᵀ)(x - c)|² for lines through `centers` along unit `axes`, or the mean centre."""
+    """Return argmin_x Σ |(I - d·dᵀ)(x - c)|² for lines through `centers` along unit `axes`, or the mean centre."""
     projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projections.mean(axis=0)
     if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
-"""Name of a file that is being written: that of the file that it becomes, and the process."""
+"""Name pattern of a partial file: the name of the final file, and the process."""
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """Yields a temporary path beside `path` to write to, and renames it to `path` if the block ends well.
+    """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
 
     A run killed while it writes, or a machine that loses its power, leaves the old file, or none, never half of one.
     Missing parent folders are made.
@@ -30,7 +30,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def left_over(folder: Path) -> dict[Path, Path]:
-    """Files of a folder that were being written, and what they were to become."""
+    """Return the partial files of a folder, with the files they were to become."""
     if not folder.is_dir():
         return {}
     names = {entry: PARTIAL.fullmatch(entry.name) for entry in folder.iterdir()}
@@ -38,7 +38,7 @@ def left_over(folder: Path) -> dict[Path, Path]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Has the names of a folder's files on the disk, where the operating system lets folders be flushed."""
+    """Flush the names of a folder's files to disk, if the operating system can flush folders."""
     if os.name == "nt":
         return
     number = os.open(folder, os.O_RDONLY)

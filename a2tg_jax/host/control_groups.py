@@ -1,4 +1,4 @@
-"""The control groups (of a container, a batch system, a service) that this process is in, as Linux tells of them."""
+"""Control groups of this process (a container, a batch system, a service), as Linux reports them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""How many threads native loops run on."""
+"""Number of threads of native loops."""
 
 import functools
 import math
@@ -32,7 +32,7 @@ def set_num_threads(num_threads: int | None) -> None:
 
 
 def num_threads() -> int:
-    """Return the number that was set, or the environment's, or that of the cores that this process may use.
+    """Return the number of threads: the one that was set, the environment's, or one per available core.
 
     Raises:
       ValueError: if the environment's is not a positive integer.

@@ -1,4 +1,4 @@
-"""What the last bits of a training run depend on besides its numbers: versions, processor, device, threads."""
+"""Dependencies of a run's last bits besides its options: versions, processor, device, threads."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from a2tg_jax.host.startup import processor_key
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """Where numbers were computed."""
+    """Machine and software that computed a result."""
 
     jax: str
     """Version."""
@@ -19,12 +19,12 @@ class Machine:
     device: str
     """JAX's platform and the kind of device."""
     processor: str
-    """A text that processors share for which the same code is made."""
+    """Text shared by processors that run the same compiled code."""
     threads: int
-    """Of native loops, among which sums are divided."""
+    """Number of threads of native loops, which divide sums among them."""
 
     def differences(self, now: "Machine") -> list[str]:
-        """What is another now, so that numbers will differ in their last bits; with what to do, where there is."""
+        """Return what differs on another machine and changes the last bits, with a remedy if there is one."""
         told = [
             f"{name} is {getattr(now, name)} and was {getattr(self, name)}"
             for name in ("jax", "jaxlib", "device", "processor")
@@ -38,7 +38,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """Return the one that this process runs on; JAX's devices are started."""
+    """Return the machine of this process. This starts JAX's devices."""
     device = jax.devices()[0]
     kind = f"{device.platform} {device.device_kind}"
     return Machine(jax.__version__, jax.lib.__version__, kind, processor_key(), num_threads())

@@ -1,4 +1,4 @@
-"""How much memory a process has and may have, and what compiled programs leave behind in it."""
+"""Memory that a process has and may have, and what compiled programs leave behind in it."""
 
 import ctypes
 import functools
@@ -11,9 +11,9 @@ import jax
 from a2tg_jax.host.control_groups import group_folders
 
 LARGEST_SHARE = 0.6
-"""Of the pieces of memory that a process may have; beyond it compiled programs are dropped."""
+"""Share of the memory mappings allowed to a process beyond which compiled programs are dropped."""
 LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
-"""What a control group tells of its limit and its use, in version 2 and in version 1."""
+"""File names of a control group's limit and use, in version 2 and in version 1."""
 
 
 def memory_limit(root: Path = Path("/")) -> int:
@@ -65,7 +65,7 @@ def tidy_memory() -> None:
 
 
 def return_free_memory() -> None:
-    """Has the C library give back what it keeps for itself: 100 to 200 MB after a training step was compiled.
+    """Have the C library return the memory it caches: 100 to 200 MB after a training step was compiled.
 
     With other C libraries than glibc nothing happens.
     """
@@ -83,7 +83,7 @@ def _c_library() -> Any:
 
 
 def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
-    """Drops all of JAX's compiled programs where the process is about to run out of pieces of memory for further ones.
+    """Drop all compiled programs of JAX if the process is about to run out of memory mappings for further ones.
 
     Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Where it gets
     none it waits for ever. What is still needed is compiled again.

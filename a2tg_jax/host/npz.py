@@ -14,9 +14,9 @@ from a2tg_jax.host.text import shortened
 
 LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
-"""What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
+"""Bytes a file may unpack to beyond `LARGEST_RATIO` times its own size."""
 LONGEST_HEADER = 10_000
-"""Bytes of what an array says of itself."""
+"""Largest size in bytes of an array's header."""
 CHUNK = 1 << 24
 LONGEST_REASON = 200
 
@@ -64,7 +64,7 @@ def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
         if file.readinto(memoryview(piece)) != len(piece):  # type: ignore[attr-defined, arg-type]
             raise ValueError(f"{name} is cut off")
     if file.read(1):  # Also makes the zip compare its checksum.
-        raise ValueError(f"{name} goes on where it should end")
+        raise ValueError(f"{name} continues past its end")
     return flat.reshape(shape, order="F" if is_fortran else "C").astype(dtype.newbyteorder("="), copy=False)
 
 
@@ -72,7 +72,7 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int,
     """Return the dtype of one array, whether its first index runs fastest, and its shape."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
-        raise ValueError(f"{name} is of the version {version} of .npy, which is not known here")
+        raise ValueError(f"{name} is of the version {version} of .npy, which is unknown")
     length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
     if length > LONGEST_HEADER:
         raise ValueError(f"{name} has a header of {length} bytes")

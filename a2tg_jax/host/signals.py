@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: what a program does that is asked to end."""
+"""Ctrl-C, SIGTERM and SIGHUP: how a program ends when it is asked to."""
 
 import contextlib
 import signal
@@ -22,13 +22,13 @@ class Stopped(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """128 and the number of the signal, as shells say it: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
+        """Exit code, 128 plus the number of the signal: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
         return 128 + self.number
 
 
 @contextlib.contextmanager
 def raised() -> Iterator[None]:
-    """Meanwhile SIGTERM and SIGHUP raise `Stopped`, as Ctrl-C raises KeyboardInterrupt."""
+    """Have SIGTERM and SIGHUP raise `Stopped` within the block, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(number: int, frame: object) -> None:
         raise Stopped(number)
@@ -39,7 +39,7 @@ def raised() -> Iterator[None]:
 
 @contextlib.contextmanager
 def noted() -> Iterator[Callable[[], bool]]:
-    """Meanwhile the first signal is noted, and the second raises `Stopped`.
+    """Note the first signal within the block, and raise `Stopped` at the second.
 
     Yields a function that tells whether there was one. In the end any becomes a `Stopped`.
     """
@@ -61,7 +61,8 @@ def noted() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable, numbers: tuple[int, ...]) -> Iterator[None]:
-    """Signals that are ignored, as nohup ignores SIGHUP, stay so; and all do outside the main thread."""
+    """Install a handler within the block. Ignored signals, such as SIGHUP under nohup, stay ignored; other threads
+    install none."""
     before: dict[int, object] = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.getsignal(number) for number in numbers}

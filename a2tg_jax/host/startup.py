@@ -1,4 +1,4 @@
-"""Settings of JAX that have to be made before its first computation. The library itself never makes them."""
+"""Settings of JAX to be made before its first computation. The library itself never makes them."""
 
 import hashlib
 import os
@@ -12,7 +12,7 @@ from a2tg_jax.host import cores
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
 """Versions known to have the flags below; an unknown flag would end the process."""
 QUIET_CACHE_VERSION = (0, 12)
-"""The first version that reads programs from a cache without alarming lines."""
+"""First version that reads programs from a cache without alarming log lines."""
 WHOLE_LOOPS_FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 
@@ -75,7 +75,7 @@ def add_xla_flags(flags: tuple[str, ...]) -> None:
 
 
 def cache_folder() -> Path:
-    """Return the folder of what can be made again: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
+    """Return the cache folder: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "a2tg-jax"
 
 
@@ -88,7 +88,7 @@ def compilation_cache_folder() -> Path:
 
 
 def processor_key() -> str:
-    """Return a short text that processors share for which the same code is made."""
+    """Return a short text shared by processors that run the same compiled code."""
     processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
     return hashlib.sha256(processor.encode()).hexdigest()[:12]
 

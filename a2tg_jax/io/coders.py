@@ -1,4 +1,4 @@
-"""Lossless coders of byte planes: what established libraries do, bounded in what they may unpack.
+"""Lossless coders of byte planes, from established libraries, with a bound on what they unpack.
 
 A plane is a column of numbers of one byte each; C planes of n bytes are coded together, one after the other.
 Nothing is allocated for more bytes than the caller says there are, whatever the coded bytes claim.
@@ -16,18 +16,18 @@ from PIL import Image
 
 Coder = Literal["lzma", "zstd", "webp", "none"]
 Choice = Literal["smallest", "lzma", "zstd", "webp", "none"]
-"""A coder, or whichever makes least of it."""
+"""Name of a coder, or "smallest" for the one with fewest bytes."""
 ZSTD_LEVEL = 19
 LZMA_FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 20}
 ]
-"""One adaptive model for the bytes of a plane, without contexts: they are noise around few values, not text."""
+"""Filters for LZMA: one adaptive model without contexts, because planes are noise around few values."""
 WEBP_CHANNELS = 3
 LONGEST_WEBP_SIDE = 16_383
 
 
 class CodedError(ValueError):
-    """What is read is not what a coder wrote."""
+    """Error for bytes that no coder wrote."""
 
 
 def encode_smallest(planes: np.ndarray) -> tuple[Coder, bytes]:
@@ -40,7 +40,7 @@ def encode_smallest(planes: np.ndarray) -> tuple[Coder, bytes]:
 
 
 def encode(coder: Coder, planes: np.ndarray) -> bytes:
-    """Codes planes [C, n] of uint8; no bytes where there are none."""
+    """Code planes [C, n] of uint8; no planes give no bytes."""
     return CODERS[coder].encode(np.ascontiguousarray(planes)) if planes.size else b""
 
 
@@ -52,7 +52,7 @@ def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
     """
     if num_planes * length == 0:
         if data:
-            raise CodedError("holds bytes where there should be none")
+            raise CodedError("holds unexpected bytes")
         return np.zeros((num_planes, length), np.uint8)
     try:
         planes = CODERS[coder].decode(data, num_planes, length)
@@ -85,24 +85,24 @@ def _decode_lzma(data: bytes, num_planes: int, length: int) -> np.ndarray:
     stream = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS)
     found = stream.decompress(data, num_planes * length + 1)
     if not stream.eof or stream.unused_data:
-        raise ValueError("it does not end where it should")
+        raise ValueError("it does not end at its announced length")
     return np.frombuffer(found, np.uint8)
 
 
 def _webp_sides(num_planes: int, length: int) -> tuple[int, int]:
-    """Height and width of the whole image."""
+    """Return the height and width of the whole image."""
     num, height, width = _webp_shape(num_planes, length)
     return num * height, width
 
 
 def _webp_shape(num_planes: int, length: int) -> tuple[int, int, int]:
-    """Images below each other, the height and the width of one: a square for three planes."""
+    """Return the number of stacked images, and the height and width of one: a square for three planes."""
     width = math.isqrt(max(length - 1, 0)) + 1
     return -(-num_planes // WEBP_CHANNELS), -(-length // width), width
 
 
 def _encode_webp(planes: np.ndarray) -> bytes:
-    """Three planes as the channels of an image, row by row."""
+    """Code three planes as the channels of an image, row by row."""
     num, height, width = _webp_shape(*planes.shape)
     if max(_webp_sides(*planes.shape)) > LONGEST_WEBP_SIDE:
         raise ValueError(f"coder: {planes.size} bytes are more than an image of WebP holds; choose another")

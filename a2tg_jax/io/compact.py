@@ -51,7 +51,7 @@ HEAD = struct.Struct("<8sHIII")
 MOST_BYTES = 1 << 32
 LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
-"""What a file may unpack to: `LARGEST_RATIO` times its own size, and this."""
+"""Bytes a file may unpack to beyond `LARGEST_RATIO` times its own size."""
 LEAST_OPACITY = 1e-7
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
@@ -60,33 +60,33 @@ ORIGIN_DTYPES = {
 
 @dataclasses.dataclass(frozen=True)
 class CompactChoices:
-    """How finely numbers are kept: in 1 to 16 bits, evenly from the smallest to the largest, or as floats.
+    """Precision of each group of numbers: 1 to 16 bits, in even steps from the smallest to the largest, or floats.
 
     The defaults cost a few hundredths of a decibel.
     """
 
     means: Precision = 14
-    """Each axis; as bits, in steps that grow with the distance from the middle."""
+    """Precision of each axis; bits have steps that grow with the distance from the middle."""
     log_scales: Precision = 8
     quats: Precision = 8
-    """Each of three numbers."""
+    """Precision of each of three numbers."""
     opacities: Precision = 6
-    """As bits, of the opacities; as floats, of their logits."""
+    """Precision of the opacities as bits, or of their logits as floats."""
     sh_0: Precision = 8
-    """Spherical harmonics of degree 0."""
+    """Precision of the spherical harmonics of degree 0."""
     sh_rest: Precision = 5
-    """Of the higher degrees, each with ends of its own."""
+    """Precision of the higher degrees, each with its own range."""
     texels: Precision = 7
-    """RGB and alpha, each with ends of its own."""
+    """Precision of RGB and alpha, each with its own range."""
     coder: Choice = "smallest"
-    """lzma, of Python's own library; zstd; webp, as lossless images; none; or for each part the smallest of them."""
+    """Coder of all parts: lzma (Python's own), zstd, webp (lossless images), none, or the smallest for each part."""
 
     def keeping(self, others: Mapping[str, Any]) -> Self:
-        """Return the choices with others, by name."""
+        """Return the choices with some changed, by name."""
         return dataclasses.replace(self, **dict(others))  # type: ignore[arg-type]
 
     def check(self) -> Self:
-        """Raise ValueError, naming the choice, if one cannot be."""
+        """Raise ValueError, naming the choice, if one is invalid."""
         for field in dataclasses.fields(self):
             if field.name != "coder":
                 check_precision(f"choices.{field.name}", getattr(self, field.name))
@@ -101,7 +101,7 @@ DEFAULT_CHOICES = CompactChoices()
 
 
 def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoices = DEFAULT_CHOICES) -> None:
-    """Write the rows of a model that exist, with its appearance and its origin, in few bytes.
+    """Write a model's live rows, its appearance and its origin in few bytes.
 
     Args:
       path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
@@ -273,7 +273,7 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices)
 
 
 def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:
-    """Where the model was trained, as it was."""
+    """Return the origin that the file holds."""
     num = len(data["names"])
     shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
     shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
@@ -283,7 +283,7 @@ def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:
 
 
 def _textures_of(reader: Reader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes [N, 2] and texels [T, 4]."""
+    """Return sizes [N, 2] and texels [T, 4]."""
     if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in table for side in size):
         raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {table}")
     if any(len(size) != 2 for size in table):

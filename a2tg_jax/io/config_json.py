@@ -12,7 +12,7 @@ from a2tg_jax.host.text import shortened
 ConfigT = TypeVar("ConfigT")
 LARGEST_INTEGER = 2**64
 NONE = "None"
-"""None in a format that has no word for it, such as TOML."""
+"""Text for None in formats that lack it, such as TOML."""
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def config_from_dict(
     optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
         if name not in data and name not in optional:
-            raise ValueError(f"{_within(where, name)} is missing; it was written by another version")
+            raise ValueError(f"{_within(where, name)} is missing; another version wrote it")
     values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names if name in data}
     return kind(**values, **given)
 
@@ -58,7 +58,7 @@ def has_default(field: dataclasses.Field) -> bool:
 
 
 def _within(where: str, name: str) -> str:
-    """What the errors call a field: where.name, or "FILE: name" where the place is "FILE:"."""
+    """Return the name of a field in errors: where.name, or "FILE: name" if the place is "FILE:"."""
     return f"{where} {name}" if where.endswith(":") else f"{where}.{name}"
 
 

@@ -30,13 +30,13 @@ from a2tg_jax.model import Model
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 LONGEST_REASON = 500
-"""Characters of what is wrong with a file: it may say anything of itself."""
+"""Largest number of characters of an error about a file, whose own text may be long."""
 APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
-"""What the names of their arrays begin with."""
+"""Prefixes of the names of their arrays."""
 
 
 def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
-    """Write the rows of a model that exist, with its appearance and its origin.
+    """Write a model's live rows, its appearance and its origin.
 
     Args:
       path: the file, by custom *.npz; an older one is replaced once the new one is whole.
@@ -108,7 +108,7 @@ def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appea
 
 
 def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
-    """Class and options; of an appearance that holds others, theirs too."""
+    """Return the class and options of an appearance, and of those it holds."""
     kind = type(appearance)
     held = _held_appearances(appearance)
     described: dict[str, Any] = {"module": kind.__module__, "name": kind.__qualname__}
@@ -120,7 +120,7 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
     if back != appearance:
-        raise ValueError(f"the options of {kind.__name__} do not come back from JSON: {options}")
+        raise ValueError(f"the options of {kind.__name__} do not survive JSON: {options}")
     return {**described, "options": options}
 
 
@@ -148,7 +148,7 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
     if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
         return found
     raise ValueError(
-        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
+        f"shows the appearance {name} of the module {module}, which is unknown here: import that module first, or "
         f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
     )
 
@@ -157,7 +157,7 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
 
 
 def origin_to_dict(origin: Origin) -> dict[str, Any]:
-    """What of an origin is not numbers."""
+    """Return the fields of an origin that are not arrays."""
     return {"names": list(origin.names), "background": list(origin.background)}
 
 

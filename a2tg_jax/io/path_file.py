@@ -1,4 +1,4 @@
-"""Views that someone kept in the viewer, as JSON: what a flight goes through."""
+"""Camera paths as JSON: views saved in the viewer for a flight."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ LARGEST_SIDE = 16384
 MOST_VIEWS = 10_000
 LARGEST_NUMBER = 1e9
 ROUNDING = 1e-3
-"""How far from a rotation a matrix may be."""
+"""Largest deviation of a matrix from a rotation."""
 
 
 def load_views(path: Path) -> list[Camera]:
@@ -59,7 +59,7 @@ def _camera(view: Any, where: str) -> Camera:
 
 
 def _numbers(view: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """Finite numbers of a shape, which stand row by row in a list."""
+    """Return finite numbers of a shape from a list in row order."""
     values, count = view.get(name), int(np.prod(shape))
     is_number = lambda x: isinstance(x, int | float) and not isinstance(x, bool)  # noqa: E731
     if not isinstance(values, list) or len(values) != count or not all(map(is_number, values)):

@@ -36,7 +36,7 @@ ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUAT
 REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
 THIRD_SCALE = "scale_2"
 THICKNESS = 1e-3
-"""Third scale of a flat Gaussian in a file, as a share of its shorter one."""
+"""Ratio of the third scale of a flat Gaussian in a file to its shorter one."""
 LEAST_OPACITY = 1e-6
 AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
 """Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
@@ -148,7 +148,7 @@ def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
 
 
 def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
-    """Gaussians from the structured array of the vertices."""
+    """Return the Gaussians of a structured array of vertices."""
     names = vertices.dtype.names or ()
     rest = [name for name in SH_REST if name in names]
     if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
@@ -176,7 +176,7 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
 
 
 def _without_thinnest_axis(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3] whose thinnest axis is made the normal and dropped.
+    """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
 
     The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
     """

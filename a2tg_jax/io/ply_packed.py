@@ -20,7 +20,7 @@ BOUNDS = tuple(f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min
 COLOR_BOUNDS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS)
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 SH_RANGE = 8.0
-"""From the lowest to the highest coefficient that a byte may stand for."""
+"""Range of the coefficients that a byte stands for."""
 LEAST_OPACITY = 1e-6
 
 
@@ -65,7 +65,7 @@ def read_packed(file: BinaryIO, path: Path) -> np.ndarray:
 def _check(headers: Mapping[str, VertexHeader], path: Path) -> None:
     chunk, vertex = headers["chunk"], headers["vertex"]
     if vertex.encoding != "binary_little_endian":
-        raise ValueError(f"{path}: is a packed PLY in {vertex.encoding}; binary_little_endian is wanted")
+        raise ValueError(f"{path}: is a packed PLY in {vertex.encoding}; binary_little_endian is expected")
     chunk.require(BOUNDS, "a PLY as SuperSplat packs it")
     vertex.require(PACKED, "a PLY as SuperSplat packs it")
     if any(vertex.fields[name] != "u4" for name in PACKED):
@@ -78,7 +78,7 @@ def _check(headers: Mapping[str, VertexHeader], path: Path) -> None:
 
 
 def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Numbers in [0, 1] of unsigned integers in one, the first highest."""
+    """Return numbers in [0, 1] of unsigned integers packed into one, the first highest."""
     found, shift = [], sum(bits)
     for num in bits:
         shift -= num
@@ -87,7 +87,7 @@ def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def _within(bounds: Mapping[str, np.ndarray], what: str, axes: str, shares, names) -> dict[str, np.ndarray]:
-    """Columns between their bounds."""
+    """Return columns scaled between their bounds."""
     ends = [(bounds[f"min_{what}{axis}"], bounds[f"max_{what}{axis}"]) for axis in axes]
     return {
         name: low * (1 - share) + high * share for name, (low, high), share in zip(names, ends, shares, strict=True)
@@ -95,7 +95,8 @@ def _within(bounds: Mapping[str, np.ndarray], what: str, axes: str, shares, name
 
 
 def _rotations(packed: np.ndarray) -> dict[str, np.ndarray]:
-    """Unit quaternions wxyz: the largest number, whose index is in the highest bits, follows from the others."""
+    """Return unit quaternions wxyz. The highest bits hold the index of the largest number, which follows from the
+    others."""
     shares = _unpacked(packed & np.uint32((1 << 30) - 1), (10, 10, 10))
     others = np.stack([(share - 0.5) * np.sqrt(2) for share in shares])
     largest = np.sqrt(np.maximum(1 - np.sum(others**2, axis=0), 0.0))
@@ -105,7 +106,7 @@ def _rotations(packed: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _colors(bounds: Mapping[str, np.ndarray], packed: np.ndarray) -> dict[str, np.ndarray]:
-    """Coefficients of degree 0, and logits of opacities."""
+    """Return coefficients of degree 0, and logits of opacities."""
     *colors, opacity = _unpacked(packed, (8, 8, 8, 8))
     if set(COLOR_BOUNDS) <= set(bounds):
         colors = list(_within(bounds, "", CHANNELS, colors, CHANNELS).values())

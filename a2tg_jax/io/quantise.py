@@ -14,7 +14,7 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 class Ends(NamedTuple):
-    """Where the first and the last step lie."""
+    """Ends of a range: the first and the last step."""
 
     low: float
     high: float
@@ -70,7 +70,7 @@ def num_bytes_of(bits: int) -> int:
 
 
 def to_planes(codes: np.ndarray, bits: int) -> np.ndarray:
-    """uint8 [C·bytes, n]: the lowest bytes of codes [C, n], column by column, then the next higher."""
+    """Return uint8 [C·bytes, n]: the lowest bytes of codes [C, n], column by column, then the next higher."""
     codes = np.atleast_2d(codes)
     planes = [(codes >> (8 * index)) & 255 for index in range(num_bytes_of(bits))]
     return np.concatenate(planes).astype(np.uint8) if planes else np.zeros((0, codes.shape[1]), np.uint8)
@@ -85,7 +85,7 @@ def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
 
 
 def to_byte_planes(values: np.ndarray) -> np.ndarray:
-    """uint8 [C·itemsize, n]: the bytes of numbers [C, n] of any type, lowest first, as `to_planes` has them."""
+    """Return uint8 [C·itemsize, n]: the bytes of numbers [C, n] of any type, lowest first, as in `to_planes`."""
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     num_columns, length = values.shape
     by_byte = values.view(np.uint8).reshape(num_columns, length, values.dtype.itemsize)
@@ -103,7 +103,7 @@ def from_byte_planes(planes: np.ndarray, num_columns: int, dtype: np.dtype) -> n
 
 
 def green_apart(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Codes [3, n] of red, green, blue as red − green, green, blue − green, modulo what fits into their bytes."""
+    """Return codes [3, n] of RGB as red − green, green, blue − green, modulo the range of their bytes."""
     red, green, blue = codes
     mask = (1 << 8 * num_bytes_of(bits)) - 1
     return np.stack([(red - green) & mask, green, (blue - green) & mask])
@@ -127,7 +127,7 @@ class Contraction(NamedTuple):
 
     @staticmethod
     def of(x: np.ndarray) -> "Contraction":
-        """Of the numbers [n] of one axis: three quarters of them lie within the spread."""
+        """Return the compression of the numbers [n] of one axis; three quarters of them lie within the spread."""
         if not x.size:
             return Contraction(0.0, 1.0)
         centre = _short(np.float32(np.median(x)))
@@ -174,7 +174,7 @@ HALF_TURNS = np.array(
 
 
 def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit quaternions [n, 4] turned by half about one of their own axes, so that w is largest and not negative.
+    """Return unit quaternions [n, 4] after a half-turn about an own axis, so that w is largest and not negative.
 
     A flat Gaussian is the same after half a turn about any of its axes; what is shown on it is mirrored along.
 
@@ -190,7 +190,7 @@ def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_w(xyz: np.ndarray) -> np.ndarray:
-    """Unit quaternions [n, 4] of their last three numbers [3, n]; w is not negative."""
+    """Return unit quaternions [n, 4] from their last three numbers [3, n]; w is not negative."""
     squares = np.minimum(np.sum(xyz**2, axis=0), 1.0)
     quats = np.concatenate([np.sqrt(1.0 - squares)[None], xyz]).T
     return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)

@@ -18,7 +18,7 @@ from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
 U_MIRRORED, V_MIRRORED = (2, 3), (1, 3)
-"""The axes of half-turns that mirror a texture's columns, and its rows."""
+"""Axes of half-turns that mirror a texture's columns, and its rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,19 +28,19 @@ class Rows:
     means: np.ndarray
     """[N, 3]."""
     quats: np.ndarray
-    """[N, 4] unit, w largest."""
+    """Unit quaternions [N, 4], w largest."""
     log_scales: np.ndarray
     """[N, 2]."""
     logit_opacities: np.ndarray
     """[N]."""
     degrees: np.ndarray
-    """[N] of their spherical harmonics."""
+    """Degrees [N] of their spherical harmonics."""
     bands: tuple[np.ndarray, ...]
     """Band l is [M, 2l + 1, 3], of the M splats of degree l or more, in their order."""
     sizes: np.ndarray | None
-    """[N, 2] of their textures, (Tv, Tu); None without textures."""
+    """Sizes [N, 2] of their textures, (Tv, Tu); None without textures."""
     texels: np.ndarray | None
-    """[T, 4], one texture after the other, each row by row."""
+    """Texels [T, 4], one texture after the other, each row by row."""
 
 
 def check_kind(appearance: Appearance) -> None:
@@ -64,7 +64,7 @@ def rows_of(model: Model) -> Rows:
     shown = model.appearance.arrays(model.params, model.layout)
     for name, values in (*fields.items(), *shown.items()):
         if not np.isfinite(values).all():
-            raise ValueError(f"model.{name} must be finite; some are NaN or infinite")
+            raise ValueError(f"model.{name} must be finite; some values are NaN or infinite")
     sh = fields["sh"]
     bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
     degrees = np.full(gaussians.num, gaussians.sh_degree)
@@ -100,7 +100,7 @@ def _owned(degrees: np.ndarray, order: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Where the texels of splats in another order, and mirrored, stood."""
+    """Return the old places of the texels of reordered and mirrored splats."""
     areas = sizes.prod(axis=1)
     starts = (np.cumsum(areas) - areas)[order]
     areas = areas[order]

@@ -14,23 +14,23 @@ from a2tg_jax.io.coders import CODERS, Choice, CodedError, decode, encode, encod
 from a2tg_jax.io.quantise import Contraction, Ends, Precision
 
 MEANS_FLOAT_BITS = 16
-"""Of a place along the Z curve where means are kept as floats."""
+"""Bits of a place along the Z curve if means are kept as floats."""
 
 
 @dataclasses.dataclass
 class Layout:
-    """What is written beside the bytes."""
+    """Description of the coded bytes."""
 
     lengths: dict[str, int] = dataclasses.field(default_factory=dict)
     """Coded bytes by name, in order."""
     coders: dict[str, str] = dataclasses.field(default_factory=dict)
-    """By name."""
+    """Coder of each part, by name."""
     ends: dict[str, list[float]] = dataclasses.field(default_factory=dict)
-    """Of what is kept in bits, the smallest and the largest; of each axis of the means, centre and spread before."""
+    """Smallest and largest of each group kept in bits; for each axis of the means, centre and spread come first."""
 
 
 class Writer:
-    """Codes columns one after the other."""
+    """Writer of coded columns, one after the other."""
 
     def __init__(self, coder: Choice):
         self.coder = coder
@@ -44,7 +44,7 @@ class Writer:
         return b"".join(self._pieces)
 
     def planes(self, name: str, planes: np.ndarray) -> None:
-        """uint8 [C, n]."""
+        """Write uint8 [C, n]."""
         coder = self.coder
         if coder == "smallest":
             coder, piece = encode_smallest(planes)
@@ -56,15 +56,15 @@ class Writer:
         self.num_unpacked += planes.size
 
     def exact(self, name: str, values: np.ndarray) -> None:
-        """Numbers of any shape and type, as they are."""
+        """Write numbers of any shape and type exactly."""
         self.planes(name, quantise.to_byte_planes(values.reshape(1, -1)))
 
     def indices(self, name: str, indices: np.ndarray, count: int) -> None:
-        """[n] integers below `count`; nothing where there is one."""
+        """Write [n] integers below `count`; no bytes if there is one."""
         self.planes(name, quantise.to_planes(indices, _bits_of_indices(count)))
 
     def numbers(self, name: str, values: np.ndarray, precision: Precision, *, is_color: bool = False) -> None:
-        """Floats [C, n]; where they are colours, the three columns are red, green, blue.
+        """Write floats [C, n]. The three columns of colours are red, green, blue.
 
         Raises:
           ValueError: if float16 cannot hold them.
@@ -83,7 +83,7 @@ class Writer:
         self.planes(name, quantise.to_planes(codes, precision))
 
     def means(self, name: str, values: np.ndarray, precision: Precision) -> np.ndarray:
-        """Positions [3, n], in the order [n] of the Z curve that is returned."""
+        """Write positions [3, n], and return their order [n] along the Z curve."""
         bits = precision if isinstance(precision, int) else MEANS_FLOAT_BITS
         contractions = [Contraction.of(axis) for axis in values]
         contracted = [of.contracted(axis) for of, axis in zip(contractions, values, strict=True)]
@@ -121,7 +121,7 @@ class Reader:
         self._names = list(layout.lengths)
 
     def planes(self, name: str, num_planes: int, length: int) -> np.ndarray:
-        """uint8 [num_planes, length].
+        """Read uint8 [num_planes, length].
 
         Raises:
           ValueError: if the next part is another, is damaged, or there is no room left.
@@ -168,7 +168,7 @@ class Reader:
     def numbers(
         self, name: str, num_columns: int, length: int, precision: Precision, *, is_color: bool = False
     ) -> np.ndarray:
-        """float32 [num_columns, length]."""
+        """Read float32 [num_columns, length]."""
         if not isinstance(precision, int):
             dtype = np.dtype(precision)
             planes = self.planes(name, num_columns * dtype.itemsize, length)
@@ -184,7 +184,7 @@ class Reader:
         return _finite(name, quantise.dequantised(codes, ends, precision))
 
     def means(self, name: str, length: int, precision: Precision) -> np.ndarray:
-        """float32 [3, length]."""
+        """Read float32 [3, length]."""
         if not isinstance(precision, int):
             return self.numbers(name, 3, length, precision)
         known = np.reshape(_numbers(name, self.layout.ends[name], 12), (3, 4)).tolist()
@@ -204,7 +204,7 @@ def _bits_of_indices(count: int) -> int:
 
 
 def _numbers(name: str, found: Any, count: int) -> list[float]:
-    """So many finite numbers of a header."""
+    """Return finite numbers of a header."""
     is_right = isinstance(found, list) and len(found) == count and all(type(x) in (int, float) for x in found)
     if not is_right or not all(abs(x) <= quantise.LARGEST_FLOAT for x in found):
         raise ValueError(f"the ends of {name} must be {count} numbers; got {found}")

@@ -1,4 +1,4 @@
-"""Whether what was read from a file is a model at all: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
+"""Checks that a file holds a valid model: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
 
 Native loops believe the layout that they are given. Both loaders, of models and of checkpoints, go through here first.
 """
@@ -54,9 +54,9 @@ def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaus
     if isinstance(appearance, Banded):
         own, base = gaussians.sh_degree, layout.bands.base_degree
         if own != base:
-            raise ValueError(f"Banded is of bands above degree {base}, but the Gaussians have degree {own}")
+            raise ValueError(f"Banded has bands above degree {base}, but the Gaussians have degree {own}")
         if layout.bands.num != num:
-            raise ValueError(f"Banded is of {layout.bands.num} degrees, but there are {num} Gaussians")
+            raise ValueError(f"Banded has {layout.bands.num} degrees, but there are {num} Gaussians")
         check_rows(appearance.inner, params.inner, layout.inner, gaussians)
         return
     for leaf in jax.tree.leaves(params):
@@ -78,10 +78,10 @@ def check_places(textures: Textures, layout: AtlasLayout) -> None:
         raise ValueError(f"layout.bucket must lie below {len(textures.buckets)}; got {bucket.min()}..{bucket.max()}")
     capacities = np.asarray([len(texels) for texels in textures.buckets], np.int64)
     if bucket.size and ((row < 0) | (row >= capacities[bucket])).any():
-        raise ValueError("layout.row must lie within the buckets; some are beyond theirs")
+        raise ValueError("layout.row must lie within the buckets; some do not")
     starts = np.cumsum(capacities) - capacities
     if bucket.size and np.bincount(starts[bucket] + row).max() > 1:
-        raise ValueError("layout must give each texture a row of its own; some share one")
+        raise ValueError("layout must give each texture its own row; some share one")
 
 
 def check_origin(origin: Origin) -> None:

@@ -17,11 +17,11 @@ from a2tg_jax.texture import MAX_SIDE
 BITS: Mapping[str, int] = {
     "log_scales": 8, "quats": 8, "opacities": 8, "sh_0": 8, "sh_1": 7, "sh_2": 6, "sh_3": 6, "colors": 8, "alphas": 8,
 }  # fmt: skip
-"""Of the numbers that are kept as a byte."""
+"""Bits of the numbers kept as a byte."""
 MEANS_BITS = 16
 LEAST_OPACITY = 1e-7
 SCALE_RANGE = 16.0
-"""Scales less than exp(−this) times the largest are kept as that: they are less than a pixel wherever all is seen."""
+"""Largest −log of a scale relative to the largest one; smaller scales, below a pixel in any full view, are raised."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Codes:
     """A scene's numbers as bytes, in the file's order; columns first."""
 
     means: np.ndarray
-    """[3, N], of 16 bits."""
+    """Means [3, N], 16 bits each."""
     columns: np.ndarray
     """[9, N]: log-scales, x, y, z of the quaternions, opacity, and of degree 0 red − green, green, blue − green."""
     degrees: np.ndarray
@@ -41,7 +41,7 @@ class Codes:
     texels: np.ndarray | None
     """[4, T]."""
     ends: Mapping[str, Any]
-    """For the header."""
+    """Ends of each group, for the header."""
 
     def chunk(self, start: int, stop: int) -> Iterator[bytes]:
         """Yield the pieces of one chunk."""
@@ -136,7 +136,7 @@ def rows_of_body(header: Mapping[str, Any], body: bytes) -> Rows:
 
 
 def signed_root(x: np.ndarray) -> np.ndarray:
-    """√|x| with the sign of x. Most residuals are small, and some are large: steps grow with them."""
+    """Return √|x| with the sign of x, so that steps grow with the residual; most residuals are small."""
     return np.sign(x) * np.sqrt(np.abs(x))
 
 

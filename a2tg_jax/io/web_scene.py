@@ -36,23 +36,23 @@ HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header, bytes of the body as coded, checksum of the header."""
 LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
 MOST_ROWS = 1 << 24
-"""Rows and texels that a file may announce."""
+"""Largest number of rows, and of texels, that a file may announce."""
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""What a file may unpack to: so many times its own bytes, and the room."""
+"""Bounds of what a file may unpack to: a multiple of its own bytes, and further bytes."""
 NEAREST = 1e-3
 """Distance from a camera, in units of the median, below which a row does not count for more."""
 MOST_CAMERAS = 16
-"""So many cameras say which rows show most."""
+"""Largest number of cameras that decide which rows show most."""
 
 
 @dataclasses.dataclass(frozen=True)
 class WebScene:
-    """What a file holds."""
+    """Content of a file."""
 
     model: Model
-    """Float32, in the order of the file; its cameras stand in the world of the scene."""
+    """Model in float32, in the order of the file; its cameras are in the world of the scene."""
     header: Mapping[str, Any]
-    """As the file has it."""
+    """Header of the file."""
 
 
 def is_viewable(appearance: Appearance) -> bool:
@@ -114,7 +114,7 @@ def encode_web_scene(
 
 
 def decode_web_scene(data: bytes, where: str = "the web scene") -> WebScene:
-    """What the bytes of a file hold; errors call it `where`.
+    """Return the scene in the bytes of a file; errors call it `where`.
 
     Raises:
       ValueError: if it is not a scene for browsers, is damaged, or is of another version.
@@ -191,7 +191,7 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     except zlib.error as error:
         raise ValueError(f"is damaged: {error}") from error
     if len(body) != header["bytes"] or not reader.eof:
-        raise ValueError(f"does not unpack to the {header['bytes']} bytes that it announces")
+        raise ValueError(f"does not unpack to the announced {header['bytes']} bytes")
     return header, body
 
 
@@ -223,7 +223,7 @@ def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
 
 
 def _appearance_of(header: Mapping[str, Any]) -> Appearance:
-    """What a file's splats show."""
+    """Return the appearance that a file describes."""
     max_alpha = header["max_alpha"]
     if not isinstance(max_alpha, float) or not 0 < max_alpha < 1:
         raise ValueError(f"max_alpha must lie in (0, 1); got {max_alpha!r}")

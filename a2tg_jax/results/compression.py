@@ -1,4 +1,4 @@
-"""A compact file of a run's model, or of any: the smallest that loses little, and a table of what was tried."""
+"""Compression of a model: the smallest compact file within a loss, and a table of the choices tried."""
 
 import dataclasses
 import math
@@ -30,21 +30,21 @@ from a2tg_jax.results.summary import aligned
 
 SUFFIX = ".a2tgz"
 MOST_VIEWS = 16
-"""So many training views are measured, evenly chosen."""
+"""Largest number of training views measured, evenly chosen."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Compressed:
-    """A file that was written, and how it was chosen."""
+    """Compact file, and how it was chosen."""
 
     path: Path
     model: Model
-    """What it was made from."""
+    """Model before compression."""
     trials: Sequence[Trial]
-    """Each group at each of its steps."""
+    """Trial of each group at each precision."""
     chosen: Trial
     measures: tuple[str, ...]
-    """What the losses of the trials are."""
+    """Names of the loss measures of the trials."""
 
 
 def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -> Compressed:
@@ -68,9 +68,9 @@ def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -
     check_kind(model.appearance)
     out = path.with_suffix(SUFFIX) if out is None else out
     if not 0 <= max_loss < math.inf:
-        raise ValueError(f"max_loss must be a number of dB of at least 0; got {max_loss}")
+        raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if out.is_dir() or out.resolve() == path.resolve():
-        raise ValueError(f"out must be a file other than the model, or a new one; got {out}")
+        raise ValueError(f"out must be a new file, or one other than the model; got {out}")
     losses = _losses(model, None if run is None else _scene_of(run), settings)
     trials = measure_choices(model, list(losses.values()))
     chosen = smallest_within(model, list(losses.values()), max_loss, trials)
@@ -87,7 +87,7 @@ def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
     planned = plan[plan.main[-1]]
     path = run.model(planned.name)
     if not is_regular(path):
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
     return path, settings_of(planned.system)
 
 
@@ -107,8 +107,7 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
         return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
     if model.origin is None:
         raise ValueError(
-            "the model does not know where it was trained, so there are no cameras to measure a loss "
-            "with: save_compact in Python, with choices of your own, needs none"
+            "the model has no cameras to measure a loss with; use save_compact in Python with your own choices"
         )
     pairs = zip(model.origin.cameras, model.origin.is_test, strict=True)
     cameras = [camera for camera, is_test in pairs if not is_test]

@@ -1,4 +1,4 @@
-"""Figures of runs that learn exposures or poses, beside those of the photographs as they are given.
+"""Metrics of runs that learn exposures or poses, beside those of the photographs as given.
 
 A photograph's exposure and the exact pose of its camera are not the model's to know. Runs that learn those of the
 training views are therefore scored twice: as they are, and up to them. `color_fit`: each render's colours are mapped to
@@ -27,7 +27,7 @@ TITLES = {
     "aligned": "poses aligned",
     "aligned_color_fit": "poses aligned, colours fitted",
 }
-"""By what follows the split in `metrics.json`: test_color_fit, …"""
+"""Titles by the suffix of a split in `metrics.json`: test_color_fit, …"""
 
 
 def measure_corrected(

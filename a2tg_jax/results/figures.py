@@ -16,11 +16,11 @@ from a2tg_jax.results.images import resolution_colors
 from a2tg_jax.training import History
 
 COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66ccee")
-"""Of the stages, in turn."""
+"""Colours of the stages, in turn."""
 GREY = "#7a8088"
-"""Can be read on white and on black."""
+"""Colour of text, legible on white and on black."""
 RUNNING_MEANS = 10
-"""A running mean covers this share of a stage: a tenth."""
+"""Number of running-mean windows in a stage; each covers a tenth."""
 MOST_POINTS = 4000
 """Points of a curve; a running mean takes the square of their number in time."""
 CURVES = (

@@ -1,4 +1,4 @@
-"""The run folder: what lies where, and when an existing one may be used.
+"""The run folder: its layout, and when an existing one may be used.
 
     RUN/
       .a2tg-run                  the marker: this program made the folder, and what it wrote there
@@ -57,7 +57,7 @@ class RunFolder:
         return path
 
     def own_all(self, names: Sequence[str]) -> None:
-        """Notes several files, by their names relative to the folder, in one go."""
+        """Note several files in the marker at once, by names relative to the folder."""
         known = set(self.written())
         lines = [f"{name}\n" for name in dict.fromkeys(names) if name not in known]
         if not lines:
@@ -205,7 +205,7 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
         raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with --out")
     if not overwrite:
         raise FileExistsError(
-            f"{path} is not empty; add --resume to go on with it, --overwrite to start anew, or choose another --out"
+            f"{path} is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
         )
 
 

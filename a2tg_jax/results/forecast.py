@@ -1,4 +1,4 @@
-"""What a whole run will take, memory, disk and time, told before it; and the refusal of what cannot fit."""
+"""Forecast of a run's memory, disk and time, and the refusal of runs that cannot fit."""
 
 import dataclasses
 import math
@@ -29,11 +29,11 @@ from a2tg_jax.training.cost import (
 )
 
 REPORT = 290 * MB
-"""What evaluation, figures and the report compile and import."""
+"""Bytes that evaluation, figures and the report compile and import."""
 EVALUATION_PER_PIXEL = 150
 """Bytes of a view that is rendered, with depth and normals, compared and drawn."""
 KEPT_STATES = 3
-"""Checkpoints of a stage on disk while a new one is written."""
+"""Number of checkpoints of a stage on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
 ROUGHLY = 2.0
@@ -45,23 +45,23 @@ OPTIONS = {
     "gradients": "--densify.cap, --memory-budget, --batch-size or --sh-degree",
     "pixels": "--downscale",
 }
-"""What to change where most of the memory is for one thing."""
+"""Options to change, by what needs most of the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RunForecast:
-    """What a run will take, about."""
+    """Estimate of what a run will take."""
 
     phases: Mapping[str, Bytes]
     """Memory at the peak of each stage, by name, and of the evaluation."""
     disk_bytes: float
-    """In the run folder."""
+    """Bytes in the run folder."""
     seconds: float
-    """Of training, on CPUs; 0 where that is not known before."""
+    """Training time on CPUs; 0 if it cannot be estimated."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
-        """The phase that takes most memory, and what."""
+        """Phase with the most memory, and its parts."""
         return max(self.phases.items(), key=lambda item: item[1].total)
 
     def told(self, limit: float) -> str:
@@ -96,7 +96,7 @@ class RunForecast:
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
         raise ValueError(
-            f"the run would take about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
+            f"the run would need about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
             f"used: change {OPTIONS[largest]}, or allow more with --max-memory"
         )
 

@@ -47,7 +47,7 @@ def render_frames(
     plan = read_record(run).plan
     planned = plan[plan.main[-1] if name is None else name]
     if not run.model(planned.name).is_file():
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
     model = load_model(run.model(planned.name))
     cameras = dict(_cameras(model, route, num_frames))
     renderer = Renderer(model, cameras=cameras.values(), settings=settings_of(planned.system), has_geometry=False)
@@ -80,7 +80,7 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
         yield from _numbered(path_through(load_views(route), num_frames))
         return
     if model.origin is None:
-        raise ValueError("the model does not know where it was trained, so there are no cameras to render")
+        raise ValueError("the model has no cameras to render; it does not know where it was trained")
     views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
     if route == "smooth":
         yield from _numbered(smooth_path([camera for _, _, camera in views], num_frames))

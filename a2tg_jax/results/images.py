@@ -27,9 +27,9 @@ from a2tg_jax.texture import AtlasLayout
 ERROR_GAIN = 4
 MARGIN, CAPTION_HEIGHT = 6, 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
-"""Pillow's own font lacks × and ²."""
+"""Font of captions; Pillow's own lacks × and ²."""
 LONGEST_SIDE = 1280
-"""Of a picture in the report, in pixels."""
+"""Longest side of a picture in the report, in pixels."""
 
 
 def to_uint8(image) -> np.ndarray:

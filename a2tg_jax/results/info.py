@@ -1,4 +1,4 @@
-"""What a run folder holds, in a few lines of text."""
+"""Summary of a run folder in a few lines of text."""
 
 from pathlib import Path
 
@@ -48,13 +48,13 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     data = read_json(path)
     models = data.get("models") if isinstance(data, dict) else None
     if not isinstance(models, dict):
-        raise ValueError(f"{path}: has no models; a2tg eval writes it anew")
+        raise ValueError(f"{path}: has no models; a2tg eval rewrites it")
     psnrs: dict[str, dict[str, float]] = {}
     for name, model in models.items():
         splits = {split: model[split] for split in SPLITS if split in model} if isinstance(model, dict) else None
         found = None if splits is None else [isinstance(x, dict) and x.get("psnr") for x in splits.values()]
         if splits is None or found is None or not all(type(psnr) in (int, float) for psnr in found):
-            raise ValueError(f"{path}: has no PSNR of {shortened(name)}; a2tg eval writes it anew")
+            raise ValueError(f"{path}: has no PSNR of {shortened(name)}; a2tg eval rewrites it")
         psnrs[name] = {split: float(psnr) for split, psnr in zip(splits, found, strict=True)}  # type: ignore[arg-type]
     return psnrs
 

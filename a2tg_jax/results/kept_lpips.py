@@ -1,4 +1,4 @@
-"""LPIPS that stands in a run folder already, for a measurement without its weights."""
+"""LPIPS kept from an earlier measurement, if this one has no weights."""
 
 import dataclasses
 import hashlib

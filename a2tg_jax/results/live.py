@@ -26,16 +26,16 @@ from a2tg_jax.web.page import SCENE_NAME, STATUS_NAME, viewer_html
 from a2tg_jax.web.server import Route, served
 
 SECONDS = 3.0
-"""Between two snapshots, at least."""
+"""Shortest time between two snapshots in seconds."""
 SHARE = 0.03
-"""Of the time, at most, that snapshots take."""
+"""Largest share of the time that snapshots take."""
 WAIT = 0.1
 QUICK = 1
-"""Level of compression: what is looked at once need not be small."""
+"""Compression level; a scene viewed once need not be small."""
 
 
 class LiveView:
-    """What is seen of a training; called between its steps (`training.loop.Watch`)."""
+    """View of a training, called between its steps (`training.loop.Watch`)."""
 
     def __init__(self, scene: Scene, title: str, now: Callable[[], float] = time.perf_counter):
         """Args:
@@ -63,7 +63,7 @@ class LiveView:
 
     @property
     def routes(self) -> dict[str, Route]:
-        """What the viewer's server answers."""
+        """Routes of the viewer's server."""
         photographs = ServedPhotographs(origin_of_scene(self._scene), lambda: self._scene)
         return {
             "/": Route("text/html; charset=utf-8", viewer_html().encode()),
@@ -93,7 +93,7 @@ class LiveView:
             self._status |= found
 
     def _take(self, run: StageRun) -> None:
-        """Copy the state, and lets a thread make a scene of it."""
+        """Copy the state, and have a thread encode it as a scene."""
         began = self._now()
         origin = origin_of_scene(self._scene, BACKGROUNDS[run.system.background])
         model = dataclasses.replace(jax.device_get(run.state.model), origin=origin)
@@ -115,7 +115,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def shown_live(scene: Scene, title: str, on_start: Callable[[str], None]) -> Iterator[LiveView]:
-    """Serve what is seen of a training meanwhile.
+    """Serve the view of a training within the block.
 
     Args:
       scene: that is trained on.

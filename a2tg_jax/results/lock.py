@@ -1,4 +1,4 @@
-"""One process at a time writes in a run folder, and none finds what a killed one left half done."""
+"""Lock of a run folder: one process writes at a time, and leftovers of killed ones are removed."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""HTML of pages that are one file each: nothing is loaded, and nothing runs but the page's own style and script."""
+"""HTML of self-contained pages: nothing is loaded, and only the page's own style and script apply."""
 
 import base64
 import hashlib

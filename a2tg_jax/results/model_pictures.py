@@ -1,4 +1,4 @@
-"""Pictures of one model alone: its textures, what it knows of the surface, a flight past its cameras."""
+"""Pictures of one model: its textures, depth, normals, and a flight past its cameras."""
 
 import io
 from collections.abc import Iterable
@@ -22,9 +22,9 @@ from a2tg_jax.texture import texture_arrays
 
 NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8
 CHECKER = (0.75, 0.55)
-"""Greys behind what is transparent."""
+"""Greys behind transparent texels."""
 LEAST_ALPHA = 0.5
-"""Where less is seen, there is no depth and no normal."""
+"""Smallest alpha that shows a depth and a normal."""
 DEPTH_RANGE = 2, 98
 """Percentiles of the depths that colours reach from and to."""
 FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
@@ -93,8 +93,8 @@ def depth_picture(output: RenderOutput) -> np.ndarray:
 
 
 def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
-    """uint8 [H, W, 3] of the normals seen from the camera: red to the right, green up, blue towards it; black as
-    `depth_picture`."""
+    """Return uint8 [H, W, 3] of the normals seen from the camera: red to the right, green up, blue towards it; black as
+    in `depth_picture`."""
     normal = np.asarray(output.normal) @ np.asarray(camera.viewmat)[:3, :3].T * (1, -1, -1)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     is_seen = (np.asarray(output.alpha) > LEAST_ALPHA)[..., None] & (length > 0)

@@ -1,4 +1,4 @@
-"""Which stages a run trains: those of its systems, each once where systems share it, under a name of its own."""
+"""Plan of a run: the stages of its systems, shared stages once, each with a unique name."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -12,19 +12,19 @@ from a2tg_jax.training import Stage, System
 
 PACKAGE = "a2tg_jax"
 STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
-"""Options of every system that reach training through its stages alone."""
+"""Options of every system that reach training only through its stages."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedStage:
-    """A stage of a system, and perhaps of others that begin as that one does."""
+    """Stage of a system, shared by all systems that begin in the same way."""
 
     name: str
-    """Unique in the run: of its files, columns and captions."""
+    """Name of its files, columns and captions, unique in the run."""
     system: System
-    """The first system that has it."""
+    """First system that has the stage."""
     index: int
-    """Which of the system's stages, from 0."""
+    """Index of the stage in its system, from 0."""
     start: str | None
     """Name of the stage whose model it starts from; None for a first stage."""
 

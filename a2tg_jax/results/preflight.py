@@ -1,4 +1,4 @@
-"""What is looked at before anything is trained or written: options, weights, places, room on the disk."""
+"""Checks before anything is trained or written: options, weights, folders, room on the disk."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training.start import check_start, initial_number
 
 STATE_SIZE = 3
-"""A checkpoint holds parameters and two moments of each."""
+"""Arrays per parameter in a checkpoint: its value and two moments."""
 
 
 def check_new_run(
@@ -48,7 +48,7 @@ def check_apart(out: Path, source: Path) -> None:
     """Raise ValueError if one of two folders, one to read and one to write, lies in the other."""
     written, read = out.resolve(), source.resolve()
     if written.is_relative_to(read) or read.is_relative_to(written):
-        raise ValueError(f"{out} and {source} lie in each other: choose a folder besides it for what is written")
+        raise ValueError(f"{out} and {source} overlap: choose an output folder outside it")
 
 
 def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
@@ -62,7 +62,7 @@ def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
     free = shutil.disk_usage(_existing(out)).free
     if needed > free:
         raise ValueError(
-            f"{out} needs {needed / 1e9:.1f} GB at least for models and checkpoints, and the disk has "
+            f"{out} needs {needed / 1e9:.1f} GB for models and checkpoints, but the disk has "
             f"{free / 1e9:.1f} GB: make room, or choose another --out, fewer Gaussians or fewer --compare"
         )
 

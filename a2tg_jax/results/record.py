@@ -1,4 +1,4 @@
-"""What a run was asked to do: the scene, a system with all its numbers, systems to compare. Kept as run.toml.
+"""Record of a run: the scene, a system with all its options, systems to compare. Kept as run.toml.
 
 A configuration file says the same or less; what it leaves out has the value that the command line gives it:
 
@@ -34,25 +34,25 @@ from a2tg_jax.training.registry import differences, with_changes
 
 SYNTHETIC = "synthetic"
 SYNTHETIC_SIZE = (208, 156)
-"""Small enough for two cores to train on in minutes."""
+"""Width and height, small enough to train in minutes on two cores."""
 DEFAULT_SYSTEM = "a2tg"
 LONGEST_REASON = 500
 OnNan = Literal["stop", "restore"]
-"""Training ends with an error, or goes on from the newest checkpoint with the views in another order."""
+"""Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneSource:
-    """Where the scene comes from, so that it can be loaded again."""
+    """Source of a scene, from which it can be loaded again."""
 
     path: str
-    """A folder with photographs and poses, or "synthetic": the built-in scene."""
+    """Folder with photographs and poses, or "synthetic" for the built-in scene."""
     downscale: int = 1
-    """Use the images at 1/k of their size."""
+    """Factor k by which images are downscaled."""
     test_every: int = 8
-    """Every k-th view is a test view."""
+    """Interval k of test views: every k-th view is held out."""
     alpha: AlphaMeaning = "transparency"
-    """What the alpha channel of photographs is: the transparency of what they show, or a mask."""
+    """Meaning of the alpha channel: transparency before a background, or a mask."""
 
     def load(self, room: int | None = None) -> Scene:
         """Return the scene in its normalised world.
@@ -71,23 +71,23 @@ class SceneSource:
 
 @dataclasses.dataclass(frozen=True)
 class RunRecord:
-    """One run's task."""
+    """Record of a run."""
 
     scene: SceneSource
     name: str
-    """Of the system, as `find_system` takes it."""
+    """Name of the system, as `find_system` takes it."""
     system: System
-    """With every number."""
+    """System with all its options."""
     compare: tuple[str, ...] = ()
-    """Names of the systems that are trained beside it, with its options where they have options of these names."""
+    """Names of the systems to compare. They take the main system's options of the same names."""
     preset: str | None = None
-    """What other options of these systems start from."""
+    """Preset of the other options of these systems."""
     on_nan: OnNan = "stop"
-    """What is done where a loss or gradient is not finite, or a loss explodes."""
+    """Action if a loss or gradient is not finite, or a loss explodes."""
 
     @property
     def systems(self) -> dict[str, System]:
-        """The main system and then those compared with it, by label.
+        """Main system and then those compared with it, by label.
 
         Raises:
           ValueError: if a system is not found, or two have one label.
@@ -101,7 +101,7 @@ class RunRecord:
 
     @property
     def plan(self) -> RunPlan:
-        """What is trained."""
+        """Plan of the stages to train."""
         return plan_run(self.systems)
 
     def check(self) -> None:
@@ -116,7 +116,7 @@ class RunRecord:
             except ValueError as error:
                 if system is self.system:
                     raise
-                raise ValueError(f"compare {label}, which has the options of {self.name}: {error}") from error
+                raise ValueError(f"compare {label}, with the options of {self.name}: {error}") from error
         plan_run(self.systems)
 
     def leaves(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class RunRecord:
 
 @dataclasses.dataclass(frozen=True)
 class RunFile:
-    """What a configuration file may say."""
+    """Content of a configuration file."""
 
     scene: str | None = None
     downscale: int = 1

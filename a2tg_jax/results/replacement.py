@@ -1,4 +1,4 @@
-"""A run that takes the place of another in its folder: the old one is kept until the new one has its report.
+"""Replacement of a run in its folder. The old run is kept until the new one has its report.
 
     1. Before the new run's first checkpoint, nothing of the old one is touched.
     2. Then the old one moves to RUN/.a2tg-old, a run folder too, and the new one's checkpoint and run.toml are written.

@@ -42,7 +42,7 @@ SECTIONS = (
 CROP_ZOOM = 3
 HIGHER_IS_BETTER = ("PSNR", "SSIM", "frames a second")
 LOWER_IS_BETTER = ("LPIPS", "memory")
-"""Words in the names of figures whose best value is marked."""
+"""Words in the names of metrics whose best value is marked."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +51,10 @@ class Comparison:
 
     name: str
     images: Sequence[np.ndarray]
-    """Photograph first, uint8 [H, W, 3]."""
+    """Images, uint8 [H, W, 3], the photograph first."""
     captions: Sequence[str]
     crop: Crop | None
-    """A part to show enlarged."""
+    """Part to show enlarged."""
 
 
 def write_report(run: RunFolder, result: RunResult, comparisons: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Everything that is made from a run's finished models: metrics, pictures, figures, point cloud, report."""
+"""Evaluation of a run's finished models: metrics, pictures, figures, point cloud, report."""
 
 import dataclasses
 import os
@@ -60,7 +60,7 @@ def evaluate_run(
     plan = record.plan
     models = {name: load_model(run.model(name)) for name in plan.names if run.model(name).is_file()}
     if not models:
-        raise FileNotFoundError(f"{run.path} has no finished stage yet; go on with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with a2tg train … --resume")
     scene = scene or record.scene.load()
     measured = {
         name: dataclasses.replace(

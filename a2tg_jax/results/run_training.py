@@ -1,4 +1,4 @@
-"""Training in a run folder: stage after stage, with checkpoints, and from where an earlier attempt stopped."""
+"""Training in a run folder, stage after stage, with checkpoints to resume from."""
 
 import dataclasses
 import warnings
@@ -28,9 +28,9 @@ from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 
 LONGEST_WITHOUT_CHECKPOINT = 500
-"""Iterations."""
+"""Largest number of iterations between checkpoints."""
 MOST_RESTORED = 5
-"""So often a stage goes back because it diverged, each time with another order of the views."""
+"""Largest number of times a diverged stage is restored, each time with another order of the views."""
 
 
 def train_run(
@@ -134,12 +134,12 @@ class _Training:
         save_checkpoint(path, before)
         told, count = f"{error}, in {path}", before.num_restored + 1
         if self.on_nan == "stop":
-            raise ValueError(f"{told}; --on-nan restore would take the views in another order") from error
+            raise ValueError(f"{told}; --on-nan restore continues with the views in another order") from error
         if count > MOST_RESTORED:
-            raise ValueError(f"{told}; the stage went back {MOST_RESTORED} times already") from error
+            raise ValueError(f"{told}; the stage was restored {MOST_RESTORED} times already") from error
         back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
         warnings.warn(
-            f"{told}; the stage goes back to {back} and takes the views in another order ({count} of {MOST_RESTORED} "
+            f"{told}; the stage restarts from {back} with the views in another order ({count} of {MOST_RESTORED} "
             "times)",
             stacklevel=4,
         )
@@ -147,7 +147,7 @@ class _Training:
 
 
 class _Keeper:
-    """Writes checkpoints. The first of a run that replaces another sets that one aside."""
+    """Writer of checkpoints. The first checkpoint of a replacing run sets the old run aside."""
 
     def __init__(self, run: RunFolder, name: str, replaced_by: RunRecord | None):
         self.run, self.name, self.replaced_by = run, name, replaced_by
@@ -180,11 +180,15 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
         _check_unchanged(path, checkpoint.system, planned)
         for damaged, damage in zip(paths, damages, strict=False):
             aside = run.set_damaged_aside(damaged)
-            warnings.warn(f"{damage}; it is {aside.name} now, and training goes on from {path.name}", stacklevel=2)
+            warnings.warn(
+                f"{damage}; it was renamed to {aside.name}, and training continues from {path.name}", stacklevel=2
+            )
         _warn_of_machine(path, checkpoint)
         return dataclasses.replace(checkpoint, system=planned.system)
     if damages:
-        raise ValueError(f"{damages[0]}; there is no other: delete it to train {planned.name} from its beginning")
+        raise ValueError(
+            f"{damages[0]}; there is no other checkpoint: delete it to train {planned.name} from its beginning"
+        )
     return None
 
 
@@ -192,7 +196,9 @@ def _warn_of_machine(path: Path, checkpoint: Checkpoint) -> None:
     """Warn if a resumed run will differ in its last bits, because another machine wrote the checkpoint."""
     told = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
     if told:
-        warnings.warn(f"{path.name} was made elsewhere, so last bits will differ: {'; '.join(told)}", stacklevel=3)
+        warnings.warn(
+            f"{path.name} was made on another machine, so last bits will differ: {'; '.join(told)}", stacklevel=3
+        )
 
 
 def _check_model(path: Path, planned: PlannedStage) -> None:
@@ -210,5 +216,5 @@ def _check_unchanged(path: Path, made: System, planned: PlannedStage) -> None:
         return
     before, now = flatten_config(made), flatten_config(planned.system)
     names = ", ".join(name for name in now if before[name] != now[name])
-    advice = "put that back, or train in a new folder"
-    raise ValueError(f"{path} was made with another {names} than run.toml says: {advice}")
+    advice = "restore that, or train in a new folder"
+    raise ValueError(f"{path} was made with another {names} than in run.toml: {advice}")

@@ -1,4 +1,4 @@
-"""The numbers of a run: what they are, as metrics.json, and as a table."""
+"""Results of a run: values, metrics.json, and the headline table."""
 
 import dataclasses
 import platform
@@ -21,58 +21,58 @@ FIGURES = (
 )  # fmt: skip
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
 NUM_QUALITIES = 2 * len(QUALITIES)
-"""The first figures, of test and training views."""
+"""Number of the first figures, of test and training views."""
 EQUAL_BYTES = 0.01
 """Largest relative difference of two sizes that are called equal."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelResult:
-    """One stage's model, measured."""
+    """Measurements of one stage's model."""
 
     train: Evaluation
     test: Evaluation | None
-    """None where the scene has no test views."""
+    """Metrics of the test views; None without test views."""
     num_gaussians: int
     num_texels: int
-    """0 without textures."""
+    """Number of texels; 0 without textures."""
     num_bytes: int
-    """Of the trained floats, padding left out: `Model.num_bytes`."""
+    """Bytes of the trained floats without padding: `Model.num_bytes`."""
     num_published_bytes: int
-    """As the method's authors count them: `Model.num_published_bytes`."""
+    """Bytes as the method's authors count them: `Model.num_published_bytes`."""
     num_padding_bytes: int
-    """That exist in the buffers only."""
+    """Bytes of padding in the buffers."""
     seconds: float
     """Training time of this stage."""
     sha256: str = ""
-    """Of the model's file."""
+    """SHA-256 of the model's file."""
     corrected: Mapping[str, Evaluation] = dataclasses.field(default_factory=dict)
-    """Figures up to exposure and pose (`results.corrected`), where a system of the run learns these."""
+    """Metrics up to exposure and pose (`results.corrected`), if a system of the run learns these."""
 
     @property
     def splits(self) -> dict[str, Evaluation]:
-        """All that was evaluated, by its name in metrics.json."""
+        """All evaluations, by their names in metrics.json."""
         test = {} if self.test is None else {"test": self.test}
         return {"train": self.train, **test, **self.corrected}
 
     @property
     def shown(self) -> Evaluation:
-        """The test views, or the training views where there are none."""
+        """Evaluation of the test views, or of the training views if there are none."""
         return self.test or self.train
 
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
-    """All the models of a run that are finished."""
+    """Results of all finished models of a run."""
 
     scene: str
     """Name of the scene."""
     record: RunRecord
     plan: RunPlan
     models: Mapping[str, ModelResult]
-    """By the names of their stages."""
+    """Results by the names of their stages."""
     is_lpips_kept: bool = False
-    """Whether LPIPS is that of an earlier measurement of the same models."""
+    """Whether LPIPS was kept from an earlier measurement of the same models."""
 
     @property
     def main(self) -> str:

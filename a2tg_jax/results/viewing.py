@@ -1,4 +1,4 @@
-"""What the viewer is given: a run's model or any other, as a scene for browsers, and its photographs."""
+"""Content of the viewer: a model as a scene for browsers, and its photographs."""
 
 import dataclasses
 import functools
@@ -33,27 +33,27 @@ QUALITY = 90
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """A model, and what is known of it."""
+    """Model with its title, render settings and photographs."""
 
     model: Model
     title: str
     note: str = ""
-    """What the viewer says about it."""
+    """Note that the viewer shows."""
     settings: RenderSettings = RenderSettings()  # noqa: RUF009 - frozen
-    """How it is rendered."""
+    """Render settings."""
     load_scene: Callable[[], Scene | None] = lambda: None
-    """The photographs; None where there are none."""
+    """Loader of the photographs; None without photographs."""
 
     @functools.cached_property
     def near_plane(self) -> float:
-        """Hits nearer than this do not show; small in the world of a file of which no size is known."""
+        """Distance of the near plane; small for files whose world has an unknown size."""
         if self.model.origin is not None or not self.model.num:
             return self.settings.near_plane
         return min(self.settings.near_plane, 0.02 * middle_of(self.model)[1])
 
     @functools.cached_property
     def encoded(self) -> bytes:
-        """The scene for browsers. Raises ValueError where they cannot show it."""
+        """Return the scene for browsers. Raises ValueError if they cannot show it."""
         return encode_web_scene(self.model, title=self.title, note=self.note, near_plane=self.near_plane)
 
 
@@ -71,7 +71,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
     if path.is_dir():
         return _source_of_run(open_run(path), name)
     if name is not None:
-        raise ValueError(f"--model is one of a run folder's models; {path} is no folder")
+        raise ValueError(f"--model needs a run folder; {path} is not a folder")
     if path.suffix == ".ply":
         return _source_of_ply(path)
     load = load_compact if path.suffix == ".a2tgz" else load_model
@@ -83,7 +83,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     planned = record.plan[record.plan.main[-1] if name is None else name]
     path = run.model(planned.name)
     if not is_regular(path):
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; go on with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
 
     def load_scene() -> Scene | None:
         try:
@@ -109,7 +109,7 @@ def _source_of_ply(path: Path) -> Source:
 
 
 class ServedPhotographs:
-    """Those of the cameras that a model knows, as JPEG, read when they are asked for."""
+    """Photographs of a model's cameras, served as JPEG and read on demand."""
 
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None]):
         """Args:
@@ -122,7 +122,7 @@ class ServedPhotographs:
 
     @property
     def views(self) -> dict[int, View]:
-        """By the index of the camera."""
+        """Views by the index of their cameras."""
         with self._lock:
             if self._views is None:
                 self._views = self._found()
@@ -140,7 +140,7 @@ class ServedPhotographs:
 
     @property
     def routes(self) -> dict[str, Route]:
-        """What the viewer's server answers."""
+        """Routes of the viewer's server."""
         names = () if self._origin is None else self._origin.names
         listed = Route("application/json", lambda: json.dumps(sorted(self.views)).encode())
         each = {

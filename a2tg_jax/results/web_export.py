@@ -1,4 +1,4 @@
-"""The viewer's page for any web server, or as one file, with a scene; and what its file of the scene loses."""
+"""Export of the viewer with a scene, for a web server or as one file, and the loss of its scene file."""
 
 import dataclasses
 import json
@@ -17,21 +17,21 @@ from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
-"""So many views are measured, evenly chosen."""
+"""Largest number of views measured, evenly chosen."""
 RING_SIZE = (320, 240)
 
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """Files of an export."""
 
     path: Path
-    """The page."""
+    """Path of the page."""
     num_bytes: int
-    """Of the scene's file, alone."""
+    """Bytes of the scene file alone."""
     model: Model
     losses: Mapping[str, float]
-    """dB of PSNR that the file loses, by what they are measured on."""
+    """Loss of the scene file in dB of PSNR, by what it is measured on."""
 
 
 def export_web(source: Source, out: Path, *, single_file: bool = False, photographs: bool = False) -> Exported:
@@ -47,9 +47,9 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
       ValueError: if browsers cannot show the model, or photographs are asked for where there are none, or in one file.
     """
     if single_file and photographs:
-        raise ValueError("--photographs lie in a folder beside the page: leave out --single-file")
+        raise ValueError("--photographs needs a folder beside the page: leave out --single-file")
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
-        raise ValueError(f"{out} holds a page that is not the viewer's; choose another folder with --web")
+        raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
     data = source.encoded
     files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
     for path, content in files.items():

@@ -1,4 +1,4 @@
-"""A run from its checks to its report: begun, or gone on with, by one process at a time."""
+"""Whole runs, from checks to report, begun or resumed by one process at a time."""
 
 import contextlib
 import shlex
@@ -20,7 +20,7 @@ from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
-"""Of a scene, somebody who looks at its training meanwhile."""
+"""Function that gives the watcher of a scene's training."""
 
 
 def unseen(scene: Scene) -> AbstractContextManager[Watch]:
@@ -121,4 +121,4 @@ def how_to_go_on(run: RunFolder) -> str:
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     if finished and not checkpoints:
         last = f"the last model is {finished[-1]}"
-    return f"{last}; go on with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"
+    return f"{last}; continue with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"

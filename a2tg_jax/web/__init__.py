@@ -1,1 +1,1 @@
-"""The viewer: a page for browsers, made of the sources in web/, and a server of it and of a scene."""
+"""The viewer: a page for browsers, built from the sources in web/, and a server for it."""

@@ -1,14 +1,14 @@
-"""The viewer's page, one HTML file with script and style inside, and what lies beside it or in it."""
+"""The viewer's page, one HTML file with script and style inside, and the files beside it."""
 
 import base64
 from importlib import resources
 
 SCENE_NAME = "scene.a2tgw"
-"""What the page looks for beside itself."""
+"""Name of the scene file beside the page."""
 PHOTOGRAPHS_NAME = "photographs.json"
-"""A list of the cameras whose photographs lie beside the page, as `photograph_name` names them."""
+"""Name of the list of cameras with photographs beside the page, as `photograph_name` names them."""
 STATUS_NAME = "training.json"
-"""What is told of a training that runs; the page asks again and again while it is there."""
+"""Name of the status of a running training, which the page polls while it exists."""
 
 
 def viewer_html() -> str:

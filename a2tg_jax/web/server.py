@@ -1,4 +1,4 @@
-"""A page and its files, from memory, for browsers of this machine alone; the server itself is waitress'."""
+"""Server of a page and its files from memory, for browsers of this machine alone; runs on waitress."""
 
 import contextlib
 import dataclasses
@@ -24,14 +24,14 @@ Application = Callable[[Mapping[str, Any], StartResponse], Iterable[bytes]]
 
 @dataclasses.dataclass(frozen=True)
 class Route:
-    """What is answered at a path."""
+    """Answer at a path."""
 
     content_type: str
     content: bytes | Callable[[], bytes | None]
-    """The bytes; or what finds them each time that they are asked for, None where there are none."""
+    """Bytes, or a function that finds them at each request and returns None if there are none."""
 
     act: Callable[[], None] | None = None
-    """What is done first: such a path is asked for by POST, from the page itself."""
+    """Function called first. Such a path answers POST, from the page itself."""
 
     def read(self) -> bytes | None:
         return self.content() if callable(self.content) else self.content
@@ -87,7 +87,7 @@ def serve(routes: Mapping[str, Route], *, port: int = 0, on_start: Callable[[str
 
 @contextlib.contextmanager
 def served(routes: Mapping[str, Route], *, port: int = 0) -> Iterator[str]:
-    """Serve meanwhile, in a thread; yields the address. Arguments and errors as of `serve`."""
+    """Serve in a thread within the block, and yield the address. Arguments and errors are those of `serve`."""
     connections: dict[int, Any] = {}
     server = _opened(routes, port, connections)
     thread = threading.Thread(target=server.run, daemon=True)
@@ -123,5 +123,5 @@ def _listening(port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         found.close()
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"port {port} cannot be used: {reason}; leave --port out for a free one") from error
+        raise ValueError(f"port {port} cannot be used: {reason}; leave out --port for a free one") from error
     return found
