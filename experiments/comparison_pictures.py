@@ -1,13 +1,10 @@
-"""Test views of the systems at equal bytes beside the photograph, where they differ most: the paper's comparison.
-
-python experiments/comparison_pictures.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Test views at equal bytes beside the photograph, at the largest difference: the paper's comparison."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from lab import pictures, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
@@ -50,7 +47,4 @@ def _squared_error(target: np.ndarray, image: np.ndarray) -> float:
     return float(np.mean((target.astype(np.float32) - image.astype(np.float32)) ** 2))
 
 
-EXPERIMENT = Experiment("comparison_pictures", ("pictures",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("comparison_pictures", ("pictures",), present, __doc__)

@@ -1,13 +1,10 @@
-"""What textures learn: the full picture, spherical harmonics only, textures only; and the textures themselves.
-
-python experiments/decomposition.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""The share of textures in a picture: all, spherical harmonics only, textures only; and the textures."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from lab import pictures, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import background_of
 from PIL import Image
@@ -49,7 +46,4 @@ def _textures_picture(model: a2tg.Model) -> Image.Image:
     return Image.fromarray(np.concatenate(padded) if padded else np.full((1, 1, 3), 255, np.uint8))
 
 
-EXPERIMENT = Experiment("decomposition", ("pictures",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("decomposition", ("pictures",), present, __doc__)

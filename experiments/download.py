@@ -1,9 +1,9 @@
-"""Fetches the data sets of the paper: Mip-NeRF 360 (12 GB), Tanks and Temples and Deep Blending (0.7 GB).
+"""Fetch the data sets of the paper: Mip-NeRF 360 (12 GB), Tanks and Temples and Deep Blending (0.7 GB).
 
-python experiments/download.py SCENES
+    python experiments/download.py SCENES
 
-Archives go below SCENES/archives, where an interrupted download is continued, and are unpacked into 360_v2, tandt and
-db, as grids/scales.toml names them. What is there already is left alone.
+Archives are downloaded to SCENES/archives and unpacked into 360_v2, tandt and db, as grids/scales.toml names them. An
+interrupted download continues. Existing data sets are left alone.
 """
 
 import argparse

@@ -1,9 +1,7 @@
 """Frames per second, time of a frame and of training, and size: Table 4 of the paper.
 
-    python experiments/efficiency.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-Times are taken when all runs are finished, one after the other, and kept in efficiency.json: let nothing else run
-beside it. Training time is that of a step with all Gaussians, multiplied by the iterations.
+Times are measured one after the other after all runs, and kept in efficiency.json. Let nothing else run beside the
+measurement. Training time is the time of a step with all Gaussians, multiplied by the iterations.
 """
 
 import dataclasses
@@ -12,7 +10,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import Job
 from lab.measured import Figures, measured_once
@@ -79,7 +77,4 @@ def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
     return min(paces)
 
 
-EXPERIMENT = Experiment("efficiency", ("efficiency",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("efficiency", ("efficiency",), present, __doc__)

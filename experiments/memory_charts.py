@@ -1,12 +1,9 @@
-"""PSNR against memory, and memory against the number of Gaussians: the line charts of the paper.
-
-python experiments/memory_charts.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""PSNR against memory, and memory against the number of Gaussians: the line charts of the paper."""
 
 from collections.abc import Sequence
 
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 from a2tg_jax.results.figures import save_figure
@@ -40,7 +37,4 @@ def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> lis
     return [(tables.mean(group, x), tables.mean(group, y)) for group in groups.values()]
 
 
-EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present, __doc__)

@@ -1,8 +1,6 @@
-"""How small the files of models are: each choice of bits, the smallest file within a loss, PSNR against bytes on disk.
+"""Sizes of model files: each choice of bits, the smallest file within a loss, PSNR against bytes on disk.
 
-    python experiments/on_disk.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-What was measured is kept in on_disk.json. A choice is made by PSNR on training views and reported on test views.
+Figures are kept in on_disk.json. Choices are made by PSNR on training views and reported on test views.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import Figures, measured_once
@@ -168,7 +166,4 @@ def _panels(found: Sequence[tuple[tables.Result, Figures]]) -> list[tuple[str, d
     return [(scene, curves, "kB on disk", "test PSNR, dB") for scene, curves in panels.items()]
 
 
-EXPERIMENT = Experiment("on_disk", ("on_disk",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("on_disk", ("on_disk",), present, __doc__)

@@ -1,8 +1,6 @@
-"""What least squares on colours and texels, shapes being held, brings to models that are trained: no byte more.
+"""Gain of least squares on the colours and texels of trained models, at fixed shapes and bytes.
 
-    python experiments/polish.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-What was measured is kept in polish.json.
+Figures are kept in polish.json.
 """
 
 import time
@@ -10,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
@@ -61,7 +59,4 @@ def _told(after: Mapping[str, float], before: Mapping[str, float]) -> str:
     return f"{psnr:+.2f} · {tables.MISSING if np.isnan(lpips) else f'{lpips:+.3f}'} · {train:+.2f}"
 
 
-EXPERIMENT = Experiment("polish", ("polish",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("polish", ("polish",), present, __doc__)

@@ -1,4 +1,4 @@
-"""What masks, exposures and refined poses win back where a capture is disturbed by known amounts, and what they cost.
+"""Gain and cost of masks, exposures and refined poses on captures that are disturbed by known amounts.
 
     python experiments/real_captures.py --out OUT                       # the built-in scene
     python experiments/real_captures.py --out OUT --scenes SCENES       # and fox and snowmiku in that folder

@@ -1,12 +1,9 @@
-"""How many Gaussians have textures of each resolution, and where: square ones blue, others red, as in the paper.
-
-python experiments/resolution_shares.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Share of Gaussians with textures of each resolution, and their places: square ones blue, others red."""
 
 from collections.abc import Sequence
 
 from lab import pictures, plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
@@ -57,7 +54,4 @@ def _picture(lab: Lab, result: tables.Result) -> None:
     save_picture(lab.pages / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
 
 
-EXPERIMENT = Experiment("resolution_shares", ("ablation", "pictures"), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("resolution_shares", ("ablation", "pictures"), present, __doc__)

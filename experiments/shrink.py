@@ -1,15 +1,13 @@
-"""What textures that shrink save: bytes at 0.02 and 0.05 dB on training views, and what that loses on test views.
+"""Bytes saved by shrinking textures within 0.02 and 0.05 dB on training views, and the loss on test views.
 
-    python experiments/shrink.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-What was measured is kept in shrink.json.
+Figures are kept in shrink.json.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
@@ -61,7 +59,4 @@ def _told(after: dict[str, Any], before: dict[str, Any]) -> str:
     return f"{_kilobytes(after)} kB: {after['psnr'] - before['psnr']:+.2f} · {lpips}"
 
 
-EXPERIMENT = Experiment("shrink", ("shrink",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("shrink", ("shrink",), present, __doc__)

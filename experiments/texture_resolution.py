@@ -1,12 +1,9 @@
-"""Textures of one size against textures of at most that size: the table and the charts of the paper's appendix.
-
-python experiments/texture_resolution.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Textures of one size against textures of at most that size: the paper's appendix."""
 
 from collections.abc import Sequence
 
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 from a2tg_jax.results.figures import save_figure
@@ -40,7 +37,4 @@ def _curves(results: Sequence[tables.Result], figure: str) -> dict[str, list[plo
     return curves
 
 
-EXPERIMENT = Experiment("texture_resolution", ("texture_resolution",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("texture_resolution", ("texture_resolution",), present, __doc__)

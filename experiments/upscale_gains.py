@@ -1,11 +1,9 @@
-"""Which Gaussians gain by a texture, and what predicts it: training goes on with and without textures of some of them.
+"""Gain of textures on groups of Gaussians, and the criteria that predict it.
 
-    python experiments/upscale_gains.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-A model without textures is trained on, once as it is, and once for each group of its Gaussians, which get 2×2 texels:
-the gain of a group is what its textures bring on the views that are trained on. Groups are the quarters of every
-criterion's order, so that all are of one size, and take the same bytes. A criterion is as good as its mean over a group
-ranks the groups by their gain. What was measured is kept in upscale_gains.json.
+Training continues from a model without textures, once as it is and once for each group of Gaussians, which gets 2×2
+texels. The gain of a group is the PSNR that its textures add on training views. Groups are the quarters of each
+criterion's order, so all have one size and take the same bytes. A criterion is good if its mean over a group ranks the
+groups by their gain. Figures are kept in upscale_gains.json.
 """
 
 import dataclasses
@@ -18,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
@@ -203,7 +201,4 @@ def _scores(model: Model, layout, sums: Mapping[str, Array]) -> dict[str, Array]
     return {"paper": average, "paper_by_size": average * size, **{name: own[rows] for name, own in by_row.items()}}
 
 
-EXPERIMENT = Experiment("upscale_gains", ("upscale_gains",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("upscale_gains", ("upscale_gains",), present, __doc__)
