@@ -8,7 +8,7 @@ from lab.grid import Grid
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, then the paper's."""
+    """Write our tables, then the paper's."""
     (grid,) = grids
     results = tables.results_of(grid, lab.records)
     others = [method.label for method in grid.methods]

@@ -15,7 +15,7 @@ ZOOM = 4
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Of each scene whose models are there, the test view, and the part of it, in which the reference gains most."""
+    """Save, for each scene with models, the test view and the part of it in which the reference gains most."""
     (grid,) = grids
     for scene in dict.fromkeys(cell.scene for cell in grid.cells):
         results = [result for result in tables.results_of(grid, lab.records) if result.run.cell.scene == scene]
@@ -26,7 +26,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[str, a2tg.Model]) -> None:
-    """One of the whole view, one of a part; the first model is the reference, the second what it gains over."""
+    """Save the whole view and a part; the first model is the reference, the second the one it is compared with."""
     background = next(iter(models.values())).background
     drawn = {label: a2tg.Renderer(model) for label, model in models.items()}
     rows = []

@@ -16,7 +16,7 @@ NUM_TEXTURES, ZOOM = 16, 12
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Two pictures of each scene whose model is there, and how much textures bring to its test views."""
+    """Save two pictures of each scene with a model, and write the PSNR that textures add to its test views."""
     (grid,) = grids
     rows = []
     for result in tables.results_of(grid, lab.records):
@@ -38,7 +38,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _textures_picture(model: a2tg.Model) -> Image.Image:
-    """The most varied textures of 4×4, 1×4 and 4×1 texels (rows × columns): RGB above, alpha below."""
+    """Return the most varied textures of 4×4, 1×4 and 4×1 texels (rows × columns): RGB above, alpha below."""
     sheets = [pictures.learned_textures(model, size, NUM_TEXTURES) for size in ((4, 4), (1, 4), (4, 1))]
     sheets = [pictures.enlarged(sheet, ZOOM) for sheet in sheets if sheet.shape[1]]
     width = max((sheet.shape[1] for sheet in sheets), default=1)

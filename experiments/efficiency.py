@@ -23,7 +23,7 @@ TIMED_ROUNDS = 3
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, measured once on this machine, then the paper's."""
+    """Write our times, measured once on this machine, then the paper's."""
     (grid,) = grids
     text = table_of_times(lab, EXPERIMENT.name, grid)
     columns = (
@@ -37,7 +37,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def table_of_times(lab: Lab, name: str, grid: Grid) -> str:
-    """Size and speed of a grid's models, measured once and kept in NAME.json."""
+    """Return size and speed of a grid's models, measured once and kept in NAME.json."""
     rows = [_row(result, times) for result, times in measured_once(lab, name, grid, _times)]
     header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
     return tables.markdown([*header, "machine"], rows)
@@ -54,7 +54,7 @@ def _row(result: tables.Result, times: Figures) -> list[str]:
 
 
 def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
-    """Frames per second on the test views, and the time of a step in each stage, compiled and warm."""
+    """Return frames per second on the test views, and the time of a step in each stage, compiled and warm."""
     job = result.run.job
     scene = lab.folders.load_scene(job)
     jobs = [dataclasses.replace(job, stage=stage) for stage in range(job.stage + 1)]
@@ -67,7 +67,7 @@ def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
 
 
 def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
-    """Of steps that start from what the stage left, with all its Gaussians; the best of some rounds' medians."""
+    """Return the time of a step with all Gaussians of the trained stage: the best median of some rounds."""
     system = dataclasses.replace(job.system, **{f"stage{stage}_iterations": TIMED_ITERATIONS for stage in (1, 2)})
     start = a2tg.load_model(lab.folders.model(job if job.stage == 0 else dataclasses.replace(job, stage=0)))
     paces = []

@@ -11,7 +11,7 @@ from lab.grid import Grid
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, measured once on this machine."""
+    """Write the times, measured once on this machine."""
     (grid,) = grids
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{table_of_times(lab, EXPERIMENT.name, grid)}")
 

@@ -12,7 +12,7 @@ METHODS = ("2DGS*-MCMC", "Textured Gaussians*", "A²TG", "A²TG, as quick has it
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """One chart of quality a column of scenes, and one of memory."""
+    """Save a chart of quality for each column of scenes, and one of memory."""
     results = list(
         {id(result.record): result for grid in grids for result in tables.results_of(grid, lab.records)}.values()
     )
@@ -28,8 +28,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> list[plots.Point]:
-    """Of a method, one for each number of Gaussians of the cells and each way to choose its own: means over scenes and
-    seeds."""
+    """Return a method's points, means over scenes, for each number of Gaussians and each way to choose its own."""
     groups: dict[tuple[int, bool], list[tables.Result]] = {}
     for result in results:
         if result.run.method.label == label:

@@ -19,7 +19,7 @@ NUM_STEPS = (2, 5, 10)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table of the models that are there, each measured once."""
+    """Write a table of the available models, each measured once."""
     (grid,) = grids
     rows, gains = [], []
     for result, found in measured_once(lab, EXPERIMENT.name, grid, _measure):
@@ -36,7 +36,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, dict[str, float]]:
-    """Quality before, and after so many steps."""
+    """Return quality before and after each number of steps."""
     scene = lab.folders.load_scene(result.run.job)
     background = background_of(scene)
     found = {"0": _quality(lab, scene, model, background)}

@@ -12,7 +12,7 @@ from a2tg_jax.results.images import save_picture, to_uint8
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table and a chart of the shares; a picture of each scene whose model is there."""
+    """Write a table and a chart of the shares, and a picture of each scene with a model."""
     results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
     label = grids[0].reference.label
     results = [result for result in results if result.label == label and not result.run.cell.seed]
@@ -38,13 +38,13 @@ def _place(result: tables.Result) -> str:
 
 
 def _shares(result: tables.Result) -> dict[str, float]:
-    """Of the Gaussians, by resolution."""
+    """Return the share of Gaussians by resolution."""
     counts = result.record["sizes"]
     return {size: count / sum(counts.values()) for size, count in counts.items()}
 
 
 def _picture(lab: Lab, result: tables.Result) -> None:
-    """The first of the training's cameras, as it is and by the shape of the textures."""
+    """Save the view of the first camera, as it is and coloured by the shape of the textures."""
     model = lab.model(result)
     if model is None:
         return

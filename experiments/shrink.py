@@ -18,7 +18,7 @@ MAX_LOSSES = (0.02, 0.05)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table of the models that are there, each measured once."""
+    """Write a table of the available models, each measured once."""
     (grid,) = grids
     rows = []
     for result, figures in measured_once(lab, EXPERIMENT.name, grid, _measure):
@@ -32,7 +32,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, Any]:
-    """Bytes and quality before and after."""
+    """Return bytes and quality before and after."""
     scene = lab.folders.load_scene(result.run.job)
     background = background_of(scene)
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]

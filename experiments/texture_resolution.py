@@ -10,7 +10,7 @@ from a2tg_jax.results.figures import save_figure
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, then the paper's; and PSNR and LPIPS against memory."""
+    """Write our tables, then the paper's, and charts of PSNR and LPIPS against memory."""
     (grid,) = grids
     results = tables.results_of(grid, lab.records)
     paper = tables.paper_table(EXPERIMENT.name, "gaussians", tables.QUALITY_COLUMNS, "Deep Blending")
@@ -26,7 +26,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _curves(results: Sequence[tables.Result], figure: str) -> dict[str, list[plots.Point]]:
-    """Of each method and number of Gaussians, the points of its resolutions, means over scenes."""
+    """Return the points of all resolutions, means over scenes, by method and number of Gaussians."""
     points: dict[tuple[str, int, str], list[tables.Result]] = {}
     for result in results:
         method, _, resolution = result.label.rpartition(", ")

@@ -36,9 +36,9 @@ from a2tg_jax.training.losses import photometric_loss
 
 ITERATIONS = 300
 NUM_PARTS = 4
-"""Groups that a criterion's order is cut into."""
+"""Number of groups in a criterion's order."""
 SEEDS = (0, 1, 2)
-"""Of training without textures: their spread is the noise."""
+"""Seeds of training without textures, whose spread is the noise."""
 SIZE = (2, 2)
 CRITERIA = {
     "paper": "gradient by position (the paper's)",
@@ -54,10 +54,10 @@ CRITERIA = {
 
 @event
 class GrowRows(HostEvent):
-    """Gives some Gaussians textures of one size after the first iteration."""
+    """Event that gives some Gaussians textures of one size after the first iteration."""
 
     rows: Any
-    """[N] bool."""
+    """Whether each Gaussian gets a texture, [N] bool."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return (1,)
@@ -71,7 +71,7 @@ class GrowRows(HostEvent):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trial(a2tg.System):
-    """One stage that goes on from a model, with textures of the rows; with none, Gaussians alone are trained."""
+    """One stage that continues from a model with textures of some rows, or without textures if `rows` is None."""
 
     rows: Any = dataclasses.field(default=None, hash=False)
 
@@ -83,7 +83,7 @@ class Trial(a2tg.System):
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table of rank correlations, a column a model."""
+    """Write a table of rank correlations, a column a model."""
     (grid,) = grids
     found = measured_once(lab, EXPERIMENT.name, grid, _measure, first_stage=True)
     header = ["criterion", *(f"{result.run.cell.scene.label}, {result.run.cell.budget:g} MB" for result, _ in found)]
@@ -103,7 +103,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
-    """Scores of all groups, and what each gains."""
+    """Return scores and gain of every group."""
     scene = lab.folders.load_scene(result.run.job)
     options = result.run.job.system
     system = Trial(**{field.name: getattr(options, field.name) for field in dataclasses.fields(a2tg.System)})
@@ -125,7 +125,7 @@ def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
 
 
 def _quality(scene: a2tg.Scene, model: Model, system: Trial) -> tuple[float, float]:
-    """PSNR on views trained on and on test views after a trial."""
+    """Return PSNR on training views and on test views after a trial."""
     trained = fit_stage(scene, system, 0, model, progress=False).model
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
     background = background_of(scene)
@@ -147,7 +147,7 @@ def _quarters(figures: Mapping[str, Any], name: str) -> str:
 
 
 def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
-    """[N] of each criterion, over all training views (host)."""
+    """Return each criterion, [N], over all training views (host)."""
     sizes = np.full((model.num, 2), SIZE)
     textures, layout = a2tg.allocate_textures(sizes)
     background = jnp.asarray(background_of(scene) or (0.0, 0.0, 0.0))
@@ -163,7 +163,7 @@ def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
 
 
 def _look(model: Model, camera, target: Array, background: Array, key: Array, *, settings) -> dict[str, Array]:
-    """What one view adds to the criteria, of texels as [rows, 4] in the order of the only bucket."""
+    """Return one view's terms of the criteria; texels are [rows, 4] in the order of the only bucket."""
     probe = jnp.zeros((model.num, 4), model.gaussians.means.dtype)
 
     def draw(texels: Array, probe: Array) -> Array:

@@ -442,6 +442,13 @@ def test_lpips_without_weights_is_a_dash_in_every_table():
         assert f"· {tables.MISSING}" in text or f"/ {tables.MISSING}" in text
 
 
+def test_experiments_and_benchmarks_have_one_writer_of_tables():
+    folders = (EXPERIMENTS, EXPERIMENTS.parent / "benchmarks")
+    writers = [path for folder in folders for path in folder.rglob("*.py") if "---" in path.read_text(encoding="utf-8")]
+    assert [path.name for path in writers] == ["markdown.py"]
+    assert tables.markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
+
+
 def test_choices_are_compared_with_the_default():
     results = [result("own", 20.0), result("own", 21.0, 1), result("variant", 20.25, lpips=0.19)]
     text = tables.choices_table([*results, result("variant", 20.75, 1)], "own")
