@@ -509,7 +509,8 @@ def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
             experiment.present(lab, [lab.grid(grid) for grid in experiment.grids])
     made = {path.name for path in tmp_path.glob("*.md")}
     assert shown == made | {f"{name}.md" for name in made_from_models} - {"comparison_pictures.md"}
-    assert shown == {path.name for path in committed.glob("*.md")}, "a committed table is on no page"
+    unshown = {path.name for path in committed.glob("*.md")} - shown
+    assert unshown <= {"quick_preset.md"}, "a table is on no page"
     for name in made:
         assert (tmp_path / name).read_text() == (committed / name).read_text(), name
 
