@@ -1,4 +1,4 @@
-"""All measurements, as tables and as JSON, with the machine, the versions and the commit.
+"""Run all measurements and write them as JSON, with the machine, the versions and the commit.
 
     python -m benchmarks --out benchmarks/results/cpu.json                     # everything: most of an hour
     python -m benchmarks --only render --largest 10000                         # a part of it
@@ -22,7 +22,7 @@ import subprocess
 from benchmarks.fit import fit_growth
 from benchmarks.sections import SECTIONS, device
 
-OTHER_HELP = """a program to measure beside this library, may be repeated. COMMAND gets one more argument, a case such
+OTHER_HELP = """a program to measure beside this library; may be repeated. COMMAND gets one more argument, a case such
 as {"num": 10000, "width": 320, "height": 240, "threads": 1}, and prints a last line such as
 {"forward": {"ms": 20.1}, "both": {"ms": 43.2}}: milliseconds of a forward pass, and of one with its gradients, of the
 Gaussians, the camera and the image to compare with that benchmarks/arrays.py makes"""
@@ -45,7 +45,7 @@ def main() -> None:
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("benchmark.json"))
-    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), help="these sections only")
+    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), help="run these sections only")
     parser.add_argument("--largest", type=int, default=1_000_000, help="leave out workloads of more Gaussians")
     parser.add_argument("--scene", type=pathlib.Path, help="a real scene of photographs, to train and to render")
     parser.add_argument("--mitsuba", metavar="PYTHON", help="a Python with Mitsuba 3 installed, to measure beside it")
@@ -59,7 +59,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def named_command(text: str) -> tuple[str, list[str]]:
-    """NAME=COMMAND taken apart."""
+    """Return name and command of NAME=COMMAND."""
     name, _, command = text.partition("=")
     if not name or not command:
         raise argparse.ArgumentTypeError(f"wanted NAME=COMMAND; got {text!r}")
@@ -67,7 +67,7 @@ def named_command(text: str) -> tuple[str, list[str]]:
 
 
 def machine() -> dict:
-    """Where and with what this was measured."""
+    """Return the machine, the versions and the commit."""
     names = ("jax", "jaxlib", "numpy", "llvmlite")
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     processor = platform.processor()

@@ -21,7 +21,7 @@ class RandomSplats(NamedTuple):
 
 
 def random_splats(num: int) -> RandomSplats:
-    """The Gaussians of the workload."""
+    """Return the Gaussians of the workload."""
     rng = np.random.default_rng(0)
     opacities = rng.uniform(0.1, 0.9, num)
     return RandomSplats(
@@ -34,12 +34,12 @@ def random_splats(num: int) -> RandomSplats:
 
 
 def camera_matrices(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """viewmat [4, 4] from 1.5 away and K [3, 3] with a focal length of 0.8 times the width."""
+    """Return viewmat [4, 4] from 1.5 away and K [3, 3] with a focal length of 0.8 times the width."""
     viewmat = np.eye(4)
     viewmat[2, 3] = 1.5
     return viewmat, np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
 
 
 def random_image(width: int, height: int) -> np.ndarray:
-    """[H, W, 3] float32, what images are compared with."""
+    """Return the target image, [H, W, 3] float32."""
     return np.random.default_rng(3).uniform(size=(height, width, 3)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Compiles the Pallas kernels for a GPU on a machine without one, and prints what they need.
+"""Compile the Pallas kernels for a GPU on a machine without one, and print the memory that they need.
 
     pip install --no-deps jax-cuda13-plugin==X.Y.Z jax-cuda13-pjrt==X.Y.Z     # of the installed jax X.Y.Z
     python -m benchmarks.deviceless h200.txtpb --ptxas ptxas
@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def programs():
-    """Names, functions and the shapes of their arguments: forward and backward, plain and textured."""
+    """Yield names, functions and the shapes of their arguments: forward and backward, plain and textured."""
     import jax
     import jax.numpy as jnp
 
@@ -77,7 +77,7 @@ def programs():
 
 
 def compile_for(target: pathlib.Path, function, inputs):
-    """The program for the GPU that the file describes."""
+    """Return the program for the GPU that the file describes."""
     import jax
     from jax.experimental import topologies
 
@@ -89,7 +89,7 @@ def compile_for(target: pathlib.Path, function, inputs):
 
 
 def assembled(dump: pathlib.Path, args: argparse.Namespace) -> str:
-    """Registers and spills of the kernels compiled since the last call."""
+    """Return registers and spills of the kernels compiled since the last call."""
     found = []
     for path in sorted(dump.glob("*.ptx")):
         kernel = re.search(r"\.entry (_\w+_kernel)", path.read_text())

@@ -1,4 +1,4 @@
-"""How time grows: a + b·(Gaussians) + c·(pairs of a splat and a pixel), fitted to measured cases."""
+"""Growth of time: a + b·(Gaussians) + c·(pairs of a splat and a pixel), fitted to measured cases."""
 
 from collections.abc import Iterable
 
@@ -6,10 +6,10 @@ import numpy as np
 
 
 def fit_growth(cases: Iterable[dict]) -> list[dict]:
-    """Least squares of the relative error, per number of threads, of forward and of forward + backward.
+    """Fit the relative error by least squares, per number of threads, for forward and for forward + backward.
 
-    Of all the cases, whichever section they are from, those count that this library rendered without textures, on a
-    stated number of threads and with its own choice of compositor and tile size.
+    Cases of all sections count if this library rendered them without textures, on a stated number of threads and with
+    its own choice of compositor and tile size.
     """
     chosen = [case for case in cases if is_fitted(case)]
     found = []
@@ -21,13 +21,13 @@ def fit_growth(cases: Iterable[dict]) -> list[dict]:
 
 
 def is_fitted(case: dict) -> bool:
-    """Whether a case counts."""
+    """Return whether a case counts."""
     is_plain = case["case"] in ("render", "trained") and case.get("textures", "none") == "none"
     return is_plain and {"threads", "composited_pairs"} <= case.keys() and not {"compositor", "tile_size"} & case.keys()
 
 
 def fit(cases: list[dict], which: str) -> dict:
-    """The coefficients for one kind of pass."""
+    """Return the coefficients for one kind of pass."""
     times = np.array([case[which]["ms"] for case in cases])
     columns = np.array([[1.0, case["num"], case["composited_pairs"]] for case in cases])
     weighted = columns / times[:, None]

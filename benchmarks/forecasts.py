@@ -1,9 +1,9 @@
-"""What `a2tg train` says it will need, beside what it takes: ten configurations, each in a process of its own.
+"""Forecast and measured memory of `a2tg train`: ten configurations, each in a process of its own.
 
     python -m benchmarks.forecasts --scenes SCENES --out benchmarks/results/forecasts.json
 
-SCENES holds the folders fox, herz_jesus_p25, lego and snowmiku. Nothing compiled is found: each case begins with an
-empty cache, as a first run does. A table is printed.
+SCENES holds the folders fox, herz_jesus_p25, lego and snowmiku. Each case starts with an empty
+cache, as a first run does. A table is printed.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.host.memory import memory_peak
 from a2tg_jax.results.forecast import forecast_run
 from benchmarks.large_scene import write_scene
+from experiments.lab import markdown
 
 SHORT = ("--stage1-iterations", "20", "--stage2-iterations", "20")
 CASES: dict[str, tuple[str, ...]] = {
@@ -56,7 +57,7 @@ CASES: dict[str, tuple[str, ...]] = {
 
 
 def measure(name: str, scenes: pathlib.Path, folder: pathlib.Path) -> int:
-    """The peak of the process of one case, in bytes."""
+    """Return the peak memory of one case's process, in bytes."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder / f"cache-{len(os.listdir(folder))}")}
     command = [sys.executable, "-m", "benchmarks.forecasts", "--run", json.dumps(arguments_of(name, scenes, folder))]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
@@ -64,14 +65,14 @@ def measure(name: str, scenes: pathlib.Path, folder: pathlib.Path) -> int:
 
 
 def arguments_of(name: str, scenes: pathlib.Path, folder: pathlib.Path) -> list[str]:
-    """Those of `a2tg train`, without the name of the command."""
+    """Return the arguments of `a2tg train`, without the name of the command."""
     scene, *options = CASES[name]
     places = {"synthetic": "synthetic", "written": str(folder / "written")}
     return [places.get(scene, str(scenes / scene)), "--out", str(folder / "run"), "--overwrite", *options]
 
 
 def compare(name: str, arguments: list[str], peak: int) -> dict:
-    """A case as the file has it: what is forecast, and the peak."""
+    """Return a case for the file: the forecast and the peak."""
     record = cli._parse("train", arguments).record
     phase, told = forecast_run(record.scene.load(), record.plan).peak
     ratio = round(told.total / peak, 3)
@@ -79,12 +80,12 @@ def compare(name: str, arguments: list[str], peak: int) -> dict:
 
 
 def table(found: list[dict]) -> str:
-    """Markdown."""
-    lines = ["| run | forecast, MB | peak, MB | forecast / peak |", "| --- | --- | --- | --- |"]
-    for case in found:
-        figures = f"{case['forecast'] / 1e6:,.0f} | {case['peak'] / 1e6:,.0f} | {case['ratio']:.2f}"
-        lines.append(f"| {case['case']} | {figures} |")
-    return "\n".join(lines)
+    """Return the cases as a table in Markdown."""
+    rows = [
+        [case["case"], f"{case['forecast'] / 1e6:,.0f}", f"{case['peak'] / 1e6:,.0f}", f"{case['ratio']:.2f}"]
+        for case in found
+    ]
+    return markdown.table(["run", "forecast, MB", "peak, MB", "forecast / peak"], rows)
 
 
 def main() -> None:
@@ -92,7 +93,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=pathlib.Path, default=pathlib.Path("scenes"))
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("forecasts.json"))
     parser.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--again", action="store_true", help="forecast anew; the peaks are those of the file")
+    parser.add_argument("--again", action="store_true", help="forecast again; keep the peaks of the file")
     parser.add_argument("--run", type=json.loads, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.run is not None:
@@ -108,7 +109,7 @@ def main() -> None:
             peak = found[name]["peak"] if args.again else measure(name, args.scenes, folder)
             found[name] = compare(name, arguments_of(name, args.scenes, folder), peak)
             args.out.write_text(json.dumps(list(found.values()), indent=1) + "\n")
-    print(table(list(found.values())))
+    print(table(list(found.values())), end="")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Many large photographs in little memory: a scene is written to a temporary folder, trained on and measured.
+"""Memory of many large photographs: write a scene to a temporary folder, train on it and measure.
 
     python -m benchmarks.large_scene --out benchmarks/results/large_scene.json
 
 By default 200 photographs of 6000×4000 pixels in 8 GB, at full size and at a quarter of it; a few iterations and one
-view of evaluation. Every case runs in a process of its own, which ends itself where it takes more.
+view of evaluation. Every case runs in a process of its own, which ends itself if it takes more.
 """
 
 import argparse
@@ -24,12 +24,12 @@ from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.memory import memory_peak
 
 NUM_PICTURES = 8
-"""Different photographs; the others are links to them, and are decoded like any."""
+"""Number of different photographs; the others are links to them, decoded like any."""
 ITERATIONS = 6
 
 
 def write_scene(folder: pathlib.Path, num: int, width: int, height: int) -> None:
-    """A transforms.json, points, and JPEG files: the built-in scene, enlarged and with noise."""
+    """Write a transforms.json, points, and JPEG files: the built-in scene, enlarged and with noise."""
     made = a2tg_jax.synthetic_scene(num_views=NUM_PICTURES, width=600, height=round(600 * height / width))
     views = sorted((*made.train, *made.test), key=lambda view: view.name)
     images, rng = folder / "images", np.random.default_rng(0)
@@ -60,7 +60,7 @@ def _write_points(path: pathlib.Path, points: np.ndarray, colors: np.ndarray) ->
 
 
 def measure(case: dict) -> dict:
-    """Loads, trains a little and evaluates a view, in this process; ends it where it takes more than it may."""
+    """Load, train a little and evaluate a view; end this process if it takes more memory than the limit."""
     threading.Thread(target=_end_beyond, args=(case["limit"],), daemon=True).start()
     a2tg_jax.configure_cpu()
     start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What the processor can do at best."""
+"""Best possible time of the processor."""
 
 import concurrent.futures
 import os
@@ -15,7 +15,7 @@ from benchmarks.timing import timed
 
 
 def measure_limit(case: dict) -> dict:
-    """How long the processor takes for a number of multiply-adds and one exp per pixel and splat, and nothing else."""
+    """Return the time of a number of multiply-adds and one exp per pixel and splat, and nothing else."""
     module, width = ir.Module("limit"), llvm_modules.vector_bytes() // 4
     writer = Writer(module, "limit", ("data",), ("num",), "float32")
     at = lanes.Lanes(writer.b, width)

@@ -1,4 +1,4 @@
-"""One case, measured in a process of its own, so that its peak memory and its compilation are its own.
+"""Measure one case in a process of its own, which gives it its own peak memory and compilation.
 
     python -m benchmarks.measure '{"case": "render", "num": 10000, "width": 320, "height": 240, "textures": "mixed"}'
 

@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def load_scene(mi, num: int, width: int, height: int):
-    """The workload of `benchmarks.arrays`."""
+    """Return the workload of `benchmarks.arrays`."""
     splats = random_splats(num)
     quats = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
     scales = np.concatenate([splats.scales, splats.scales.min(axis=1, keepdims=True) / 10], axis=1)

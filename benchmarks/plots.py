@@ -1,4 +1,4 @@
-"""The plots of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
+"""Plots of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
 
 python -m benchmarks.plots benchmarks/results/cpu.json docs/images
 """
@@ -23,7 +23,7 @@ def main() -> None:
 
 
 def plot_growth(cases: list[dict], path: pathlib.Path) -> None:
-    """Forward + backward against the number of Gaussians, one panel per image size, all threads."""
+    """Plot forward + backward against the number of Gaussians, one panel per image size, all threads."""
     cases = [case for case in cases if "failed" not in case]
     threads = max(case["threads"] for case in cases)
     sizes = sorted({(case["width"], case["height"]) for case in cases})
@@ -43,7 +43,7 @@ def plot_growth(cases: list[dict], path: pathlib.Path) -> None:
 
 
 def plot_stages(cases: list[dict], path: pathlib.Path) -> None:
-    """Where the time goes, per case, as stacked bars."""
+    """Plot the time of each stage, per case, as stacked bars."""
     stages = {
         "tile lists": lambda case: case["tile lists"]["ms"],
         "compositing": lambda case: case["compositing, forward and backward"]["ms"],

@@ -17,7 +17,7 @@ from benchmarks.workload import random_scene, random_textures
 
 
 def measure_render(case: dict) -> dict:
-    """The random workload."""
+    """Measure the random workload."""
     gaussians, camera = random_scene(case["num"], case["width"], case["height"])
     textures, layout = random_textures(case["num"], case.get("textures", "none"))
     settings = a2tg_jax.RenderSettings(compositor=case.get("compositor", "auto"), tile_size=case.get("tile_size", 8))
@@ -25,7 +25,7 @@ def measure_render(case: dict) -> dict:
 
 
 def measure_ratios(case: dict) -> dict:
-    """Textured beside untextured, in turn in one process: what a noisy machine distorts least."""
+    """Measure textured and untextured passes in turn in one process, which a noisy machine distorts least."""
     gaussians, camera = random_scene(case["num"], case["width"], case["height"])
     calls, kinds = {}, ("none", "mixed", "4x4")
     for kind in kinds:
@@ -52,7 +52,7 @@ def measure_view(
     layout: a2tg_jax.AtlasLayout | None,
     settings: a2tg_jax.RenderSettings,
 ) -> dict:
-    """Forward, forward with backward, and how many pairs were composited."""
+    """Measure forward, forward with backward, and count the composited pairs."""
     made = passes(gaussians, camera, textures, layout, settings)
     counts = made.counts(gaussians, textures, jnp.zeros((gaussians.num, 4)))
     return {
@@ -66,15 +66,15 @@ class Passes(NamedTuple):
     """Jitted functions of Gaussians and textures."""
 
     forward: Callable
-    """The image."""
+    """Image."""
     both: Callable
-    """The gradient of L1 against a fixed random image."""
+    """Gradient of L1 against a fixed random image."""
     counts: Callable
-    """Of the statistic's probe, too: its gradient (`rasterize.compositor.composite`)."""
+    """Gradient at the statistic's probe, a further argument (`rasterize.compositor.composite`)."""
 
 
 def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSettings) -> Passes:
-    """What is measured of a view."""
+    """Return the measured functions of a view."""
     settings = a2tg_jax.plan_render(gaussians, camera, textures, layout, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 

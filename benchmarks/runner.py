@@ -1,4 +1,4 @@
-"""Runs one case in a process of its own and reads the line of JSON that it prints."""
+"""Run one case in a process of its own and read the line of JSON that it prints."""
 
 import json
 import os
@@ -12,7 +12,7 @@ OURS = (sys.executable, "-m", "benchmarks.measure")
 
 
 def measure_all(cases: Iterable[Mapping[str, Any]], largest: int) -> list[dict]:
-    """The figures of this library for the cases that have no more Gaussians than `largest`."""
+    """Return the figures of this library for the cases with at most `largest` Gaussians."""
     return [measure(case) for case in cases if case["num"] <= largest]
 
 
@@ -23,14 +23,14 @@ def measure(
     environment: Mapping[str, str] | None = None,
     timeout: float = 1200,
 ) -> dict:
-    """The case with its figures, printed as a line; a case that fails says so and is kept as a failure."""
+    """Return the case with its figures, or with its failure, and print it as a line."""
     figures = {**case, **run(case, command, environment or {}, timeout)}
     print(line(figures), flush=True)
     return figures
 
 
 def run(case: Mapping[str, Any], command: Sequence[str], environment: Mapping[str, str], timeout: float) -> dict:
-    """What the command, given the case as its last argument, prints as its last line; or why there is nothing."""
+    """Return the last line of the command, called with the case as its last argument, or the failure."""
     try:
         done = subprocess.run(
             [*command, json.dumps(case)],
@@ -48,7 +48,7 @@ def run(case: Mapping[str, Any], command: Sequence[str], environment: Mapping[st
 
 
 def line(figures: Mapping[str, Any]) -> str:
-    """A case as one line of a table; the views that it rendered, each on a line below it."""
+    """Return a case as one line of text, with a line below it for each rendered view."""
     words = []
     for name, value in figures.items():
         if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""The cases of each section of the report."""
+"""Cases of each section of the report."""
 
 import argparse
 import functools
@@ -18,12 +18,12 @@ TYPICAL = ((10_000, SIZES[0]), (50_000, SIZES[1]))
 ALL = os.cpu_count() or 1
 THREADS = (1, ALL)
 MULTIPLY_ADDS = {"forward": 20, "both": 80}
-"""Needed for a splat at a pixel: nine for the ray's plane, four for (u, v) and ρ, and what falloff, colour and
-transmittance take; the backward pass does this again and about twice as much for the derivatives."""
+"""Multiply-adds of a splat at a pixel: nine for the ray's plane, four for (u, v) and ρ, the rest for falloff, colour
+and transmittance; the backward pass does this again and about twice as much for the derivatives."""
 
 
 def render_section(args: argparse.Namespace) -> list[dict]:
-    """The random workload at two sizes, untextured and textured, with one thread and with all."""
+    """Measure the random workload at two sizes, untextured and textured, with one thread and with all."""
     cases = [
         random_case(num, size, textures=kind, threads=threads)
         for size in SIZES
@@ -36,19 +36,19 @@ def render_section(args: argparse.Namespace) -> list[dict]:
 
 
 def ratios_section(args: argparse.Namespace) -> list[dict]:
-    """What textures cost, measured side by side."""
+    """Measure the cost of textures side by side."""
     cases = [{**random_case(num, size, threads=ALL), "case": "ratios", "rounds": 25} for num, size in TYPICAL]
     return measure_all(cases, args.largest)
 
 
 def pixels_section(args: argparse.Namespace) -> list[dict]:
-    """The same Gaussians at growing image sizes."""
+    """Measure the same Gaussians at growing image sizes."""
     cases = [random_case(10_000, size, textures="none", threads=threads) for size in PIXELS for threads in THREADS]
     return measure_all(cases, args.largest)
 
 
 def full_size_section(args: argparse.Namespace) -> list[dict]:
-    """Large scenes and large textures."""
+    """Measure large scenes and large textures."""
     cases = [
         random_case(300_000, FULL_SIZE, textures="none", threads=ALL),
         random_case(LARGEST, FULL_SIZE, textures="none", threads=ALL),
@@ -58,7 +58,7 @@ def full_size_section(args: argparse.Namespace) -> list[dict]:
 
 
 def stages_section(args: argparse.Namespace) -> list[dict]:
-    """Where the time of a training step goes."""
+    """Measure the stages of a training step."""
     cases = [
         {**random_case(num, size, textures=kind, threads=threads), "case": "stages"}
         for num, size in TYPICAL
@@ -69,14 +69,14 @@ def stages_section(args: argparse.Namespace) -> list[dict]:
 
 
 def compositors_section(args: argparse.Namespace) -> list[dict]:
-    """Native loops beside XLA, and tile sizes."""
+    """Measure native loops beside XLA, and tile sizes."""
     choices = ({"compositor": "xla"}, {"tile_size": 4}, {"tile_size": 8}, {"tile_size": 16}, {"tile_size": 32})
     cases = [random_case(10_000, SIZES[0], textures=kind, **choice) for kind in ("none", "mixed") for choice in choices]
     return measure_all(cases, args.largest)
 
 
 def limit_section(args: argparse.Namespace) -> dict[str, list[dict]]:
-    """What the processor could do at best, for the multiply-adds of ten million pairs of a splat and a pixel."""
+    """Measure the multiply-adds of ten million pairs of a splat and a pixel, the best possible time."""
     return {
         name: [
             measure({"case": "limit", "multiply_adds": number, "pairs": 1e7, "threads": threads}) for threads in THREADS
@@ -86,7 +86,7 @@ def limit_section(args: argparse.Namespace) -> dict[str, list[dict]]:
 
 
 def training_section(args: argparse.Namespace) -> list[dict]:
-    """Training steps on a real scene, each case first without compiled programs on disk and then with them."""
+    """Measure training steps on a real scene, first without compiled programs on disk and then with them."""
     if args.scene is None:
         return []
     found = []
@@ -101,7 +101,7 @@ def training_section(args: argparse.Namespace) -> list[dict]:
 
 
 def trained_section(args: argparse.Namespace) -> list[dict]:
-    """A view of a real scene after short training, at three sizes; each a case of its own in the report."""
+    """Measure a view of a real scene after short training, at three sizes; each a case of its own in the report."""
     if args.scene is None:
         return []
     scene = {"scene": str(args.scene.resolve()), "downscale": 4, "factors": [1, 2, 4]}
@@ -112,7 +112,7 @@ def trained_section(args: argparse.Namespace) -> list[dict]:
 
 
 def others_section(args: argparse.Namespace) -> list[dict]:
-    """Other programs on the same workload, one thread, beside this library."""
+    """Measure other programs on the same workload, one thread, beside this library."""
     programs = dict(args.other)
     if args.mitsuba is not None:
         programs["mitsuba"] = [args.mitsuba, "-m", "benchmarks.mitsuba"]
@@ -126,7 +126,7 @@ def others_section(args: argparse.Namespace) -> list[dict]:
 
 
 def gpu_section(args: argparse.Namespace) -> list[dict]:
-    """Large scenes on a GPU, beside gsplat; nothing where JAX has none."""
+    """Measure large scenes on a GPU, beside gsplat; nothing if JAX has no GPU."""
     if not device().startswith("gpu"):
         return []
     found = []
@@ -144,13 +144,13 @@ def gpu_section(args: argparse.Namespace) -> list[dict]:
 
 
 def random_case(num: int, size: tuple[int, int], **more: str | int) -> dict:
-    """The random workload of so many Gaussians at an image size."""
+    """Return a case of the random workload."""
     return {"case": "render", "num": num, "width": size[0], "height": size[1], **more}
 
 
 @functools.cache
 def device() -> str:
-    """JAX's default device, as a process of its own sees it: this one must leave a GPU's memory to the cases."""
+    """Return JAX's default device, asked by another process: this one must leave a GPU's memory to the cases."""
     program = "import jax; device = jax.devices()[0]; print(device.platform, device.device_kind)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return done.stdout.strip()

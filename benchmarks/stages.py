@@ -1,4 +1,4 @@
-"""Where the time of a training step goes, on the random workload."""
+"""Time of each stage of a training step, on the random workload."""
 
 import functools
 
@@ -19,7 +19,7 @@ timed = functools.partial(timing.timed, wait=jax.block_until_ready)
 
 
 def measure_stages(case: dict) -> dict:
-    """Each stage apart."""
+    """Measure each stage apart."""
     num, width, height = case["num"], case["width"], case["height"]
     gaussians, camera = random_scene(num, width, height)
     textures, layout = random_textures(num, case.get("textures", "none"))

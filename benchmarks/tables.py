@@ -1,14 +1,16 @@
-"""The tables of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
+"""Tables of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
 
     python -m benchmarks.tables benchmarks/results/cpu.json docs/performance.md
 
-replaces what stands between `<!-- NAME -->` and `<!-- end -->` in the document by the table of that name.
+replaces the text between `<!-- NAME -->` and `<!-- end -->` in the document by the table of that name.
 """
 
 import json
 import pathlib
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+
+from experiments.lab.markdown import table
 
 TEXTURES = {"none": "none", "mixed": "mixed", "4x4": "all 4×4", "16x16": "all 16×16"}
 STAGES = (
@@ -37,14 +39,8 @@ def main() -> None:
     document.write_text(text)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def ms(figure: dict) -> str:
-    """A time in milliseconds, two or three digits of it."""
+    """Return a time in milliseconds with two or three digits."""
     value = figure["ms"]
     return f"{value:.1f}" if value < 10 else f"{value:.0f}"
 
@@ -58,7 +54,7 @@ def measured(cases: Iterable[dict]) -> list[dict]:
 
 
 def pairs_of_threads(cases: Iterable[dict]) -> list[dict[int, dict]]:
-    """Cases that differ in nothing but the threads, by threads."""
+    """Group the cases that differ in nothing but the threads, by threads."""
     groups: dict[tuple, dict[int, dict]] = {}
     for case in measured(cases):
         key = (case["width"], case["num"], case["textures"])
@@ -211,7 +207,7 @@ TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "training": (training, ("training",)),
     "trained": (trained, ("trained",)),
 }
-"""Each with the sections of the report that it needs."""
+"""Function of each table, with the sections of the report that it needs."""
 
 if __name__ == "__main__":
     main()

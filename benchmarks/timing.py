@@ -1,4 +1,4 @@
-"""How long a call takes. Needs nothing but numpy, so that other programs are timed by the same rule."""
+"""Time of a call. Needs nothing but numpy, so that other programs are timed by the same rule."""
 
 import time
 from collections.abc import Callable
@@ -10,12 +10,12 @@ import numpy as np
 def timed(
     function: Callable, *args: Any, wait: Callable[[Any], Any] = lambda result: result, least_runs: int = 5
 ) -> dict[str, float]:
-    """Seconds of the first call, and the median and least milliseconds of the following ones.
+    """Return seconds of the first call, and the median and least milliseconds of the following ones.
 
     Args:
       function: called with `args`.
-      wait: called with its result; returns when that is there.
-      least_runs: after the first call; more, up to 40, while they take less than a second together.
+      wait: called with its result; returns when that is computed.
+      least_runs: number of calls after the first; more, up to 40, while they take less than a second together.
     """
 
     def seconds() -> float:

@@ -1,4 +1,4 @@
-"""Training steps on a real scene, and views of what was trained."""
+"""Training steps on a real scene, and views of the trained model."""
 
 import dataclasses
 import pathlib
@@ -15,7 +15,7 @@ from benchmarks.rendering import measure_view
 
 
 def measure_training(case: dict) -> dict:
-    """Warm steps of both stages: median milliseconds of the last ones, compilation apart."""
+    """Measure warm steps of both stages: median milliseconds of the last ones, without compilation."""
     scene, textured = load_case(case)
     plain = like(Gaussians2dMcmc, textured)
     first = fit_stage(scene, textured, 0, progress=False)
@@ -31,7 +31,7 @@ def measure_training(case: dict) -> dict:
 
 
 def measure_trained(case: dict) -> dict:
-    """A test view after short training, at several sizes, without and with the textures."""
+    """Measure a test view after short training, at several sizes, without and with the textures."""
     scene, system = load_case(case)
     model = a2tg_jax.fit(scene, system, progress=False).model
     camera, settings = scene.test[0].camera, a2tg_jax.RenderSettings(tile_size=system.tile_size)
@@ -45,7 +45,7 @@ def measure_trained(case: dict) -> dict:
 
 
 def load_case(case: dict) -> tuple[a2tg_jax.Scene, A2tg]:
-    """The scene, and a short training of it."""
+    """Return the scene and a system for a short training."""
     scene = a2tg_jax.load_scene(pathlib.Path(case["scene"]), downscale=case["downscale"])
     stage1, stage2 = case["iterations"]
     system = dataclasses.replace(
@@ -58,6 +58,6 @@ def load_case(case: dict) -> tuple[a2tg_jax.Scene, A2tg]:
 
 
 def late_step_ms(history: a2tg_jax.History) -> float:
-    """Milliseconds a step, the median over the last half of the log."""
+    """Return milliseconds a step, the median over the last half of the log."""
     steps = np.diff(history.seconds) / np.diff(history.iteration)
     return float(np.median(steps[-(len(steps) // 2) :])) * 1e3

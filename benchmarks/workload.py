@@ -1,4 +1,4 @@
-"""What is measured: the random workload as this library's arrays, and textures for it."""
+"""The measured workload: random Gaussians as this library's arrays, and textures for them."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from benchmarks.arrays import camera_matrices, random_splats
 
 
 def random_scene(num: int, width: int, height: int) -> tuple[a2tg_jax.Gaussians, a2tg_jax.Camera]:
-    """The Gaussians and the camera of `benchmarks.arrays`."""
+    """Return the Gaussians and the camera of `benchmarks.arrays`."""
     splats = random_splats(num)
     viewmat, K = camera_matrices(width, height)
     as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -24,7 +24,7 @@ def random_scene(num: int, width: int, height: int) -> tuple[a2tg_jax.Gaussians,
 
 
 def random_textures(num: int, kind: str, seed: int = 1):
-    """Textures of one kind: none, 70% 1×1 and 30% up to 4×4 ("mixed"), or all of one size."""
+    """Return textures of one kind: none, 70% 1×1 and 30% up to 4×4 ("mixed"), or all of one size."""
     if kind == "none":
         return None, None
     rng = np.random.default_rng(seed)

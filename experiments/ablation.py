@@ -1,17 +1,14 @@
-"""What upscaling and anisotropy bring, and what they cost: Table 3 of the paper.
-
-python experiments/ablation.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Gain and cost of upscaling and of anisotropy: Table 3 of the paper."""
 
 from collections.abc import Sequence
 
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, then the paper's."""
+    """Write our tables, then the paper's."""
     (grid,) = grids
     results = tables.results_of(grid, lab.records)
     others = [method.label for method in grid.methods]
@@ -21,7 +18,4 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{ours}\n## In the paper\n\n{paper}")
 
 
-EXPERIMENT = Experiment("ablation", ("ablation",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("ablation", ("ablation",), present, __doc__)

@@ -1,13 +1,10 @@
-"""Test views of the systems at equal bytes beside the photograph, where they differ most: the paper's comparison.
-
-python experiments/comparison_pictures.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Test views at equal bytes beside the photograph, at the largest difference: the paper's comparison."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from lab import pictures, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
@@ -18,7 +15,7 @@ ZOOM = 4
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Of each scene whose models are there, the test view, and the part of it, in which the reference gains most."""
+    """Save, for each scene with models, the test view and the part of it in which the reference gains most."""
     (grid,) = grids
     for scene in dict.fromkeys(cell.scene for cell in grid.cells):
         results = [result for result in tables.results_of(grid, lab.records) if result.run.cell.scene == scene]
@@ -29,7 +26,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[str, a2tg.Model]) -> None:
-    """One of the whole view, one of a part; the first model is the reference, the second what it gains over."""
+    """Save the whole view and a part; the first model is the reference, the second the one it is compared with."""
     background = next(iter(models.values())).background
     drawn = {label: a2tg.Renderer(model) for label, model in models.items()}
     rows = []
@@ -50,7 +47,4 @@ def _squared_error(target: np.ndarray, image: np.ndarray) -> float:
     return float(np.mean((target.astype(np.float32) - image.astype(np.float32)) ** 2))
 
 
-EXPERIMENT = Experiment("comparison_pictures", ("pictures",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("comparison_pictures", ("pictures",), present, __doc__)

@@ -1,13 +1,10 @@
-"""What textures learn: the full picture, spherical harmonics only, textures only; and the textures themselves.
-
-python experiments/decomposition.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""The share of textures in a picture: all, spherical harmonics only, textures only; and the textures."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from lab import pictures, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import background_of
 from PIL import Image
@@ -19,7 +16,7 @@ NUM_TEXTURES, ZOOM = 16, 12
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Two pictures of each scene whose model is there, and how much textures bring to its test views."""
+    """Save two pictures of each scene with a model, and write the PSNR that textures add to its test views."""
     (grid,) = grids
     rows = []
     for result in tables.results_of(grid, lab.records):
@@ -41,7 +38,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _textures_picture(model: a2tg.Model) -> Image.Image:
-    """The most varied textures of 4×4, 1×4 and 4×1 texels (rows × columns): RGB above, alpha below."""
+    """Return the most varied textures of 4×4, 1×4 and 4×1 texels (rows × columns): RGB above, alpha below."""
     sheets = [pictures.learned_textures(model, size, NUM_TEXTURES) for size in ((4, 4), (1, 4), (4, 1))]
     sheets = [pictures.enlarged(sheet, ZOOM) for sheet in sheets if sheet.shape[1]]
     width = max((sheet.shape[1] for sheet in sheets), default=1)
@@ -49,7 +46,4 @@ def _textures_picture(model: a2tg.Model) -> Image.Image:
     return Image.fromarray(np.concatenate(padded) if padded else np.full((1, 1, 3), 255, np.uint8))
 
 
-EXPERIMENT = Experiment("decomposition", ("pictures",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("decomposition", ("pictures",), present, __doc__)

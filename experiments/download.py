@@ -1,9 +1,9 @@
-"""Fetches the data sets of the paper: Mip-NeRF 360 (12 GB), Tanks and Temples and Deep Blending (0.7 GB).
+"""Fetch the data sets of the paper: Mip-NeRF 360 (12 GB), Tanks and Temples and Deep Blending (0.7 GB).
 
-python experiments/download.py SCENES
+    python experiments/download.py SCENES
 
-Archives go below SCENES/archives, where an interrupted download is continued, and are unpacked into 360_v2, tandt and
-db, as grids/scales.toml names them. What is there already is left alone.
+Archives are downloaded to SCENES/archives and unpacked into 360_v2, tandt and db, as grids/scales.toml names them. An
+interrupted download continues. Existing data sets are left alone.
 """
 
 import argparse
@@ -19,7 +19,7 @@ ARCHIVES = {
     "https://storage.googleapis.com/gresearch/refraw360/360_v2.zip": "360_v2",
     "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip": ".",
 }
-"""Where each is unpacked, below SCENES."""
+"""Folder below SCENES in which each archive is unpacked, by address."""
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 60
 
@@ -34,14 +34,14 @@ def main() -> None:
 
 
 def fetch_all(scenes: Path, archives: Mapping[str, str]) -> None:
-    """Downloads and unpacks what is not there yet.
+    """Download and unpack the archives that are missing.
 
     Args:
       scenes: folder for the scenes.
       archives: folder below it by address.
 
     Raises:
-      OSError: if an address cannot be read; what came so far stays, and the next call goes on.
+      OSError: if an address cannot be read; the downloaded part stays, and the next call continues.
       ValueError: if an archive would write outside its folder.
     """
     for url, name in archives.items():
@@ -60,7 +60,7 @@ def fetch_all(scenes: Path, archives: Mapping[str, str]) -> None:
 
 
 def download(url: str, path: Path) -> None:
-    """Downloads a file, from where an earlier attempt stopped."""
+    """Download a file, from where an earlier attempt stopped."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     if path.is_file():
@@ -89,7 +89,7 @@ def download(url: str, path: Path) -> None:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks a zip archive.
+    """Unpack a zip archive.
 
     Raises:
       ValueError: if a member's name leads outside the folder.

@@ -1,9 +1,7 @@
 """Frames per second, time of a frame and of training, and size: Table 4 of the paper.
 
-    python experiments/efficiency.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-Times are taken when all runs are finished, one after the other, and kept in efficiency.json: let nothing else run
-beside it. Training time is that of a step with all Gaussians, multiplied by the iterations.
+Times are measured one after the other after all runs, and kept in efficiency.json. Let nothing else run beside the
+measurement. Training time is the time of a step with all Gaussians, multiplied by the iterations.
 """
 
 import dataclasses
@@ -12,7 +10,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import Job
 from lab.measured import Figures, measured_once
@@ -25,7 +23,7 @@ TIMED_ROUNDS = 3
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, measured once on this machine, then the paper's."""
+    """Write our times, measured once on this machine, then the paper's."""
     (grid,) = grids
     text = table_of_times(lab, EXPERIMENT.name, grid)
     columns = (
@@ -39,7 +37,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def table_of_times(lab: Lab, name: str, grid: Grid) -> str:
-    """Size and speed of a grid's models, measured once and kept in NAME.json."""
+    """Return size and speed of a grid's models, measured once and kept in NAME.json."""
     rows = [_row(result, times) for result, times in measured_once(lab, name, grid, _times)]
     header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
     return tables.markdown([*header, "machine"], rows)
@@ -56,7 +54,7 @@ def _row(result: tables.Result, times: Figures) -> list[str]:
 
 
 def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
-    """Frames per second on the test views, and the time of a step in each stage, compiled and warm."""
+    """Return frames per second on the test views, and the time of a step in each stage, compiled and warm."""
     job = result.run.job
     scene = lab.folders.load_scene(job)
     jobs = [dataclasses.replace(job, stage=stage) for stage in range(job.stage + 1)]
@@ -69,7 +67,7 @@ def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
 
 
 def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
-    """Of steps that start from what the stage left, with all its Gaussians; the best of some rounds' medians."""
+    """Return the time of a step with all Gaussians of the trained stage: the best median of some rounds."""
     system = dataclasses.replace(job.system, **{f"stage{stage}_iterations": TIMED_ITERATIONS for stage in (1, 2)})
     start = a2tg.load_model(lab.folders.model(job if job.stage == 0 else dataclasses.replace(job, stage=0)))
     paces = []
@@ -79,7 +77,4 @@ def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
     return min(paces)
 
 
-EXPERIMENT = Experiment("efficiency", ("efficiency",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("efficiency", ("efficiency",), present, __doc__)

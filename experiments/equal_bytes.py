@@ -1,29 +1,27 @@
-"""The best picture for the bytes: every method fills the same bytes, from few to many.
-
-python experiments/equal_bytes.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Quality of every method at equal bytes, from few to many."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 from a2tg_jax.results.figures import save_figure
 
 GRIDS = ("equal_bytes", "equal_bytes_again", "equal_bytes_more", "equal_bytes_many")
-FIGURES = (("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
+FIGURES = (("psnr", "test PSNR, dB"), ("lpips", "test LPIPS"))
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Quality at each size, what each method gains over the reference, and a chart."""
+    """Write the gain of each method over the reference, quality at each size, and a chart of the means."""
     grid = grids[0]
     results = unique(result for own in grids for result in tables.results_of(own, lab.records))
     parts = [
         f"# {grid.title}",
-        f"dB above {grid.reference.label}, mean over scenes and seeds that both have (of how many), test views. "
-        f"The scene held out counts with the others.\n\n{gains(results, grid.reference.label)}",
+        f"dB · LPIPS above {grid.reference.label}, test views: averaged over the seeds of a scene, then over scenes, "
+        f"with the 95 % t interval over scenes (number of scenes). The held-out scene counts as the others do.\n\n"
+        f"{gains(results, grid.reference.label)}",
         *(_quality(grid, seed, results) for seed in sorted({result.run.cell.seed for result in results})),
     ]
     lab.write(EXPERIMENT.name, "\n\n".join(part.strip() for part in parts) + "\n")
@@ -31,63 +29,68 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _quality(grid: Grid, seed: int, results: Sequence[tables.Result]) -> str:
-    """Seeds apart: not every method was trained from each."""
+    """Return quality from one seed; not every method was trained from each."""
     own = [result for result in results if result.run.cell.seed == seed]
     return f"## Seed {seed}\n\n{tables.quality_tables(grid, own)}"
 
 
 def unique(results: Iterable[tables.Result]) -> list[tables.Result]:
-    """Each run once, smallest bytes first; grids share that of the reference."""
+    """Return each run once, smallest budget first; grids share the runs of the reference."""
     found = {(result.run.cell, result.label): result for result in results}
     return sorted(found.values(), key=lambda result: result.run.cell.budget or 0.0)
 
 
 def by_budget(results: Sequence[tables.Result]) -> dict[str, dict[float, list[tables.Result]]]:
-    """Results by method and budget."""
+    """Return the results by method and budget."""
     groups: dict[str, dict[float, list[tables.Result]]] = {}
     for result in results:
         groups.setdefault(result.label, {}).setdefault(result.run.cell.budget or 0.0, []).append(result)
     return groups
 
 
+def at_budget(results: Sequence[tables.Result], budget: float) -> list[tables.Result]:
+    """Return the results in so many MB."""
+    return [result for result in results if (result.run.cell.budget or 0.0) == budget]
+
+
 def gains(results: Sequence[tables.Result], reference: str) -> str:
-    """A row a method, a column a budget."""
+    """Return a table with a row a method and a column a budget."""
     budgets = sorted({result.run.cell.budget or 0.0 for result in results})
-    base = {result.run.cell: result for result in results if result.label == reference}
     rows = []
-    for label, sizes in by_budget(results).items():
+    for label in by_budget(results):
         if label != reference:
-            found = [[(r, base[r.run.cell]) for r in sizes.get(size, ()) if r.run.cell in base] for size in budgets]
-            shown = [_told(pairs) for pairs in found]
-            means = [np.mean([a["psnr"] - b["psnr"] for a, b in pairs]) for pairs in found if pairs]
-            rows.append([label, *shown, f"{np.mean(means):+.2f}" if len(means) == len(budgets) else tables.MISSING])
+            found = [at_budget(results, budget) for budget in budgets]
+            shown = [told_gain(own, label, reference) for own in found]
+            means = [tables.gains_by_scene(own, label, reference, "psnr").values() for own in found]
+            average = np.mean([np.mean(list(own)) for own in means]) if all(means) else float("nan")
+            rows.append([label, *shown, tables.signed(float(average), 2)])
     return tables.markdown(["method", *(f"{size:g} MB: dB · LPIPS" for size in budgets), "mean"], rows)
 
 
-def _told(pairs: Sequence[tuple[tables.Result, tables.Result]]) -> str:
-    if not pairs:
+def told_gain(results: Sequence[tables.Result], label: str, other: str) -> str:
+    """Return the gain in dB with its interval, the gain in LPIPS, and the number of scenes."""
+    psnr, lpips = (tables.gains_by_scene(results, label, other, figure).values() for figure in ("psnr", "lpips"))
+    if not psnr:
         return tables.MISSING
-    decibels, distance = (np.mean([a[figure] - b[figure] for a, b in pairs]) for figure in ("psnr", "lpips"))
-    lpips = tables.MISSING if np.isnan(distance) else f"{distance:+.3f}"
-    return f"{decibels:+.2f} · {lpips} ({len(pairs)})"
+    distance = tables.signed(tables.over_scenes(lpips).mean, 3)
+    return f"{tables.over_scenes(psnr).told(2)} · {distance} ({len(psnr)})"
 
 
 def panels(results: Sequence[tables.Result]) -> list:
-    """Of each scene PSNR, SSIM and LPIPS against bytes, of the first seed, from which every method was trained."""
-    first = min((result.run.cell.seed for result in results), default=0)
+    """Return curves of PSNR and LPIPS against bytes: means over the scenes, if a method was trained on all of them."""
+    scenes = {result.run.cell.scene for result in results}
     found = []
-    for column in dict.fromkeys(result.column for result in results):
-        own = by_budget([result for result in results if result.column == column and result.run.cell.seed == first])
-        for figure, told in FIGURES:
-            curves = {
-                label: [(tables.mean(group, "mb"), tables.mean(group, figure)) for group in sizes.values()]
-                for label, sizes in own.items()
-            }
-            found.append((column, curves, "MB", told))
+    for figure, told in FIGURES:
+        curves = {
+            label: [
+                (tables.mean(group, "mb"), tables.mean(group, figure))
+                for group in sizes.values()
+                if {result.run.cell.scene for result in group} == scenes
+            ]
+            for label, sizes in by_budget(results).items()
+        }
+        found.append((f"mean of {len(scenes)} scenes", curves, "MB", told))
     return found
 
 
-EXPERIMENT = Experiment("equal_bytes", GRIDS, present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("equal_bytes", GRIDS, present, __doc__)

@@ -1,12 +1,9 @@
-"""PSNR against memory, and memory against the number of Gaussians: the line charts of the paper.
-
-python experiments/memory_charts.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""PSNR against memory, and memory against the number of Gaussians: the line charts of the paper."""
 
 from collections.abc import Sequence
 
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 from a2tg_jax.results.figures import save_figure
@@ -15,7 +12,7 @@ METHODS = ("2DGS*-MCMC", "Textured Gaussians*", "A²TG", "A²TG, as quick has it
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """One chart of quality a column of scenes, and one of memory."""
+    """Save a chart of quality for each column of scenes, and one of memory."""
     results = list(
         {id(result.record): result for grid in grids for result in tables.results_of(grid, lab.records)}.values()
     )
@@ -31,8 +28,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> list[plots.Point]:
-    """Of a method, one for each number of Gaussians of the cells and each way to choose its own: means over scenes and
-    seeds."""
+    """Return a method's points, means over scenes, for each number of Gaussians and each way to choose its own."""
     groups: dict[tuple[int, bool], list[tables.Result]] = {}
     for result in results:
         if result.run.method.label == label:
@@ -40,7 +36,4 @@ def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> lis
     return [(tables.mean(group, x), tables.mean(group, y)) for group in groups.values()]
 
 
-EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present, __doc__)

@@ -1,8 +1,6 @@
-"""How small the files of models are: each choice of bits, the smallest file within a loss, PSNR against bytes on disk.
+"""Sizes of model files: each choice of bits, the smallest file within a loss, PSNR against bytes on disk.
 
-    python experiments/on_disk.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-What was measured is kept in on_disk.json. A choice is made by PSNR on training views and reported on test views.
+Figures are kept in on_disk.json. Choices are made by PSNR on training views and reported on test views.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import Figures, measured_once
@@ -22,12 +20,12 @@ from a2tg_jax.io.compact import GROUPS, bytes_by_part, decode_model, encode_mode
 from a2tg_jax.results.figures import save_figure
 
 MAX_LOSSES = (0.02, 0.05, 0.1, 0.3, 1.0)
-"""In dB on training views: a point of a curve each."""
+"""Largest losses in dB on training views, a point of a curve each."""
 REPORTED = "0.05"
 CODER_CHOICES = ("smallest", *CODERS)
 TRIED = {**LADDER, "sh_rest": (*LADDER["sh_rest"], "float16"), "texels": (*LADDER["texels"], "float16")}
 PARTS = {"sh": ("sh_",), "texels": ("texel_", "sizes"), "cameras": ("origin_",)}
-"""Parts of a file that are told together, by what their names begin with."""
+"""Parts of a file that are counted together, with the first letters of their names."""
 PUBLISHED = (
     "Published figures are of other scenes, and photographs of full size: HAC has 27.77 dB in 21.9 MB and 27.53 dB in "
     "15.3 MB as means over Mip-NeRF 360."
@@ -35,7 +33,7 @@ PUBLISHED = (
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Tables and curves of the models that are there, each measured once."""
+    """Write tables and curves of the available models, each measured once."""
     (grid,) = grids
     found = measured_once(lab, EXPERIMENT.name, grid, _measure)
     parts = [
@@ -52,7 +50,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, Any]:
-    """All figures of a model."""
+    """Return all figures of a model."""
     scene = lab.folders.load_scene(result.run.job)
     background = background_of(scene)
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
@@ -101,7 +99,7 @@ def _files(found: Sequence[tuple[tables.Result, Figures]]) -> str:
 
 
 def _kept(figures: Mapping[str, Any], best: Mapping[str, Any]) -> str:
-    """The choices for the groups that the model has."""
+    """Return the choices for the groups that the model has."""
     groups = dict.fromkeys(group for trial in figures["trials"] for group in trial["kept"])
     return ", ".join(f"{group} {best['kept'][group]}" for group in groups)
 
@@ -122,7 +120,7 @@ def _parts(found: Sequence[tuple[tables.Result, Figures]]) -> str:
 
 
 def _shares(parts: Mapping[str, int]) -> dict[str, float]:
-    """Of the bytes of a file, by part."""
+    """Return the share of a file's bytes by part."""
     shares: dict[str, float] = {}
     for name, size in parts.items():
         together = next((label for label, starts in PARTS.items() if name.startswith(starts)), name)
@@ -139,7 +137,7 @@ def _coders(found: Sequence[tuple[tables.Result, Figures]]) -> str:
 
 
 def _choices(found: Sequence[tuple[tables.Result, Figures]]) -> str:
-    """Size relative to the finest of a model's group, and losses."""
+    """Return sizes relative to the finest choice, and losses."""
     points: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for _, figures in found:
         finest = max(trial["bytes"] for trial in figures["trials"])
@@ -155,7 +153,7 @@ def _choices(found: Sequence[tuple[tables.Result, Figures]]) -> str:
 
 
 def _panels(found: Sequence[tuple[tables.Result, Figures]]) -> list[tuple[str, dict[str, list[plots.Point]], str, str]]:
-    """PSNR on test views against kB on disk, a chart for each scene and a curve for each model."""
+    """Return PSNR on test views against kB on disk, a chart for each scene and a curve for each model."""
     panels: dict[str, dict[str, list[plots.Point]]] = {}
     for result, figures in found:
         curve = [
@@ -168,7 +166,4 @@ def _panels(found: Sequence[tuple[tables.Result, Figures]]) -> list[tuple[str, d
     return [(scene, curves, "kB on disk", "test PSNR, dB") for scene, curves in panels.items()]
 
 
-EXPERIMENT = Experiment("on_disk", ("on_disk",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("on_disk", ("on_disk",), present, __doc__)

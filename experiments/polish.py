@@ -1,8 +1,6 @@
-"""What least squares on colours and texels, shapes being held, brings to models that are trained: no byte more.
+"""Gain of least squares on the colours and texels of trained models, at fixed shapes and bytes.
 
-    python experiments/polish.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-What was measured is kept in polish.json.
+Figures are kept in polish.json.
 """
 
 import time
@@ -10,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
@@ -21,7 +19,7 @@ NUM_STEPS = (2, 5, 10)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table of the models that are there, each measured once."""
+    """Write a table of the available models, each measured once."""
     (grid,) = grids
     rows, gains = [], []
     for result, found in measured_once(lab, EXPERIMENT.name, grid, _measure):
@@ -38,7 +36,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, dict[str, float]]:
-    """Quality before, and after so many steps."""
+    """Return quality before and after each number of steps."""
     scene = lab.folders.load_scene(result.run.job)
     background = background_of(scene)
     found = {"0": _quality(lab, scene, model, background)}
@@ -61,7 +59,4 @@ def _told(after: Mapping[str, float], before: Mapping[str, float]) -> str:
     return f"{psnr:+.2f} · {tables.MISSING if np.isnan(lpips) else f'{lpips:+.3f}'} · {train:+.2f}"
 
 
-EXPERIMENT = Experiment("polish", ("polish",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("polish", ("polish",), present, __doc__)

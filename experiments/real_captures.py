@@ -1,4 +1,4 @@
-"""What masks, exposures and refined poses win back where a capture is disturbed by known amounts, and what they cost.
+"""Gain and cost of masks, exposures and refined poses on captures that are disturbed by known amounts.
 
     python experiments/real_captures.py --out OUT                       # the built-in scene
     python experiments/real_captures.py --out OUT --scenes SCENES       # and fox and snowmiku in that folder
@@ -28,7 +28,7 @@ from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training.corrections import exposed
 
 DEGREES, SHARE = 0.5, 0.01
-"""By which each camera is turned and moved, the latter in units of its distance from what it looks at (the median)."""
+"""Angle and distance by which each camera moves; the latter in units of the median distance to the scene."""
 SYSTEM = dataclasses.replace(
     a2tg.Gaussians2dMcmc.preset("quick"),
     stage1_iterations=1_000,
@@ -41,7 +41,7 @@ Scene = a2tg.Scene
 
 
 def each_view(scene: Scene, change: Callable[[np.random.Generator, a2tg.View], a2tg.View], *, has_test: bool) -> Scene:
-    """The scene with its training views changed, and its test views too where that is asked for."""
+    """Return the scene with its training views changed, and its test views too if requested."""
     rng = np.random.default_rng(0)
     train = tuple(change(rng, view) for view in scene.train)
     return dataclasses.replace(
@@ -50,7 +50,7 @@ def each_view(scene: Scene, change: Callable[[np.random.Generator, a2tg.View], a
 
 
 def with_poses(rng: np.random.Generator, view: a2tg.View) -> a2tg.View:
-    """A camera turned by `DEGREES` about a random axis and moved by `SHARE` in a random direction."""
+    """Return a view, its camera turned by `DEGREES` about a random axis and moved by `SHARE` in a random direction."""
     directions = rng.normal(size=(2, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     twist = (directions * [[np.deg2rad(DEGREES)], [SHARE]]).ravel()
@@ -59,14 +59,14 @@ def with_poses(rng: np.random.Generator, view: a2tg.View) -> a2tg.View:
 
 
 def with_exposure(rng: np.random.Generator, view: a2tg.View) -> a2tg.View:
-    """A photograph with each channel times 0.8 to 1.25 and up to 0.05 brighter or darker."""
+    """Return a photograph with each channel times 0.8 to 1.25 and up to 0.05 brighter or darker."""
     gains, offsets = np.exp(rng.uniform(-1, 1, 3) * np.log(1.25)), rng.uniform(-0.05, 0.05, 3)
     color = np.clip(view.image / 255 * gains + offsets, 0, 1)
     return dataclasses.replace(view, picture=np.rint(255 * color).astype(np.uint8))
 
 
 def with_passers_by(rng: np.random.Generator, view: a2tg.View, *, is_masked: bool) -> a2tg.View:
-    """A photograph before which two rectangles of noise stand, each a fifth of its sides; masked or not."""
+    """Return a photograph with two rectangles of noise, each a fifth of its sides; masked or not."""
     image, mask = view.image.copy(), np.ones(view.picture.size, bool)
     height, width = view.picture.size[0] // 5, view.picture.size[1] // 5
     for _ in range(2):
@@ -78,7 +78,7 @@ def with_passers_by(rng: np.random.Generator, view: a2tg.View, *, is_masked: boo
 
 
 def disturbances(scene: Scene) -> dict[str, Scene]:
-    """The scene as it is, and disturbed in each way."""
+    """Return the scene as it is, and disturbed in each way."""
     return {
         "as it is": scene,
         "poses disturbed": each_view(scene, with_poses, has_test=True),
@@ -99,13 +99,13 @@ TRAININGS = {
     "fox": (("as it is", ""), ("as it is", "poses"), ("poses disturbed", ""), ("poses disturbed", "poses")),
     "snowmiku": (("as it is", ""), ("as it is", "exposure")),
 }  # fmt: skip
-"""Of each scene, how it is disturbed and what is learned."""
+"""Disturbance and learned correction of each training, by scene."""
 ITERATIONS = {"snowmiku": 3_000}
-"""It has more views."""
+"""Iterations of scenes with more views."""
 
 
 def pose_error(viewmats: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """Means of the angle (degrees) and the distance of cameras from their true ones, after the best similarity."""
+    """Return the mean angle (degrees) and distance of cameras from their true ones, after the best similarity."""
     centers, wanted = camera_centers(viewmats), camera_centers(true)
     a, b = centers - centers.mean(axis=0), wanted - wanted.mean(axis=0)
     left, values, right = np.linalg.svd(b.T @ a)
@@ -120,7 +120,7 @@ def viewmats_of(views: tuple[a2tg.View, ...]) -> np.ndarray:
 
 
 def measured(scene: Scene, disturbed: Scene, variant: str, iterations: int) -> dict[str, float]:
-    """One training: PSNR of test views as they are, up to exposure, up to pose; how far training cameras are off."""
+    """Train once; return PSNR of test views as they are, up to exposure, up to pose, and errors of training cameras."""
     system = dataclasses.replace(SYSTEM, stage1_iterations=iterations, **VARIANTS[variant])
     model = a2tg.fit(disturbed, system, progress=False, session=a2tg.Session(tidy_memory)).model
     refined, test = refined_views(disturbed.train, model), disturbed.test
@@ -135,7 +135,7 @@ def measured(scene: Scene, disturbed: Scene, variant: str, iterations: int) -> d
 
 
 def with_neighbours(test: Sequence[a2tg.View], model: a2tg.Model) -> dict[str, float]:
-    """PSNR of test views under the mean exposure of the training views before and after them, where there are any."""
+    """Return PSNR of test views under the mean exposure of neighbouring training views; empty without exposures."""
     origin = model.origin
     if origin is None or "exposure" not in origin.corrections:
         return {}
@@ -151,7 +151,7 @@ def with_neighbours(test: Sequence[a2tg.View], model: a2tg.Model) -> dict[str, f
 
 
 def load(name: str, folder: Path | None) -> Scene:
-    """The built-in scene at 160 × 120; one of the folder at a quarter."""
+    """Return the built-in scene at 160×120, or one of the folder at a quarter of its size."""
     if name == "synthetic":
         return a2tg.synthetic_scene(width=160, height=120)
     assert folder is not None
@@ -159,7 +159,7 @@ def load(name: str, folder: Path | None) -> Scene:
 
 
 def table(found: Mapping[str, Mapping[str, float]]) -> str:
-    """Every training in a row."""
+    """Return a table with a row for every training."""
     names = {"test": "test", "test_neighbours": "neighbours'", "test_color_fit": "fitted", "test_aligned": "aligned"}
     header = ["scene", "capture", "learned", *names.values(), "poses off by"]
     rows = []

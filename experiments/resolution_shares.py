@@ -1,12 +1,9 @@
-"""How many Gaussians have textures of each resolution, and where: square ones blue, others red, as in the paper.
-
-python experiments/resolution_shares.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Share of Gaussians with textures of each resolution, and their places: square ones blue, others red."""
 
 from collections.abc import Sequence
 
 from lab import pictures, plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
@@ -15,7 +12,7 @@ from a2tg_jax.results.images import save_picture, to_uint8
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table and a chart of the shares; a picture of each scene whose model is there."""
+    """Write a table and a chart of the shares, and a picture of each scene with a model."""
     results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
     label = grids[0].reference.label
     results = [result for result in results if result.label == label and not result.run.cell.seed]
@@ -41,13 +38,13 @@ def _place(result: tables.Result) -> str:
 
 
 def _shares(result: tables.Result) -> dict[str, float]:
-    """Of the Gaussians, by resolution."""
+    """Return the share of Gaussians by resolution."""
     counts = result.record["sizes"]
     return {size: count / sum(counts.values()) for size, count in counts.items()}
 
 
 def _picture(lab: Lab, result: tables.Result) -> None:
-    """The first of the training's cameras, as it is and by the shape of the textures."""
+    """Save the view of the first camera, as it is and coloured by the shape of the textures."""
     model = lab.model(result)
     if model is None:
         return
@@ -57,7 +54,4 @@ def _picture(lab: Lab, result: tables.Result) -> None:
     save_picture(lab.pages / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
 
 
-EXPERIMENT = Experiment("resolution_shares", ("ablation", "pictures"), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("resolution_shares", ("ablation", "pictures"), present, __doc__)

@@ -1,15 +1,13 @@
-"""What textures that shrink save: bytes at 0.02 and 0.05 dB on training views, and what that loses on test views.
+"""Bytes saved by shrinking textures within 0.02 and 0.05 dB on training views, and the loss on test views.
 
-    python experiments/shrink.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-What was measured is kept in shrink.json.
+Figures are kept in shrink.json.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
@@ -20,7 +18,7 @@ MAX_LOSSES = (0.02, 0.05)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table of the models that are there, each measured once."""
+    """Write a table of the available models, each measured once."""
     (grid,) = grids
     rows = []
     for result, figures in measured_once(lab, EXPERIMENT.name, grid, _measure):
@@ -34,7 +32,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, Any]:
-    """Bytes and quality before and after."""
+    """Return bytes and quality before and after."""
     scene = lab.folders.load_scene(result.run.job)
     background = background_of(scene)
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
@@ -61,7 +59,4 @@ def _told(after: dict[str, Any], before: dict[str, Any]) -> str:
     return f"{_kilobytes(after)} kB: {after['psnr'] - before['psnr']:+.2f} · {lpips}"
 
 
-EXPERIMENT = Experiment("shrink", ("shrink",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("shrink", ("shrink",), present, __doc__)

@@ -1,19 +1,16 @@
-"""Textures of one size against textures of at most that size: the table and the charts of the paper's appendix.
-
-python experiments/texture_resolution.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-"""
+"""Textures of one size against textures of at most that size: the paper's appendix."""
 
 from collections.abc import Sequence
 
 from lab import plots, tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 from a2tg_jax.results.figures import save_figure
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Ours, then the paper's; and PSNR and LPIPS against memory."""
+    """Write our tables, then the paper's, and charts of PSNR and LPIPS against memory."""
     (grid,) = grids
     results = tables.results_of(grid, lab.records)
     paper = tables.paper_table(EXPERIMENT.name, "gaussians", tables.QUALITY_COLUMNS, "Deep Blending")
@@ -29,7 +26,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _curves(results: Sequence[tables.Result], figure: str) -> dict[str, list[plots.Point]]:
-    """Of each method and number of Gaussians, the points of its resolutions, means over scenes."""
+    """Return the points of all resolutions, means over scenes, by method and number of Gaussians."""
     points: dict[tuple[str, int, str], list[tables.Result]] = {}
     for result in results:
         method, _, resolution = result.label.rpartition(", ")
@@ -40,7 +37,4 @@ def _curves(results: Sequence[tables.Result], figure: str) -> dict[str, list[plo
     return curves
 
 
-EXPERIMENT = Experiment("texture_resolution", ("texture_resolution",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("texture_resolution", ("texture_resolution",), present, __doc__)

@@ -1,11 +1,9 @@
-"""Which Gaussians gain by a texture, and what predicts it: training goes on with and without textures of some of them.
+"""Gain of textures on groups of Gaussians, and the criteria that predict it.
 
-    python experiments/upscale_gains.py --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-
-A model without textures is trained on, once as it is, and once for each group of its Gaussians, which get 2×2 texels:
-the gain of a group is what its textures bring on the views that are trained on. Groups are the quarters of every
-criterion's order, so that all are of one size, and take the same bytes. A criterion is as good as its mean over a group
-ranks the groups by their gain. What was measured is kept in upscale_gains.json.
+Training continues from a model without textures, once as it is and once for each group of Gaussians, which gets 2×2
+texels. The gain of a group is the PSNR that its textures add on training views. Groups are the quarters of each
+criterion's order, so all have one size and take the same bytes. A criterion is good if its mean over a group ranks the
+groups by their gain. Figures are kept in upscale_gains.json.
 """
 
 import dataclasses
@@ -18,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from lab import tables
-from lab.cli import Experiment, Lab, main
+from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
@@ -38,9 +36,9 @@ from a2tg_jax.training.losses import photometric_loss
 
 ITERATIONS = 300
 NUM_PARTS = 4
-"""Groups that a criterion's order is cut into."""
+"""Number of groups in a criterion's order."""
 SEEDS = (0, 1, 2)
-"""Of training without textures: their spread is the noise."""
+"""Seeds of training without textures, whose spread is the noise."""
 SIZE = (2, 2)
 CRITERIA = {
     "paper": "gradient by position (the paper's)",
@@ -56,10 +54,10 @@ CRITERIA = {
 
 @event
 class GrowRows(HostEvent):
-    """Gives some Gaussians textures of one size after the first iteration."""
+    """Event that gives some Gaussians textures of one size after the first iteration."""
 
     rows: Any
-    """[N] bool."""
+    """Whether each Gaussian gets a texture, [N] bool."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return (1,)
@@ -73,7 +71,7 @@ class GrowRows(HostEvent):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trial(a2tg.System):
-    """One stage that goes on from a model, with textures of the rows; with none, Gaussians alone are trained."""
+    """One stage that continues from a model with textures of some rows, or without textures if `rows` is None."""
 
     rows: Any = dataclasses.field(default=None, hash=False)
 
@@ -85,7 +83,7 @@ class Trial(a2tg.System):
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """A table of rank correlations, a column a model."""
+    """Write a table of rank correlations, a column a model."""
     (grid,) = grids
     found = measured_once(lab, EXPERIMENT.name, grid, _measure, first_stage=True)
     header = ["criterion", *(f"{result.run.cell.scene.label}, {result.run.cell.budget:g} MB" for result, _ in found)]
@@ -105,7 +103,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
-    """Scores of all groups, and what each gains."""
+    """Return scores and gain of every group."""
     scene = lab.folders.load_scene(result.run.job)
     options = result.run.job.system
     system = Trial(**{field.name: getattr(options, field.name) for field in dataclasses.fields(a2tg.System)})
@@ -127,7 +125,7 @@ def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
 
 
 def _quality(scene: a2tg.Scene, model: Model, system: Trial) -> tuple[float, float]:
-    """PSNR on views trained on and on test views after a trial."""
+    """Return PSNR on training views and on test views after a trial."""
     trained = fit_stage(scene, system, 0, model, progress=False).model
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
     background = background_of(scene)
@@ -149,7 +147,7 @@ def _quarters(figures: Mapping[str, Any], name: str) -> str:
 
 
 def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
-    """[N] of each criterion, over all training views (host)."""
+    """Return each criterion, [N], over all training views (host)."""
     sizes = np.full((model.num, 2), SIZE)
     textures, layout = a2tg.allocate_textures(sizes)
     background = jnp.asarray(background_of(scene) or (0.0, 0.0, 0.0))
@@ -165,7 +163,7 @@ def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
 
 
 def _look(model: Model, camera, target: Array, background: Array, key: Array, *, settings) -> dict[str, Array]:
-    """What one view adds to the criteria, of texels as [rows, 4] in the order of the only bucket."""
+    """Return one view's terms of the criteria; texels are [rows, 4] in the order of the only bucket."""
     probe = jnp.zeros((model.num, 4), model.gaussians.means.dtype)
 
     def draw(texels: Array, probe: Array) -> Array:
@@ -203,7 +201,4 @@ def _scores(model: Model, layout, sums: Mapping[str, Array]) -> dict[str, Array]
     return {"paper": average, "paper_by_size": average * size, **{name: own[rows] for name, own in by_row.items()}}
 
 
-EXPERIMENT = Experiment("upscale_gains", ("upscale_gains",), present)
-
-if __name__ == "__main__":
-    main([EXPERIMENT], __doc__)
+EXPERIMENT = Experiment("upscale_gains", ("upscale_gains",), present, __doc__)

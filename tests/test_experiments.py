@@ -4,18 +4,21 @@ import concurrent.futures
 import dataclasses
 import json
 import pathlib
+import re
 import shutil
 import subprocess
 import sys
 import time
 
+import equal_bytes
 import numpy as np
 import pytest
 from lab import pages, queue, tables
-from lab.cli import EXPERIMENTS, Lab, parse_arguments
+from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, read_grid, splats_in
-from lab.jobs import Folders, Job, _load_checkpoint
+from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
 from lab.plan import plan_of, seconds_of_step
+from run import experiments
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
@@ -52,11 +55,10 @@ def test_every_grid_names_runs_that_can_be_trained(name, scale):
     assert len(set(places)) == len(places) == at_equal_number + len(grid.cells) * len(grid.at_equal_bytes)
 
 
-def test_every_grid_has_a_script_that_all_runs():
-    from all import NAMES as ALL
-
-    grids = {name for script in ALL for name in __import__(script).EXPERIMENT.grids}
-    assert grids == set(NAMES)
+def test_every_grid_belongs_to_an_experiment_that_says_what_it_shows():
+    known = experiments()
+    assert {name for experiment in known.values() for name in experiment.grids} == set(NAMES)
+    assert all(experiment.summary.endswith(".") for experiment in known.values())
 
 
 def test_methods_of_a_cell_differ_in_what_their_names_say_only():
@@ -284,17 +286,20 @@ def test_what_is_wanted_is_asked_again_after_every_job(folders):
     assert pool.order == ["first", "follows"]
 
 
-def test_an_estimate_of_memory_grows_with_splats_and_texels():
+def test_an_estimate_of_memory_grows_with_splats_and_what_they_show():
     job = next(read_grid("claim", "full").jobs({}))
     small = dataclasses.replace(job, system=next(read_grid("claim", "smoke").jobs({})).system)
     assert queue.BASE_BYTES < queue.estimated_bytes(small) < queue.estimated_bytes(job)
+    plain, billboards = (a2tg.find_system(name).preset("quick") for name in ("gaussians-2d-mcmc", "bbsplat"))
+    assert model_bytes(plain) == plain.densify.cap * 58 * 4
+    assert model_bytes(billboards) >= billboards.densify.cap * 1081 * 4, "pictures of 16×16 RGBA texels"
 
 
 # End to end
 
 
-def call(script, *arguments, **options):
-    command = [sys.executable, str(EXPERIMENTS / f"{script}.py"), "--scale", "smoke", *map(str, arguments)]
+def call(name, *arguments, **options):
+    command = [sys.executable, str(EXPERIMENTS / "run.py"), name, "--scale", "smoke", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
 
 
@@ -365,15 +370,10 @@ def test_submitit_sends_jobs_out(tmp_path):
     [(["--only", "dog"], "no scene 'dog'"), (["--scale", "small", "--scenes", "nowhere"], "nowhere")],
 )
 def test_what_cannot_be_run_is_an_error_that_says_what(arguments, words, tmp_path):
-    command = [
-        sys.executable,
-        str(EXPERIMENTS / "efficiency.py"),
-        "--out",
-        str(tmp_path),
-        "--work",
-        str(tmp_path / "w"),
-    ]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+    command = [sys.executable, str(EXPERIMENTS / "run.py"), "efficiency", "--out", str(tmp_path)]
+    done = subprocess.run(
+        [*command, "--work", str(tmp_path / "w"), *arguments], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1 and words in done.stderr and "Traceback" not in done.stderr
 
 
@@ -381,6 +381,7 @@ def test_what_cannot_be_run_is_an_error_that_says_what(arguments, words, tmp_pat
 
 
 CELL = Cell(SceneAt("fox", "fox", 2), 100, 0, (10, 10))
+GRID = Grid("x", "X", "small", "quick", (CELL,), Method("own", "a2tg"), (), ())
 
 
 def result(label, psnr, seed=0, equal=False, **others):
@@ -402,10 +403,50 @@ def test_gains_have_the_verdict_that_seeds_allow():
 
 
 def test_quality_is_averaged_over_seeds_and_what_is_missing_is_a_dash():
-    grid = Grid("x", "X", "small", "quick", (CELL,), Method("own", "a2tg"), (), ())
-    text = tables.quality_tables(grid, [result("own", 20.0), result("own", 22.0, 1), result("other", 30.0, lpips=None)])
+    text = tables.quality_tables(GRID, [result("own", 20.0), result("own", 22.0, 1), result("other", 30.0, lpips=None)])
     assert "| own | 30,000 | 1,000 | 21.00 / .800 / .200 · 1.00 | 21.00 |" in text
     assert "30.00 / .800 / – · 1.00" in text
+
+
+def at(scene, label, psnr, seed=0, **others):
+    found = result(label, psnr, seed, **others)
+    cell = dataclasses.replace(found.run.cell, scene=SceneAt(scene, scene, 2))
+    return tables.Result(dataclasses.replace(found.run, cell=cell), found.record)
+
+
+def test_a_mean_counts_each_scene_once_however_many_seeds_it_has():
+    results = [at("a", "own", 20.0), at("a", "own", 22.0, 1), at("b", "own", 31.0)]
+    results += [at("a", "other", 19.0), at("a", "other", 20.0, 1), at("b", "other", 31.0)]
+    assert tables.mean(results[:3], "psnr") == 26.0
+    assert tables.gains_by_scene(results, "own", "other", "psnr") == {"a": 1.5, "b": 0.0}
+
+
+def test_an_interval_over_scenes_is_that_of_students_t():
+    """Of four values the half-width is 3.182 standard errors, as tables of t say."""
+    found = tables.over_scenes([1.0, 2.0, 3.0, 6.0])
+    error = np.sqrt(14 / 3 / 4)
+    assert found.mean == 3.0 and found.half_width == pytest.approx(3.18245 * error, rel=1e-5)
+    assert found.told(2) == "+3.00 ± 3.44" and 0.05 < found.p_value < 0.1, "0 is inside the interval"
+    assert tables.over_scenes([2.0, 2.1, 1.9]).p_value < 0.001
+    alone = tables.over_scenes([2.0])
+    assert alone.told(2) == "+2.00" and np.isnan(alone.p_value)
+    assert np.isnan(tables.over_scenes([]).mean) and tables.over_scenes([1.0, np.nan]).told(2) == tables.MISSING
+
+
+def test_lpips_without_weights_is_a_dash_in_every_table():
+    results = [at(scene, label, 20.0, lpips=None) for scene in "ab" for label in ("own", "other")]
+    texts = [tables.gains_table(results, "own", ["other"]), tables.choices_table(results, "own")]
+    texts += [equal_bytes.told_gain(results, "own", "other"), tables.quality_tables(GRID, results)]
+    for text in texts:
+        assert "nan" not in text
+        assert f"· {tables.MISSING}" in text or f"/ {tables.MISSING}" in text
+
+
+def test_experiments_and_benchmarks_have_one_writer_of_tables():
+    folders = (EXPERIMENTS, EXPERIMENTS.parent / "benchmarks")
+    writers = [path for folder in folders for path in folder.rglob("*.py") if "---" in path.read_text(encoding="utf-8")]
+    assert [path.name for path in writers] == ["markdown.py"]
+    assert tables.markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
 
 
 def test_choices_are_compared_with_the_default():
@@ -434,29 +475,54 @@ def test_columns_are_data_sets_and_what_is_missing_in_one_is_told():
     assert "20.00 / .800 / .200 · 1.00 (1 of 2 scenes) | – | – |" in tables.quality_tables(grid, [*results, other])
 
 
-def test_a_page_shows_the_tables_that_it_names(tmp_path):
+def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
+    """The page in place, the appendix from its text."""
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "x.md").write_text("# Title\n\n## Part\n\n| a |\n")
-    page = tmp_path / "page.md"
-    page.write_text("Before.\n\n<!-- results/x.md -->\nold\n<!-- end -->\n\nAfter.\n")
-    assert pages.refresh(page, tmp_path) == ["results/x.md"]
+    for name in ("PAGE", "TEXT", "APPENDIX"):
+        monkeypatch.setattr(pages, name, tmp_path / f"{name}.md")
+    before = "Before.\n\n<!-- results/x.md -->\nold\n<!-- end -->\n\nAfter.\n"
+    pages.PAGE.write_text(before)
+    pages.TEXT.write_text(before)
+    pages.refresh(tmp_path)
     wanted = "Before.\n\n<!-- results/x.md -->\n\n### Part\n\n| a |\n\n<!-- end -->\n\nAfter.\n"
-    assert page.read_text() == wanted == pages.with_tables(wanted, tmp_path)
+    assert pages.PAGE.read_text() == pages.APPENDIX.read_text() == wanted == pages.with_tables(wanted, tmp_path)
+    assert pages.TEXT.read_text() == before and pages.names(wanted) == ["results/x.md"]
 
 
 def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
-    """Every table of docs/results.md, made anew from the records."""
-    page = (EXPERIMENTS.parent / "docs" / "results.md").read_text(encoding="utf-8")
-    assert pages.with_tables(page, EXPERIMENTS) == page
+    """Both pages show the committed tables, and every table made of records is made anew."""
+    shown = set()
+    for page, text in pages.pages().items():
+        assert page.read_text(encoding="utf-8") == text, f"{page} is old: python experiments/run.py appendix"
+        shown |= {pathlib.Path(name).name for name in pages.names(text)}
     made_from_models = {
         "decomposition", "efficiency", "equal_bytes_speed", "on_disk", "polish", "shrink", "upscale_gains",
+        "comparison_pictures",
     }  # fmt: skip
-    for name in {pathlib.Path(name).stem for name in pages.names(page)} - made_from_models:
-        shutil.copy(EXPERIMENTS / "results" / "small" / "records.json", tmp_path)
-        lab = Lab(parse_arguments("", ["--tables-only", "--out", str(tmp_path), "--work", str(tmp_path / "none")]))
-        experiment = __import__(name).EXPERIMENT
-        experiment.present(lab, [lab.grid(grid) for grid in experiment.grids])
-        assert (tmp_path / f"{name}.md").read_text() == (EXPERIMENTS / "results" / "small" / f"{name}.md").read_text()
+    committed = EXPERIMENTS / "results" / "small"
+    shutil.copy(committed / "records.json", tmp_path)
+    arguments = ["--tables-only", "--out", str(tmp_path), "--work", str(tmp_path / "none")]
+    lab = Lab(argument_parser("").parse_args(arguments))
+    for name, experiment in experiments().items():
+        if name not in made_from_models and name != "quick_preset":  # its runs are not among the committed ones
+            experiment.present(lab, [lab.grid(grid) for grid in experiment.grids])
+    made = {path.name for path in tmp_path.glob("*.md")}
+    assert shown == made | {f"{name}.md" for name in made_from_models} - {"comparison_pictures.md"}
+    unshown = {path.name for path in committed.glob("*.md")} - shown
+    assert unshown <= {"quick_preset.md"}, "a table is on no page"
+    for name in made:
+        assert (tmp_path / name).read_text() == (committed / name).read_text(), name
+
+
+def test_every_picture_on_a_page_is_committed_and_every_committed_one_is_on_a_page():
+    folder = EXPERIMENTS / "results" / "small"
+    texts = "".join(path.read_text(encoding="utf-8") for path in pages.pages())
+    shown = set(re.findall(r"\(\.\./experiments/results/small/([\w-]+\.png)\)", texts))
+    assert shown and all((folder / name).is_file() for name in shown)
+    listed = subprocess.run(["git", "ls-files", "."], cwd=folder, capture_output=True, text=True, check=False)
+    if listed.returncode == 0:
+        assert shown == {name for name in listed.stdout.split() if name.endswith(".png")}
 
 
 def test_the_plan_counts_what_is_left():
@@ -465,10 +531,10 @@ def test_the_plan_counts_what_is_left():
     assert everything.startswith("4 stages left") and "180 iterations" in everything
     first = next(grid.jobs({}))
     rest = plan_of([grid], {first.key: record(), first.start.key: record()})
-    assert "0.0 hours" in rest and not rest.startswith("4 ")
+    assert not rest.startswith("4 ") and re.search(r"iterations: [\d.]+ minutes", rest) and "0.0 hours" not in rest
     assert seconds_of_step(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
 
 
 def test_arguments_have_defaults():
-    args = parse_arguments("", [])
+    args = argument_parser("").parse_args([])
     assert args.scale == "small" and args.scenes == pathlib.Path("scenes") and not args.tables_only

@@ -1,1 +1,1 @@
-"""What the experiments share: grids of runs from files, a queue that trains each once, tables beside the paper's."""
+"""Code that the experiments share: grids of runs, a queue that trains each once, tables beside the paper's."""

@@ -1,4 +1,4 @@
-"""What an experiment is, and the command line of all of them: what to run, where, and what is written in the end."""
+"""Experiments and their command line: what to run, where, and what is written at the end."""
 
 import argparse
 import contextlib
@@ -22,15 +22,15 @@ from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 MEMORY_SHARE = 0.8
-"""Of the machine's, unless --memory-gb says otherwise."""
+"""Default share of the machine's memory for all jobs together."""
 MOST_SENT = 1_000
-"""Jobs that wait in a cluster's queue at a time."""
+"""Largest number of jobs in a cluster's queue."""
 CLUSTER_DEFAULTS = {"slurm": {"timeout_min": 24 * 60, "gpus_per_node": 1, "cpus_per_task": 4, "mem_gb": 32}}
-"""What --cluster-parameter may say otherwise; submitit's own are five minutes and no GPU."""
+"""Defaults of --cluster-parameter; submitit's own are five minutes and no GPU."""
 
 
 class Lab:
-    """Folders, pool and records of one call."""
+    """Folders, pool and records of one call of the command line."""
 
     def __init__(self, args: argparse.Namespace):
         self.args = args
@@ -43,11 +43,11 @@ class Lab:
         self.records: dict[str, Record] = self._all_records()
 
     def grid(self, name: str) -> Grid:
-        """A grid, with the scenes that are wanted."""
+        """Return a grid with the requested scenes."""
         return read_grid(name, self.scale, scenes=self.args.only, held_out=not self.args.without_held_out)
 
     def run(self, grids: Sequence[Grid]) -> list[Failure]:
-        """Runs what is not finished of the grids, unless only tables are wanted."""
+        """Run the unfinished jobs of the grids, unless only tables are requested."""
         if self.args.tables_only:
             return []
         self._check_inputs(grids)
@@ -59,34 +59,34 @@ class Lab:
 
     @property
     def is_partial(self) -> bool:
-        """Whether scenes are left out."""
+        """Return whether scenes are left out."""
         return bool(self.args.only or self.args.without_held_out)
 
     @property
     def pages(self) -> Path:
-        """Where tables and pictures go: a folder of their own where only some scenes are wanted. It is made."""
+        """Return the folder of tables and pictures, and make it; some scenes alone have a folder of their own."""
         folder = self.out / "partial" if self.is_partial else self.out
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
     def model(self, result: Result, *, first_stage: bool = False) -> a2tg.Model | None:
-        """What a run, or its first stage, left; None, and a line that says so, where it is gone."""
+        """Return the model of a run, or of its first stage; print a line and return None if it is missing."""
         job = dataclasses.replace(result.run.job, stage=0) if first_stage else result.run.job
         path = self.folders.model(job)
         if path.is_file():
             return a2tg.load_model(path)
-        print(f"{result.label} on {result.run.cell.scene.label}: left out, for its model is not in {path.parent}")
+        print(f"{result.label} on {result.run.cell.scene.label}: left out, its model is missing in {path.parent}")
         return None
 
     def write(self, name: str, text: str) -> None:
-        """Prints a page and keeps it among the results."""
+        """Print a page and save it among the results."""
         path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
         print(f"\n{text}\n{path}", flush=True)
 
     def _check_inputs(self, grids: Sequence[Grid]) -> None:
-        """Before anything is trained: the scenes and the weights are there."""
+        """Raise if a scene is missing, before anything is trained."""
         for path in {cell.scene.path for grid in grids for cell in grid.cells} - {SYNTHETIC}:
             if not (self.folders.scenes / path).is_dir():
                 raise ValueError(
@@ -103,7 +103,7 @@ class Lab:
         )
 
     def _save(self) -> None:
-        """Adds the records to those in the results, where another program may have added some."""
+        """Merge the records into the results, to which another program may have added some."""
         self.out.mkdir(parents=True, exist_ok=True)
         with _locked(self.out / ".lock"):
             write_json(self._file, dict(sorted({**self._kept(), **self.records}.items())))
@@ -112,7 +112,7 @@ class Lab:
         return read_json(self._file) if self._file.is_file() else {}
 
     def _all_records(self) -> dict[str, Record]:
-        """Those of the results, and those of jobs that nobody was there to collect."""
+        """Return the records of the results and of jobs that were never collected."""
         own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
         return {**own, **self._kept()}
 
@@ -129,18 +129,24 @@ class Lab:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A table or figure: the grids that it needs, and what it makes of their results."""
+    """A table or figure: the grids that it needs, and how it presents their results."""
 
     name: str
     grids: tuple[str, ...]
     """Names of files in `grids/`."""
     present: Callable[[Lab, Sequence[Grid]], None]
-    """Called when the grids were run, also where runs are missing."""
+    """Function called after the grids were run, even if runs are missing."""
+    description: str | None
+    """Text whose first line says what the experiment shows."""
+
+    @property
+    def summary(self) -> str:
+        """Return the first line of the description."""
+        return (self.description or "").strip().partition("\n")[0]
 
 
-def main(experiments: Sequence[Experiment], description: str) -> Lab | None:
-    """Runs all that some experiments need, in one queue, and presents each; None where only a plan was wanted."""
-    args = parse_arguments(description)
+def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace) -> Lab | None:
+    """Run all jobs of some experiments in one queue and present each; return None if only a plan was requested."""
     try:
         lab = Lab(args)
         names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
@@ -159,7 +165,7 @@ def main(experiments: Sequence[Experiment], description: str) -> Lab | None:
             errors.append(f"{experiment.name}: {error}")
     if errors:
         told = "\n".join(f"  {error}" for error in errors)
-        sys.exit(f"error: not all could be done; what needs it is missing. Call again to retry:\n{told}")
+        sys.exit(f"error: some jobs failed, and what needs them is missing. Call again to retry:\n{told}")
     return lab
 
 
@@ -169,7 +175,7 @@ def _tell_failure(failure: Failure) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """One program at a time, where the system can see to that."""
+    """Exclude other programs, if the operating system can."""
     try:
         import fcntl
     except ImportError:
@@ -180,24 +186,24 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
-def parse_arguments(description: str, arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options that all experiments have."""
+def argument_parser(description: str) -> argparse.ArgumentParser:
+    """Return a parser of the options that all experiments have."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--scenes", type=Path, default=Path("scenes"), help="folder of scenes; what lies in it: grids/scales.toml")
+    add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
     add("--scale", choices=("full", "small", "smoke"), default="small", help="full is the paper's, for a GPU")
-    add("--only", nargs="+", metavar="SCENE", help="these scenes of the scale")
-    add("--without-held-out", action="store_true", help="leave out the scenes on which nothing may be chosen")
-    add("--out", type=Path, help="results: records, tables, plots; finished runs in it are never run again")
-    add("--work", type=Path, help="models and checkpoints; default: runs/experiments/SCALE")
-    add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet), which is left out otherwise")
-    add("--jobs", type=int, help="at a time; default: one a GPU, else one a core")
-    add("--memory-gb", type=float, help="that jobs on this machine may take together; default: 80%% of it")
+    add("--only", nargs="+", metavar="SCENE", help="run these scenes of the scale only")
+    add("--without-held-out", action="store_true", help="leave out the held-out scenes")
+    add("--out", type=Path, help="folder of records, tables and plots; runs finished in it are never run again")
+    add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")
+    add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet); without them LPIPS is left out")
+    add("--jobs", type=int, help="number of jobs at a time; default: one a GPU, else one a core")
+    add("--memory-gb", type=float, help="memory of all jobs on this machine together; default: 80%% of it")
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
-    add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="as submitit has them: mem_gb=32 …")
-    add("--plan", action="store_true", help="run nothing; say what is left to run, and about how long it takes")
-    add("--tables-only", action="store_true", help="run nothing; write tables and plots from what is there")
-    return parser.parse_args(arguments)
+    add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="submitit's parameters: mem_gb=32 …")
+    add("--plan", action="store_true", help="run nothing; print what is left to run and about how long it takes")
+    add("--tables-only", action="store_true", help="run nothing; write tables and plots of the finished runs")
+    return parser
 
 
 def _parameter(text: str) -> tuple[str, Any]:

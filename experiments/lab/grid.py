@@ -1,8 +1,8 @@
-"""Grids: which methods are trained on which scenes, at how many Gaussians, read from files in `grids/`.
+"""Grids: methods, scenes and numbers of Gaussians of an experiment, read from files in `grids/`.
 
-A cell is a scene with a number of Gaussians, a seed, and lengths of the stages; in it, every method of the experiment
-is one run. A method has as many splats as the cell says, or, `at_equal_bytes`, as many as fit into the bytes that the
-cell's reference ends with, which is known once that is trained.
+A cell is a scene with a number of Gaussians, a seed, and lengths of the stages. Every method of the experiment is one
+run in it. A method has the cell's number of splats, or, `at_equal_bytes`, as many as fit into the final bytes of the
+cell's reference, which are known once that is trained.
 """
 
 import dataclasses
@@ -28,9 +28,9 @@ class Method:
     system: str
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     floats: int | None = None
-    """Of a splat; needed for a given number of bytes."""
+    """Floats of a splat; needed for a given number of bytes."""
     most: int | None = None
-    """Left out where a cell has more Gaussians."""
+    """Largest number of Gaussians of the cells that have this method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,13 +38,13 @@ class SceneAt:
     """A scene at a size."""
 
     label: str
-    """DATASET/NAME, or a name."""
+    """DATASET/NAME, or a name without a data set."""
     path: str
     downscale: int
     held_out: bool = False
-    """Not looked at while anything is chosen."""
+    """Whether no choice may be made on it."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
-    """Of every system, such as its background."""
+    """Options of every system, such as its background."""
 
     @property
     def dataset(self) -> str:
@@ -53,11 +53,11 @@ class SceneAt:
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """Where methods are compared."""
+    """Place in which methods are compared."""
 
     scene: SceneAt
     gaussians: int
-    """0 where a budget says how many there are."""
+    """Number of Gaussians; 0 if there is a budget."""
     seed: int
     iterations: tuple[int, int]
     budget: float | None = None
@@ -72,7 +72,7 @@ class Run:
     cell: Cell
     is_at_equal_bytes: bool
     job: Job
-    """Its last stage."""
+    """Job of its last stage."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,12 +86,12 @@ class Grid:
     cells: tuple[Cell, ...]
     reference: Method
     methods: tuple[Method, ...]
-    """At the cell's number of Gaussians."""
+    """Methods at the cell's number of Gaussians."""
     at_equal_bytes: tuple[Method, ...]
-    """At the bytes of the reference."""
+    """Methods at the final bytes of the reference."""
 
     def runs(self, records: Mapping[str, Record]) -> Iterator[Run]:
-        """Every run that can be named already, in the order of the cells."""
+        """Yield every run that can be named already, in the order of the cells."""
         for cell in self.cells:
             for method in dict.fromkeys((self.reference, *self.methods)):
                 if method.most is not None and cell.gaussians > method.most:
@@ -103,11 +103,11 @@ class Grid:
                 yield Run(method, cell, True, self._job(method, cell, num))
 
     def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
-        """What the reference left in a cell, once it is finished."""
+        """Return the record of the reference in a cell, or None before it is finished."""
         return records.get(self._job(self.reference, cell, cell.gaussians).key)
 
     def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
-        """The last job of every run."""
+        """Return the last job of every run."""
         return (run.job for run in self.runs(records))
 
     def _job(self, method: Method, cell: Cell, num: int) -> Job:
@@ -121,7 +121,7 @@ class Grid:
 
 
 def splats_in(mb: float, method: Method) -> int:
-    """How many splats of a method fit into so many MB (10^6 bytes).
+    """Return how many splats of a method fit into so many MB (10^6 bytes).
 
     Raises:
       ValueError: if the floats of its splats are not known.
@@ -132,11 +132,11 @@ def splats_in(mb: float, method: Method) -> int:
 
 
 def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, held_out: bool = True) -> Grid:
-    """An experiment at a scale, from `grids/NAME.toml`.
+    """Read an experiment's grid at a scale from `grids/NAME.toml`.
 
     Args:
-      scenes: labels of those that are wanted; None: all that the file, or else the scale, names.
-      held_out: with the scenes on which nothing was chosen.
+      scenes: labels of the wanted scenes; None for those that the file, or else the scale, names.
+      held_out: whether held-out scenes count.
 
     Raises:
       ValueError: if the file lacks the scale, or a scene or method is unknown.
@@ -164,7 +164,7 @@ def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, hel
 
 
 def _methods(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Method]:
-    """By label. One that is `like` another has its system, and its options where it has none of its own."""
+    """Return methods by label; one that is `like` another inherits its system and options."""
     methods: dict[str, Method] = {}
     for label, values in table.items():
         own = dict(values)
@@ -176,7 +176,7 @@ def _methods(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Method]:
 
 
 def _cells(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[Cell]:
-    """Every number of Gaussians, or every budget, and every seed of a block, on every scene."""
+    """Return a cell for every number of Gaussians or budget, every seed and every scene of a block."""
     first, second = block["iterations"]
     scenes = _scenes(block, wanted, held_out, name)
     sizes = (
@@ -191,7 +191,7 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _scenes(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[SceneAt]:
-    """The scenes of a block, unless others are wanted, at the block's downscale where it has one."""
+    """Return the scenes of a block, or the wanted ones, at the block's downscale if it has one."""
     table = block["scenes"]
     for label in wanted or ():
         if label not in table:

@@ -1,31 +1,39 @@
-"""Jobs: one stage of one system on one scene, trained from where it stopped, measured, and written down.
+"""Jobs: one stage of one system on one scene, trained from its checkpoint, measured, and recorded.
 
-A job's key says all that decides its result: the scene, its size, and every number of the stages so far. Whoever asks
-for the same stage gets the same job, so that a first stage is trained once however many second stages follow it.
+A job's key holds all that decides its result: the scene, its size, and every number of the stages so far. Equal stages
+are equal jobs, so a first stage is trained once for all second stages that follow it.
 """
 
 import dataclasses
 import functools
 import hashlib
+import math
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Billboards
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
+from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.origin import WHITE
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.plan import fingerprint, is_same_so_far
 from a2tg_jax.results.record import SceneSource
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
+from a2tg_jax.training.start import no_rows
 
 MOST_TRAIN_VIEWS = 16
-"""So many training views are measured, evenly chosen."""
+"""Largest number of training views that are measured, evenly chosen."""
+DEFAULT_GAUSSIANS = 100_000
+"""Assumed number of Gaussians of a system that sets no limit."""
 Record = dict[str, Any]
-"""What a finished job leaves, in JSON."""
+"""Figures of a finished job, in JSON."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,26 +45,26 @@ class Job:
     downscale: int
     system: a2tg.System
     stage: int
-    """Which of the system's stages, from 0."""
+    """Index of the system's stage, from 0."""
 
     @property
     def start(self) -> "Job | None":
-        """The job whose model it starts from."""
+        """Return the job whose model it starts from."""
         return dataclasses.replace(self, stage=self.stage - 1) if self.stage else None
 
     @property
     def iterations(self) -> int:
-        """Of its stage."""
+        """Return the iterations of its stage."""
         return self.system.stages()[self.stage].iterations
 
     @property
     def all_iterations(self) -> tuple[int, ...]:
-        """Of its stage and those before it."""
+        """Return the iterations of its stage and of those before it."""
         return tuple(stage.iterations for stage in self.system.stages()[: self.stage + 1])
 
     @property
     def key(self) -> str:
-        """Unique; a file name."""
+        """Return a unique key that is a valid file name."""
         return _key(self)
 
 
@@ -67,16 +75,44 @@ def _key(job: Job) -> str:
     return f"{job.scene.replace('/', '-')}-{job.downscale}-{job.system.stages()[job.stage].name}-{digest}"
 
 
+def num_gaussians(system: a2tg.System) -> int:
+    """Return the number of Gaussians that the events of a system let training start from at most.
+
+    Densification stops at the same number. Systems without such an event count their initial Gaussians.
+    """
+    events = [event for stage in system.stages() for event in stage.events]
+    caps = [event.most_gaussians for event in events if event.most_gaussians is not None]
+    return max(caps, default=system.initial_gaussians or DEFAULT_GAUSSIANS)
+
+
+def model_bytes(system: a2tg.System) -> float:
+    """Return the bytes of the largest model of a system's stages; only shapes are computed, no device is used."""
+    num, bases = num_gaussians(system), NUM_BASES[system.initial_sh_degree]
+    largest = 0.0
+    for stage in system.stages():
+        allocate = functools.partial(_shown_by_one, stage.appearance, bases)
+        shown = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(jax.eval_shape(allocate)))
+        size = BYTES_PER_FLOAT * num * float(floats_per_gaussian(system.initial_sh_degree) + shown)
+        for event in stage.events:
+            size = event.most_bytes(size, num, stage.iterations)
+        largest = max(largest, size)
+    return largest
+
+
+def _shown_by_one(appearance: a2tg.Appearance, num_bases: int) -> Any:
+    return appearance.allocate(jax.random.key(0), no_rows(1, num_bases))[0]
+
+
 @dataclasses.dataclass(frozen=True)
 class Folders:
-    """Where an experiment reads and writes."""
+    """Folders that an experiment reads and writes."""
 
     scenes: Path
     work: Path
-    """Models, checkpoints and records of single jobs: large, and made again where they are gone."""
+    """Folder of models, checkpoints and records of single jobs; large, and made again if missing."""
     lpips_weights: Path | None = None
     lpips_network: str | None = None
-    """Of the weights; jobs measured with another are measured again."""
+    """Network of the weights; jobs measured with another one are measured again."""
 
     def model(self, job: Job) -> Path:
         return self.work / "models" / f"{job.key}.npz"
@@ -93,9 +129,9 @@ class Folders:
 
 
 def run_job(job: Job, folders: Folders) -> Record:
-    """Trains a job, from its checkpoint where it was stopped, and measures what it made (host).
+    """Train a job, from its checkpoint if it was stopped, and measure its model (host).
 
-    One that was trained before, but measured without LPIPS or with that of another network, is measured again.
+    A job that was trained before, but measured without LPIPS or with another network's, is only measured again.
     """
     scene = folders.load_scene(job)
     path, model = folders.record(job), folders.model(job)
@@ -133,7 +169,7 @@ def _session() -> a2tg.Session:
 
 
 def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
-    """A checkpoint of this stage, perhaps of another system that shares it."""
+    """Return a checkpoint of this stage, which another system may share."""
     checkpoint = a2tg.load_checkpoint(path)
     if not is_same_so_far(checkpoint.system, job.system, job.stage):
         raise ValueError(f"{path} was made with other numbers than {job.key} has: delete it")
@@ -141,7 +177,7 @@ def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
 
 
 def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:
-    """What was trained, and what it took."""
+    """Return what was trained and what it took."""
     first = scene.test[0].camera
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
@@ -153,7 +189,7 @@ def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Rec
 
 
 def _quality(scene: a2tg.Scene, model: a2tg.Model, folders: Folders) -> Record:
-    """On the test views, and on some of those it was trained on."""
+    """Return quality on the test views and on some training views."""
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
     background = background_of(scene)
     on_test = a2tg.evaluate(scene.test, model, background=background, lpips_weights=folders.lpips_weights)
@@ -165,12 +201,12 @@ def _quality(scene: a2tg.Scene, model: a2tg.Model, folders: Folders) -> Record:
 
 
 def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
-    """White behind transparent photographs, whatever a system was trained on: all are measured alike."""
+    """Return white for transparent photographs, whatever background a system was trained on."""
     return WHITE if scene.test[0].alpha is not None else None
 
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:
-    """Splats by the size of their texture, "2x4" being two rows (v) and four columns (u); nothing without textures."""
+    """Return the number of splats by texture size, "2x4" being two rows (v) and four columns (u); empty without."""
     if model.textures is None or isinstance(model.appearance, Billboards):
         return {}
     pairs, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
@@ -178,7 +214,7 @@ def texture_sizes(model: a2tg.Model) -> dict[str, int]:
 
 
 def _milliseconds(history: a2tg.History) -> float:
-    """Median time of a step, which compilation does not move; of whatever else ran beside it, it knows nothing."""
+    """Return the median time of a step, free of compilation but not of other programs beside it."""
     paces = np.diff(history.seconds) / np.diff(history.iteration)
     return 1e3 * float(np.median(paces)) if len(paces) else float("nan")
 

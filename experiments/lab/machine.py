@@ -1,4 +1,4 @@
-"""What this machine has: memory, GPUs, cores."""
+"""Memory, GPUs and cores of this machine."""
 
 import functools
 import os
@@ -8,11 +8,11 @@ from pathlib import Path
 
 CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 UNKNOWN_BYTES = 16e9
-"""Taken for granted where the system does not tell."""
+"""Memory assumed if the system does not report it."""
 
 
 def memory_bytes() -> float:
-    """Of the machine, or of the container, whichever is less."""
+    """Return the memory of the machine or of the container, whichever is less."""
     try:
         total = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):
@@ -23,17 +23,17 @@ def memory_bytes() -> float:
 
 @functools.cache
 def num_gpus() -> int:
-    """GPUs that JAX sees. Another process looks: this one would take their memory for itself."""
+    """Return the number of GPUs that JAX sees. Another process looks, since JAX would take their memory in this one."""
     script = "import jax; print(len(jax.devices()) if jax.default_backend() == 'gpu' else 0)"
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False).stdout.split()
     return int(found[-1]) if found and found[-1].isdigit() else 0
 
 
 def num_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def default_jobs() -> int:
-    """One a GPU, whose memory jobs would share; else one a core."""
+    """Return one job a GPU, whose memory jobs would share, else one a core."""
     return num_gpus() or num_cores()

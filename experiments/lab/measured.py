@@ -1,4 +1,4 @@
-"""Figures of models that were trained, each measured once and kept."""
+"""Figures of trained models, each measured once and kept."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from lab.cli import Lab
 from lab.grid import Grid
 
 Figures = Mapping[str, Any]
-"""In JSON."""
+"""Figures of a model, in JSON."""
 
 
 def measured_once(
@@ -21,11 +21,11 @@ def measured_once(
     *,
     first_stage: bool = False,
 ) -> list[tuple[tables.Result, Figures]]:
-    """The finished runs of a grid with their figures, from NAME.json where they are in it; runs without are left out.
+    """Return the finished runs of a grid with their figures, which NAME.json keeps; runs without figures are left out.
 
     Args:
-      measure: what it returns of a run's model is kept at once.
-      first_stage: of the model that its first stage left.
+      measure: function of a run's model whose result is kept at once.
+      first_stage: whether to measure the model of the first stage.
     """
     path = lab.out / f"{name}.json"
     kept: dict[str, Figures] = read_json(path) if path.is_file() else {}

@@ -1,4 +1,4 @@
-"""Tables of results on a page of the documentation, between marks that name them.
+"""Pages of the documentation that show tables of results, between marks that name their files.
 
 <!-- results/small/claim.md -->
 …
@@ -10,28 +10,39 @@ from pathlib import Path
 
 from a2tg_jax.host.atomic import replacing
 
+EXPERIMENTS = Path(__file__).resolve().parents[1]
+DOCS = EXPERIMENTS.parent / "docs"
+PAGE, APPENDIX = DOCS / "results.md", DOCS / "results-appendix.md"
+TEXT = EXPERIMENTS / "appendix.md"
+"""Text of the appendix, without its tables."""
 BLOCK = re.compile(r"(<!-- (results/\S+\.md) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def refresh(page: Path, experiments: Path) -> list[str]:
-    """Puts the tables that a page names where it names them; returns their names."""
-    text = page.read_text(encoding="utf-8")
-    with replacing(page) as temporary:
-        temporary.write_text(with_tables(text, experiments), encoding="utf-8")
-    return names(text)
+def pages(experiments: Path = EXPERIMENTS) -> dict[Path, str]:
+    """Return the pages with the committed tables, by path."""
+    sources = {PAGE: PAGE, APPENDIX: TEXT}
+    return {page: with_tables(source.read_text(encoding="utf-8"), experiments) for page, source in sources.items()}
+
+
+def refresh(experiments: Path = EXPERIMENTS) -> None:
+    """Write the pages."""
+    for page, text in pages(experiments).items():
+        with replacing(page) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        print(page, flush=True)
 
 
 def with_tables(text: str, experiments: Path) -> str:
-    """The page with the tables as they are now."""
+    """Return a page with the current tables."""
     return BLOCK.sub(lambda found: f"{found[1]}\n{body(experiments / found[2])}\n{found[3]}", text)
 
 
 def names(text: str) -> list[str]:
-    """The files that a page shows."""
+    """Return the files whose tables a page shows."""
     return [found[2] for found in BLOCK.finditer(text)]
 
 
 def body(path: Path) -> str:
-    """A page of results without its title, its headings one level lower."""
+    """Return a page of results without its title, its headings one level lower."""
     _, *lines = path.read_text(encoding="utf-8").strip().splitlines()
     return "\n".join(f"#{line}" if line.startswith("#") else line for line in lines).strip() + "\n"

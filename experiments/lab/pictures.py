@@ -1,4 +1,4 @@
-"""Models changed so that a rendering shows something of them: what textures do, and where they are large."""
+"""Models changed so that a render shows the effect of textures and the places of large ones."""
 
 from collections.abc import Sequence
 
@@ -12,24 +12,24 @@ from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.results.images import side_by_side, with_colors
 
 LEAST_WIDTH = 300
-"""Of an image in a sheet, in pixels."""
+"""Least width of an image in a sheet, in pixels."""
 SQUARE, OBLONG = (0.15, 0.35, 0.95), (0.9, 0.12, 0.1)
 """The paper's colours: blue for textures of 2×2 and 4×4 texels, red for those that are not square."""
 
 
 def sheet(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
-    """Images side by side under their captions, enlarged without smoothing until captions fit."""
+    """Return images side by side under their captions, enlarged without smoothing until captions fit."""
     zoom = -(-LEAST_WIDTH // images[0].shape[1])
     return side_by_side([enlarged(image, zoom) for image in images], captions)
 
 
 def enlarged(image: np.ndarray, zoom: int) -> np.ndarray:
-    """Each pixel as zoom × zoom."""
+    """Return an image with each pixel repeated zoom × zoom times."""
     return np.repeat(np.repeat(image, zoom, axis=0), zoom, axis=1)
 
 
 def without_textures(model: a2tg.Model) -> a2tg.Model:
-    """RGB textures 0, alpha textures 1: what spherical harmonics show."""
+    """Return the model with RGB textures 0 and alpha textures 1, which shows spherical harmonics only."""
     assert model.textures is not None
     textures, layout = model.textures
     neutral = jax.tree.map(lambda bucket: jnp.zeros_like(bucket).at[..., 3].set(1.0), textures)
@@ -37,12 +37,12 @@ def without_textures(model: a2tg.Model) -> a2tg.Model:
 
 
 def without_sh(model: a2tg.Model) -> a2tg.Model:
-    """The Gaussians' own colour 0: what textures show."""
+    """Return the model with the Gaussians' own colour 0, which shows textures only."""
     return with_colors(model, np.ones(model.gaussians.num, bool), np.full(3, -0.5 / SH_C0))
 
 
 def colored_by_shape(model: a2tg.Model) -> a2tg.Model:
-    """Gaussians with larger square textures in blue, with others in red, the rest as they are."""
+    """Return the model with larger square textures in blue, others in red, the rest as they are."""
     assert model.textures is not None
     textures, layout = model.textures
     rows, columns = layout.sizes.T
@@ -55,12 +55,12 @@ def colored_by_shape(model: a2tg.Model) -> a2tg.Model:
 
 
 def learned_textures(model: a2tg.Model, size: tuple[int, int], num: int) -> np.ndarray:
-    """Textures of one size whose RGB varies most, as they colour a splat: on top its colour with the RGB residual, seen
-    from +z, below the alpha texture.
+    """Return the textures of one size whose RGB varies most: on top the splat's colour with the RGB residual, seen from
+    +z, below the alpha texture.
 
     Args:
       size: (rows, columns).
-      num: at most so many.
+      num: largest number of textures.
 
     Returns:
       uint8 [2·rows + 1, num·(columns + 1) − 1, 3], white between them; without columns where there are none.

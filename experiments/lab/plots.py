@@ -18,12 +18,12 @@ Point = tuple[float, float]
 
 
 def color_of(label: str) -> str:
-    """A method's colour; variants without one of their own have the same."""
+    """Return a method's colour; variants without one of their own have the same."""
     return COLORS.get(label) or COLORS.get(label.split(",")[0], OTHER_COLOR)
 
 
 def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_label: str, title: str) -> None:
-    """Curves through points, in the order of their x, which is logarithmic."""
+    """Draw curves through points sorted by x, with a logarithmic x axis."""
     for label, points in curves.items():
         if points:
             x, y = np.array(sorted(points)).T
@@ -44,11 +44,11 @@ COLUMNS = 3
 def charts(
     panels: Sequence[tuple[str, Mapping[str, Sequence[Point]], str, str]], *, log_y: Sequence[bool] = ()
 ) -> Figure:
-    """Several charts, three in a row, with one legend.
+    """Return several charts, three in a row, with one legend.
 
     Args:
-      panels: title, curves by label, and what the axes say.
-      log_y: which panels have a logarithmic y.
+      panels: title, curves by label, and labels of the axes.
+      log_y: whether each panel has a logarithmic y.
     """
     columns = min(COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
@@ -67,10 +67,10 @@ def charts(
 
 
 def shares_chart(shares: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Bars: which share of the Gaussians has a texture of each size.
+    """Return bars of the share of Gaussians with a texture of each size.
 
     Args:
-      shares: by scene, by "rows×columns".
+      shares: shares by scene, then by "rows×columns".
     """
     sizes = sorted({size for own in shares.values() for size in own}, key=_area)
     figure = Figure(figsize=(1.5 + 0.9 * len(sizes), 3.6), layout="constrained")

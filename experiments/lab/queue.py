@@ -1,7 +1,11 @@
-"""A queue of jobs that depend on each other's results: each is run once, several at a time, within the memory there is.
+"""A queue of jobs that depend on each other's results: each is run once, several at a time, within memory.
 
-What is wanted is asked again after every finished job, since how many splats fit into another run's bytes is known only
-then. Jobs run in processes of this machine, or wherever submitit sends them.
+The wanted jobs are asked for again after every finished job, because the number of splats that fit into another run's
+bytes is known only then. Jobs run in processes of this machine (`LocalPool`) or wherever submitit sends them.
+
+submitit's local executor does not replace `LocalPool`. It starts a process a job, so nothing compiled is kept from one
+job to the next. It gives every job all cores and GPUs. Its processes outlive a killed parent. It is an optional
+dependency, and experiments run without it.
 """
 
 import collections
@@ -15,30 +19,29 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from lab.jobs import Folders, Job, Record, run_job
+from lab.jobs import Folders, Job, Record, model_bytes, run_job
 
 POLL_SECONDS = 0.5
 BASE_BYTES = 4.0e9
-"""Of a process that trains: libraries, a small scene, and the programs of a hundred jobs, which it keeps until they are
-too many."""
+"""Bytes of a process that trains: libraries, a small scene, and the compiled programs of a hundred jobs."""
 COPIES = 12
-"""A trained number is kept so many times: itself, gradients, Adam's moments, sums of threads."""
+"""Copies of a trained number: itself, gradients, Adam's moments, sums of threads."""
 
 Records = Mapping[str, Record]
 Ask = Callable[[Records], Iterable[Job]]
-"""The jobs that are wanted, given the records of those that are finished."""
+"""Function that returns the wanted jobs, given the records of finished ones."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Failure:
-    """A job that could not be run."""
+    """A job that failed, with the reason."""
 
     job: Job
     reason: str
 
 
 class Handle(Protocol):
-    """A job under way, as `concurrent.futures` and submitit have it."""
+    """A running job, as in `concurrent.futures` and submitit."""
 
     def done(self) -> bool: ...
 
@@ -46,27 +49,29 @@ class Handle(Protocol):
 
 
 class Pool(Protocol):
-    """What runs jobs."""
+    """Processes that run jobs."""
 
     slots: int
-    """So many at a time."""
+    """Largest number of jobs at a time."""
     memory: float
-    """Bytes they may take together."""
+    """Bytes that the jobs may take together."""
 
     def submit(self, job: Job, folders: Folders) -> Handle: ...
 
     def is_death(self, error: Exception) -> bool:
-        """Whether an error says that a job's process died, and nothing of the job itself."""
+        """Return whether an error means that a job's process died, not that the job failed."""
         ...
 
     def close(self) -> None:
-        """Gives back what it holds, such as the memory of a GPU."""
+        """Release processes and memory."""
         ...
 
 
 class LocalPool:
-    """Processes of this machine, each with its share of the cores, which stay for one job after another: what one has
-    compiled, the next may use."""
+    """Processes of this machine, each with its share of the cores and GPUs.
+
+    They stay for one job after another, so that compiled programs are used again.
+    """
 
     def __init__(self, slots: int, memory: float, num_gpus: int = 0):
         self.slots, self.memory, self._num_gpus = slots, memory, num_gpus
@@ -95,7 +100,7 @@ class LocalPool:
 
 
 def _begin_worker(shares: Any) -> None:
-    """What a process does before its first job."""
+    """Prepare a process for its first job."""
     import a2tg_jax
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -109,7 +114,7 @@ def _begin_worker(shares: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """Where the program that hands out jobs was killed, nobody waits for this one's."""
+    """End this process if the program that hands out jobs was killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -117,15 +122,15 @@ def _end_with_parent() -> None:
 
 
 class SubmititPool:
-    """Other machines, or processes of this one, by way of submitit."""
+    """Other machines, or processes of this one, through submitit."""
 
     def __init__(self, cluster: str, folder: Path, slots: int, memory: float, **parameters: Any):
         """Args:
-        cluster: "slurm", "local", or what else submitit knows.
-        folder: for its logs.
-        slots: jobs at a time.
-        memory: bytes that they may take together.
-        parameters: of `submitit.AutoExecutor.update_parameters`, such as slurm_partition, gpus_per_node, mem_gb.
+        cluster: "slurm", "local", or another of submitit's clusters.
+        folder: folder of the logs.
+        slots: largest number of jobs at a time.
+        memory: bytes that the jobs may take together.
+        parameters: parameters of `submitit.AutoExecutor.update_parameters`, such as slurm_partition, mem_gb.
 
         Raises:
           ValueError: if submitit is not installed.
@@ -135,7 +140,7 @@ class SubmititPool:
         except ImportError as error:
             raise ValueError("--cluster needs submitit: pip install 'a2tg-jax[experiments]'") from error
         self.slots, self.memory = slots, memory
-        # What is sent out names this package, which its processes must find.
+        # Pickled jobs name this package, which their processes must find.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
         self._executor = submitit.AutoExecutor(folder, cluster=cluster)
@@ -147,7 +152,7 @@ class SubmititPool:
         return self._sent[-1]
 
     def is_death(self, error: Exception) -> bool:
-        """Killed, or out of its time; where it left a checkpoint, it goes on from that."""
+        """Return whether a job was killed or out of time; it continues from its checkpoint."""
         return type(error).__name__ == "UncompletedJobError"
 
     def close(self) -> None:
@@ -171,18 +176,18 @@ def run_all(
     on_record: Callable[[Job, Record], None],
     on_failure: Callable[[Failure], None],
 ) -> list[Failure]:
-    """Runs all that is wanted and not finished, and adds its records.
+    """Run all wanted jobs that are not finished, and add their records.
 
     Args:
-      ask: asked again after every finished job.
-      folders: where jobs read and write.
-      pool: what runs them.
-      records: of finished jobs, by key; added to.
-      on_record: called with each job that was run.
-      on_failure: called with each job that could not be.
+      ask: function that returns the wanted jobs; called again after every finished job.
+      folders: folders of the jobs.
+      pool: processes that run them.
+      records: records of finished jobs by key, to which those of this call are added.
+      on_record: called with each finished job.
+      on_failure: called with each failed job.
 
     Returns:
-      The jobs that failed. Those that need their results are not run.
+      The failed jobs. Jobs that need their results are not run.
     """
     running: dict[str, tuple[Job, Handle]] = {}
     failures: dict[str, Failure] = {}
@@ -227,7 +232,7 @@ def run_all(
 
 
 def _fits(job: Job, others: list[Job], pool: Pool, deaths: Mapping[str, int]) -> bool:
-    """Whether a job may run beside others. One alone always may; one that died, or whose neighbour did, only alone."""
+    """Return whether a job may run beside others; a job that died, or whose neighbour did, runs alone."""
     if not others:
         return True
     is_room = sum(map(estimated_bytes, [*others, job])) <= pool.memory
@@ -235,13 +240,13 @@ def _fits(job: Job, others: list[Job], pool: Pool, deaths: Mapping[str, int]) ->
 
 
 def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]:
-    """Of every chain that is not finished, the first job that is not."""
+    """Return the first unfinished job of every chain."""
     found = (_first_open(job, folders, records) for job in jobs)
     return list({job.key: job for job in found if job is not None}.values())
 
 
 def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool = False) -> Job | None:
-    """The job, or the one before it that has to be run for it; None where it is finished."""
+    """Return the job, or the one before it that it needs; None if it is finished."""
     record = records.get(job.key)
     is_measured = record is not None and folders.lpips_network in (None, record.get("lpips_network"))
     if is_measured and (not is_start or folders.model(job).is_file()):
@@ -251,11 +256,6 @@ def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool 
 
 
 def estimated_bytes(job: Job) -> float:
-    """About what a job takes, so that no more are run at once than fit."""
-    if job.system.budget_bytes is not None:
-        return BASE_BYTES + COPIES * job.system.budget_bytes
-    densify = getattr(job.system, "densify", None)
-    texture = getattr(job.system, "texture", None)
-    side = getattr(texture, "side", None) or getattr(texture, "cap", None) or 1
-    floats = 58 + 4 * side * side
-    return BASE_BYTES + 4 * COPIES * floats * getattr(densify, "cap", 100_000)
+    """Return about how much memory a job takes, so that no more run at once than fit."""
+    budget = job.system.budget_bytes
+    return BASE_BYTES + COPIES * (model_bytes(job.system) if budget is None else budget)

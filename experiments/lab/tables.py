@@ -1,24 +1,30 @@
 """Tables of results in Markdown, ours and the paper's.
 
-A column is a scene, or, where scenes belong to data sets, the mean over a data set. Several seeds are averaged; a
-difference that is not larger than seeds make is called undecided.
+A column is a scene, or the mean over a data set if scenes belong to data sets. Means are taken over the seeds of a
+scene first, then over scenes, so that every scene counts once. `± x` is the half-width of the 95 % t interval over
+scenes. A difference within the spread of seeds is called undecided.
 """
 
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import scipy.stats
 
 from a2tg_jax.results.folder import read_json
 from lab.grid import Cell, Grid, Run, SceneAt
 from lab.jobs import Record
+from lab.markdown import table as markdown
 
+T = TypeVar("T")
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
 """The figures that the paper publishes, by table."""
 MISSING = "–"
+CONFIDENCE = 0.95
+"""Level of the intervals over scenes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +36,7 @@ class Result:
 
     @property
     def label(self) -> str:
-        """The method; in its cell, no other has this one."""
+        """Return the method's label, unique within its cell."""
         return self.run.method.label + (EQUAL_BYTES if self.run.is_at_equal_bytes else "")
 
     @property
@@ -47,44 +53,84 @@ EQUAL_BYTES = ", equal bytes"
 
 
 def results_of(grid: Grid, records: Mapping[str, Record]) -> list[Result]:
-    """The finished runs of a grid."""
+    """Return the finished runs of a grid."""
     return [Result(run, records[run.job.key]) for run in grid.runs(records) if run.job.key in records]
 
 
 def mean(results: Iterable[Result], figure: str) -> float:
-    """Over scenes and seeds; not a number where there is none."""
-    values = [result[figure] for result in results]
-    return float(np.mean(values)) if values else float("nan")
+    """Return the mean over scenes of each scene's mean; NaN without results."""
+    means = [np.mean([result[figure] for result in own]) for _, own in _grouped(results, _scene)]
+    return float(np.mean(means)) if means else float("nan")
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+def _scene(result: Result) -> str:
+    return result.run.cell.scene.label
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneMean:
+    """Mean over scenes with its uncertainty."""
+
+    mean: float
+    """NaN without scenes."""
+    half_width: float
+    """Half-width of the t interval over scenes at the level `CONFIDENCE`; NaN with fewer than two scenes."""
+    p_value: float
+    """Two-sided p-value of Student's t-test of a mean of 0; NaN with fewer than two scenes."""
+
+    def told(self, digits: int) -> str:
+        """Return the mean and its interval for a table."""
+        if np.isnan(self.half_width):
+            return signed(self.mean, digits)
+        return f"{self.mean:+.{digits}f} ± {self.half_width:.{digits}f}"
+
+
+def over_scenes(values: Iterable[float]) -> SceneMean:
+    """Return the mean of one value a scene."""
+    found = np.array(list(values), float)
+    nan = float("nan")
+    if len(found) < 2 or np.isnan(found).any():
+        return SceneMean(float(np.mean(found)) if len(found) else nan, nan, nan)
+    error = scipy.stats.sem(found)
+    half = error * scipy.stats.t.ppf((1 + CONFIDENCE) / 2, len(found) - 1)
+    return SceneMean(float(found.mean()), float(half), float(scipy.stats.ttest_1samp(found, 0.0).pvalue))
+
+
+def gains_by_scene(results: Sequence[Result], label: str, other: str, figure: str) -> dict[str, float]:
+    """Return a method's figure less another's, averaged over seeds, then over the sizes of each scene."""
+    sizes: dict[str, list[float]] = {}
+    for cell, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
+        if gains := _gains(block, label, other, figure):
+            sizes.setdefault(cell.scene.label, []).append(float(np.mean(gains)))
+    return {scene: float(np.mean(own)) for scene, own in sizes.items()}
 
 
 def number(value: float, digits: int) -> str:
-    """A number for a table; what is not there, a dash. Fractions of 1 lose the zero that says nothing."""
+    """Return a number for a table, a dash for NaN; three digits lose their leading zero."""
     if np.isnan(value):
         return MISSING
     text = f"{value:,.{digits}f}"
     return text[1:] if digits == 3 and text.startswith("0.") else text
 
 
+def signed(value: float, digits: int) -> str:
+    """Return a difference with its sign for a table, a dash for NaN."""
+    return MISSING if np.isnan(value) else f"{value:+.{digits}f}"
+
+
 def percent(share: float) -> str:
-    """A share for a table."""
+    """Return a share for a table."""
     return f"{100 * share:.1f} %" if share else MISSING
 
 
 def quality(results: Sequence[Result]) -> str:
-    """PSNR / SSIM / LPIPS."""
+    """Return PSNR / SSIM / LPIPS for a table."""
     figures = zip(("psnr", "ssim", "lpips"), (2, 3, 3), strict=True)
     return " / ".join(number(mean(results, name), digits) for name, digits in figures) if results else MISSING
 
 
 def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
-    """For each number of Gaussians, or budget, the methods, and in each column quality and MB, means where it is of
-    several."""
+    """Return a table for each number of Gaussians or budget: a row a method, quality and MB in each column."""
     columns = {column: {r.run.cell.scene for r in own} for column, own in _grouped(results, lambda r: r.column)}
     parts = []
     for (num, budget), block in _grouped(results, lambda result: (result.run.cell.gaussians, result.run.cell.budget)):
@@ -100,7 +146,7 @@ def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
 
 
 def _quality_and_size(results: Sequence[Result], scenes: set[SceneAt]) -> str:
-    """With a note where some of the scenes are not finished."""
+    """Return quality and MB, with a note if some of the scenes are not finished."""
     if not results:
         return MISSING
     found = {result.run.cell.scene for result in results}
@@ -109,35 +155,35 @@ def _quality_and_size(results: Sequence[Result], scenes: set[SceneAt]) -> str:
 
 
 def _mean_of_columns(by_column: Mapping[str, Sequence[Result]]) -> str:
-    """Of all columns, each counted once as in the paper, or none."""
+    """Return the mean over all columns, each counted once as in the paper; a dash if one is missing."""
     if not all(by_column.values()):
         return MISSING
     return number(float(np.mean([mean(found, "psnr") for found in by_column.values()])), 2)
 
 
 def _iterations(results: Sequence[Result]) -> str:
-    """Of all stages."""
+    """Return the iterations of all stages."""
     return "+".join(f"{count:,}" for count in results[0].run.job.all_iterations)
 
 
 def _splats(results: Sequence[Result]) -> str:
-    """How many there are, or from how few to how many."""
+    """Return the number of splats, or its range."""
     counts = sorted({int(result["num"]) for result in results})
     return f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,}–{counts[-1]:,}"
 
 
-def _grouped(results: Iterable[Result], key: Callable[[Result], Any]) -> list[tuple[Any, list[Result]]]:
-    """By a key, in the order in which keys first come."""
-    groups: dict[Any, list[Result]] = {}
+def _grouped(results: Iterable[T], key: Callable[[T], Any]) -> list[tuple[Any, list[T]]]:
+    """Return groups by key, in the order of first occurrence."""
+    groups: dict[Any, list[T]] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)
     return list(groups.items())
 
 
 def variants_of_reference(grid: Grid, results: Sequence[Result]) -> str:
-    """A table of gains for the reference, and one for each method of the grid whose name begins with its.
+    """Return a table of gains for the reference and for each method whose label begins with the reference's.
 
-    Their bytes are their own; the splats of the others fit into those of the reference.
+    Each has its own bytes; the other methods have as many splats as fit into the bytes of the reference.
     """
     names = [method.label for method in (grid.reference, *grid.methods)]
     variants = [name for name in names if name.startswith(grid.reference.label)]
@@ -147,12 +193,12 @@ def variants_of_reference(grid: Grid, results: Sequence[Result]) -> str:
 
 
 def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]) -> str:
-    """By how much the reference is above other methods in its cell, with a verdict.
+    """Return the gain of the reference over other methods in each cell, with a verdict.
 
     Args:
-      results: of one grid.
+      results: finished runs of one grid.
       reference: label of the method.
-      others: labels of those it is compared with; `EQUAL_BYTES` ends the name of one at equal bytes.
+      others: labels of the compared methods; those at equal bytes end with `EQUAL_BYTES`.
     """
     spread = seed_spread(results, reference, others)
     rows: list[list[str]] = []
@@ -169,26 +215,29 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
                 continue
             every[other].setdefault(place.scene.label, []).append(float(np.mean(gains)))
             said = "" if spread is None else f" ({verdict(gains, spread)})"
-            shown.append(f"{np.mean(gains):+.2f}{said} · {np.mean(lpips):+.3f} · {np.mean(train):+.2f}")
+            shown.append(
+                f"{signed(float(np.mean(gains)), 2)}{said} · {signed(float(np.mean(lpips)), 3)} · "
+                f"{signed(float(np.mean(train)), 2)}"
+            )
         rows.append([*_told_place(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
-    rows.append(["*mean ± standard error*", *[""] * 6, *map(_mean_and_error, every.values())])
+    rows.append(["*mean ± 95 % interval*", *[""] * 6, *map(_mean_and_interval, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
     text = markdown([*header, *(f"against {other}: dB · LPIPS · train dB" for other in others)], rows)
     return f"{text}\n{_told_spread(spread)}\n"
 
 
 def _told_spread(spread: float | None) -> str:
-    errors = "The last row's errors are those of independent scenes."
+    interval = "The last row is the mean over scenes, each counted once, with its 95 % t interval over scenes."
     if spread is None:
-        return f"No cell has two seeds, so that nothing is said of what is above what. {errors}"
+        return f"No cell has two seeds, so no verdict is given. {interval}"
     return (
-        f"Two seeds differ by {spread:.2f} dB in such a difference (root mean square). A mean of n seeds that is not "
-        f"beyond that, divided by √n, is called undecided. {errors}"
+        f"Two seeds differ by {spread:.2f} dB in such a difference (root mean square). A mean of n seeds within that "
+        f"spread, divided by √n, is called undecided. {interval}"
     )
 
 
 def _told_place(cell: Cell, result: Result) -> list[str]:
-    """Scene, pixels, iterations and Gaussians of a cell."""
+    """Return scene, pixels, iterations and Gaussians of a cell."""
     width, height = result.record["pixels"]
     length = "+".join(f"{count:,}" for count in cell.iterations)
     density = cell.gaussians / (width * height)
@@ -199,16 +248,15 @@ def _seeds(results: Sequence[Result]) -> str:
     return str(len({result.run.cell.seed for result in results}))
 
 
-def _mean_and_error(gains: Mapping[str, Sequence[float]]) -> str:
-    """Over scenes, within which the gains at several sizes are averaged first."""
-    means = [float(np.mean(own)) for own in gains.values()]
-    if len(means) < 2:
+def _mean_and_interval(gains: Mapping[str, Sequence[float]]) -> str:
+    """Return the mean over scenes, after averaging the sizes within each scene."""
+    if len(gains) < 2:
         return MISSING
-    return f"{np.mean(means):+.2f} ± {np.std(means, ddof=1) / np.sqrt(len(means)):.2f}"
+    return over_scenes(float(np.mean(own)) for own in gains.values()).told(2)
 
 
 def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float | None:
-    """By how much two seeds differ in a gain, root mean square, in dB; None where no cell has two."""
+    """Return the root mean square difference of two seeds in a gain, in dB; None if no cell has two seeds."""
     spreads = []
     for _, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         for other in others:
@@ -218,7 +266,7 @@ def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]
 
 
 def verdict(gains: Sequence[float], spread: float) -> str:
-    """Whether gains that seeds alone move by `spread` say anything."""
+    """Return "above", "below", or "undecided" if the mean gain is within the spread of seeds."""
     mean_gain = float(np.mean(gains))
     if abs(mean_gain) <= spread / np.sqrt(len(gains)):
         return "undecided"
@@ -226,7 +274,7 @@ def verdict(gains: Sequence[float], spread: float) -> str:
 
 
 def _gains(block: Sequence[Result], reference: str, other: str, figure: str) -> list[float]:
-    """The reference's figure less the other's, of each seed that has both."""
+    """Return the reference's figure less the other's for each seed that has both."""
     by_seed = {(result.label, result.run.cell.seed): result[figure] for result in block}
     seeds = sorted({seed for _, seed in by_seed})
     return [
@@ -239,13 +287,13 @@ def _gains(block: Sequence[Result], reference: str, other: str, figure: str) -> 
 def paper_table(
     name: str, place: str, columns: Sequence[tuple[str, str]], everywhere: str = "mean of the data sets"
 ) -> str:
-    """A table of the paper.
+    """Return a table of the paper.
 
     Args:
-      name: its key in `paper.json`.
-      place: what its blocks differ in: "gaussians" or "budget_mb".
-      columns: (key, heading) of the figures.
-      everywhere: heading of the figures of a table that names no data sets.
+      name: key in `paper.json`.
+      place: key in which the blocks differ, "gaussians" or "budget_mb".
+      columns: (key, heading) of each figure.
+      everywhere: heading of the figures if the table names no data sets.
     """
     table = PAPER[name]
     datasets = list(dict.fromkeys(row.get("dataset", everywhere) for row in table))
@@ -264,7 +312,7 @@ DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 
 
 def _as_printed(key: str, value: float) -> str:
-    """With the digits that such figures have in the paper, or those that it has."""
+    """Return a figure with the paper's number of digits."""
     return number(value, DIGITS[key]) if key in DIGITS else f"{value:g}"
 
 
@@ -272,9 +320,9 @@ QUALITY_COLUMNS = (("psnr", "PSNR"), ("ssim", "SSIM"), ("lpips", "LPIPS"), ("mb"
 
 
 def choices_table(results: Sequence[Result], default: str) -> str:
-    """What each variant gains over the default, in dB and LPIPS, in each column and on average.
+    """Return the gain of each variant over the default, in dB and LPIPS, in each column and on average.
 
-    Of the scenes and seeds of a column, those count that both have.
+    Only cells that both have count.
     """
     counts = {result.run.cell.gaussians for result in results}
 
@@ -298,14 +346,16 @@ def choices_table(results: Sequence[Result], default: str) -> str:
 
 
 def _mean_gain(results: Sequence[Result], base: Mapping[Cell, Result]) -> tuple[float, float] | None:
-    """In PSNR and in LPIPS, over the cells in which there is the default too."""
+    """Return the mean gains in PSNR and LPIPS over the cells that have the default too, each scene counted once."""
     both = [(result, base[result.run.cell]) for result in results if result.run.cell in base]
     if not both:
         return None
-    psnr, lpips = (float(np.mean([a[figure] - b[figure] for a, b in both])) for figure in ("psnr", "lpips"))
+    pairs = [pair for _, pair in _grouped(both, lambda pair: _scene(pair[0]))]
+    means = [[np.mean([a[figure] - b[figure] for a, b in own]) for own in pairs] for figure in ("psnr", "lpips")]
+    psnr, lpips = (float(np.mean(own)) for own in means)
     return psnr, lpips
 
 
 def _told_gain(gain: Sequence[float]) -> str:
     decibels, distance = gain
-    return f"{decibels:+.2f} · {distance:+.3f}"
+    return f"{signed(decibels, 2)} · {signed(distance, 3)}"

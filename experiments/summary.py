@@ -1,0 +1,81 @@
+"""Gains at equal bytes with 95 % intervals over scenes: the two tables of docs/results.md."""
+
+from collections.abc import Mapping, Sequence
+
+from equal_bytes import GRIDS, at_budget, told_gain, unique
+from lab import tables
+from lab.cli import Experiment, Lab
+from lab.grid import Grid
+
+BYTEWISE, TEXTURED, PLAIN = "Bytewise", "A²TG, as quick has it", "2DGS*-MCMC"
+STRONGEST = f"{PLAIN}, degree 0"
+BASELINES = {STRONGEST: "degree 0", f"{PLAIN}, degree 1": "1", f"{PLAIN}, degree 2": "2", PLAIN: "3"}
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """Write the table of bytes and the table of textures."""
+    *budgets, claim = grids
+    results = unique(result for grid in budgets for result in tables.results_of(grid, lab.records))
+    lab.write("summary-bytes", f"# Bytewise at equal bytes\n\n{bytes_table(results)}")
+    lab.write(
+        "summary-textures",
+        f"# Textures at equal bytes\n\n{textures_table(results, tables.results_of(claim, lab.records))}",
+    )
+
+
+def bytes_table(results: Sequence[tables.Result]) -> str:
+    """Return the gains of `bytewise`: by scene over the strongest baseline, on average over the others."""
+    budgets = sorted({result.run.cell.budget or 0.0 for result in results})
+    found = [at_budget(results, budget) for budget in budgets]
+    rows = []
+    for scene in sorted({result.run.cell.scene.label for result in results}):
+        shown = [_on(own, scene) for own in found]
+        rows.append([f"{BASELINES[STRONGEST]}: {scene}", *shown])
+    for label, told in BASELINES.items():
+        means = [told_gain(own, BYTEWISE, label).partition(" (")[0] for own in found]
+        rows.append([f"**degree {told.removeprefix('degree ')}: mean**", *means])
+    return tables.markdown(["`bytewise` less MCMC of", *(f"{budget:g} MB: dB · LPIPS" for budget in budgets)], rows)
+
+
+def _on(results: Sequence[tables.Result], scene: str) -> str:
+    """Return the gains over the strongest baseline on one scene."""
+    psnr, lpips = (tables.gains_by_scene(results, BYTEWISE, STRONGEST, figure) for figure in ("psnr", "lpips"))
+    if scene not in psnr:
+        return tables.MISSING
+    return f"{tables.signed(psnr[scene], 2)} · {tables.signed(lpips[scene], 3)}"
+
+
+def textures_table(budgets: Sequence[tables.Result], claim: Sequence[tables.Result]) -> str:
+    """Return what textures gain over more Gaussians without them, in both settings."""
+    equal = tables.EQUAL_BYTES
+    rows = [
+        _row("`a2tg` of `quick` less MCMC, bytes of `a2tg`", claim, TEXTURED, PLAIN + equal),
+        _row("`a2tg` of `quick` less MCMC, given budgets", budgets, TEXTURED, PLAIN),
+        _row("`a2tg` of the paper less MCMC, bytes of `a2tg`", claim, "A²TG", PLAIN + equal),
+        _row("`bytewise` less `bytewise` without textures, given budgets", budgets, BYTEWISE, "Bytewise, untextured"),
+        _row("`a2tg` of `quick` less textures of one size, its bytes", claim, TEXTURED, "Textured Gaussians*" + equal),
+    ]
+    return tables.markdown(["compared", "cells", "dB", "p", "LPIPS", "p"], rows)
+
+
+def _row(told: str, results: Sequence[tables.Result], label: str, other: str) -> list[str]:
+    """Return one comparison: number of cells, means with intervals, p-values."""
+    cells = {(cell.scene, cell.gaussians, cell.budget) for cell in _shared_cells(results, label, other)}
+    psnr, lpips = (_estimate(tables.gains_by_scene(results, label, other, figure)) for figure in ("psnr", "lpips"))
+    return [told, str(len(cells)), psnr.told(3), _p_value(psnr), lpips.told(4), _p_value(lpips)]
+
+
+def _shared_cells(results: Sequence[tables.Result], label: str, other: str) -> set:
+    own, others = ({r.run.cell for r in results if r.label == name} for name in (label, other))
+    return own & others
+
+
+def _estimate(gains: Mapping[str, float]) -> tables.SceneMean:
+    return tables.over_scenes(gains.values())
+
+
+def _p_value(estimate: tables.SceneMean) -> str:
+    return "<.001" if estimate.p_value < 0.001 else tables.number(estimate.p_value, 3)
+
+
+EXPERIMENT = Experiment("summary", (*GRIDS, "claim"), present, __doc__)
