@@ -1,4 +1,4 @@
-"""Where texels go: the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
+"""Adaptive textures: the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
 
 The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select` choose who gets them, and calls
 `reallocate`. All but the statistic runs on the host, on whole arrays.
@@ -28,16 +28,16 @@ that would leave the statistic no time to settle."""
 
 
 USUAL_SHARE = 0.25
-"""Of the Gaussians that grow, where that is not said."""
+"""Default share of the Gaussians that grow, for forecasts."""
 
 
 class ReallocateResult(NamedTuple):
-    """What `reallocate` returns."""
+    """Result of `reallocate`."""
 
     textures: Textures
     layout: AtlasLayout
     moments: Any
-    """As given, its textures rebuilt as the texels were."""
+    """Moments as given, their textures rebuilt as the texels were."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ class UpscaleChoices:
     budget_mb: float | None = None
     """Largest reported memory in MB (10^6 bytes); needed by select="budget"."""
     anisotropic: bool = static(default=True)
-    """Double one axis only on thin Gaussians; off: always both."""
+    """Whether thin Gaussians double one axis only; off: always both."""
     axes: Literal["paper", "authors"] = static(default="paper")
     """Axis that a thin Gaussian doubles: the long one, or the short one as in the authors' program."""
     k_a: float = 4.0
@@ -69,14 +69,14 @@ class Upscale(UpscaleChoices, HostEvent):
     """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
 
     at: tuple[float, ...] | None = static(default=None)
-    """Fractions of the stage after which textures grow; None: so often that the cap can be reached, every 1/60 of the
-    stage as in the paper, under 30,000 iterations every 0.15."""
+    """Fractions of the stage after which textures grow; None: as often as it takes to reach the cap, every 1/60 of the
+    stage as in the paper, every 0.15 in stages under 30,000 iterations."""
     gradient: Statistic = static(default="position")
-    """The gradient that is averaged: by position in the world, as the paper has it, or "screen": by the position on
-    the screen, in units of half an image, and only where the low-pass filter decides, as in the authors' program."""
+    """Gradient that is averaged: by position in the world, as in the paper, or "screen": by the position on the
+    screen, in units of half an image, and only where the low-pass filter decides, as in the authors' program."""
     moments: Literal["zero", "copied"] = static(default="zero")
-    """What Adam remembers of a texture that has grown: nothing, so that its texels part quickly, or its old texels'
-    moments, copied as they are."""
+    """Adam's moments of a texture that has grown: zero, so that its texels part quickly, or copied from its old
+    texels."""
 
     @property
     def statistic(self) -> Statistic:
@@ -130,7 +130,7 @@ class Upscale(UpscaleChoices, HostEvent):
         return Change(model, rebuilt.moments, self.init(model))
 
     def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
-        """Sizes after further upscalings, where the last one gave every texture what it proposed and bytes are left.
+        """Return the sizes after further upscalings if bytes are left after all textures took what they proposed.
 
         When thin Gaussians have what they propose as well, both axes double.
         """
@@ -147,7 +147,7 @@ class Upscale(UpscaleChoices, HostEvent):
         return sizes
 
     def _how_to_select(self, used_bytes: int, due: Due) -> dict[str, float]:
-        """The keyword that tells `select` how to choose."""
+        """Return the keyword that tells `select` how to choose."""
         if self.select == "budget":
             return {"budget_bytes": event_budget(bytes_of(self.budget_mb or 0.0), used_bytes, due.index, due.count)}
         return {self.select: getattr(self, self.select)}
@@ -156,7 +156,7 @@ class Upscale(UpscaleChoices, HostEvent):
 def next_sizes(
     sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: bool = True, axes: str = "paper"
 ) -> np.ndarray:
-    """The texture sizes one upscaling would give (A²TG, anisotropic upscaling).
+    """Return the texture sizes one upscaling would give (A²TG, anisotropic upscaling).
 
     s_x/s_y > k_A and s_y < k_S: Tu doubles. s_y/s_x > k_A and s_x < k_S: Tv doubles. Otherwise both double. Each
     axis stops at the cap, so that a 4×1 texture becomes 4×2 at a cap of 4. An empty texture grows as one of 1×1 does.
@@ -198,7 +198,7 @@ def select(
     fraction: float | None = None,
     budget_bytes: float | None = None,
 ) -> np.ndarray:
-    """Which Gaussians receive their proposed size. Exactly one of the three rules is given.
+    """Choose the Gaussians that receive their proposed size, by exactly one of three rules.
 
     * threshold: those whose statistic exceeds it.
     * fraction: the round(fraction·N) largest statistics, halves rounded up, out of the Gaussians that can still grow
@@ -241,7 +241,7 @@ def select(
 def reallocate(
     textures: Textures, layout: AtlasLayout, new_sizes, moments=None, known: Sequence[Shape] = (), kept=None
 ) -> ReallocateResult:
-    """Rebuilds the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
+    """Rebuild the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
     Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding, and
     what grows from an empty texture, is (0, 0, 0, 1) in textures and 0 in moments.
@@ -278,7 +278,7 @@ def reallocate(
 
 
 def _kept_rows(moments: Textures, layout: AtlasLayout, kept) -> Textures:
-    """The moments with 0 in all rows but those of the textures that are kept."""
+    """Return the moments with 0 in all rows but those of the textures that are kept."""
     check_shape("kept", kept, (layout.num,))
     bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
     buckets = []
@@ -329,7 +329,7 @@ def _move_texels(old, resolutions, capacities, moves: list[_Move], padding: tupl
 
 
 def _nearest(old: int, new: int) -> np.ndarray:
-    """[new] index of the old texel nearest to each new one along a side: ⌊(j + 1/2)·old/new⌋, in integers."""
+    """Return [new] indices of the old texels nearest to the new ones along a side, ⌊(j + 1/2)·old/new⌋, in integers."""
     return (2 * np.arange(new) + 1) * old // (2 * new)
 
 
@@ -343,7 +343,7 @@ def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: floa
 
 
 def _bytes_between(sizes: np.ndarray, larger: np.ndarray) -> int:
-    """Bytes that textures take more at their larger sizes."""
+    """Return the bytes that textures take more at their larger sizes."""
     return BYTES_PER_TEXEL * int(np.prod(larger, axis=1).sum() - np.prod(sizes, axis=1).sum())
 
 

@@ -26,18 +26,18 @@ from a2tg_jax.texture import Shape
 
 
 class Times(NamedTuple):
-    """Every so many iterations, counted from 1, between two of them, both included. Numbers of the host, or traced."""
+    """Every so many iterations, from 1, between a first and a last, both included. Host numbers, or traced."""
 
     first: Any
     last: Any
     every: Any
 
     def is_due(self, iteration: Array) -> Array:
-        """Whether the event follows this iteration."""
+        """Return whether the event follows this iteration."""
         return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
 
     def num_left(self, iteration: Any) -> Any:
-        """How often the event happens from an iteration on, its first at the earliest."""
+        """Return the number of its times from an iteration on."""
         return self.last // self.every - (iteration - 1) // self.every
 
     @property
@@ -55,7 +55,7 @@ EVERY_ITERATION = Times(1, 2**31 - 1, 1)
 
 
 class Seen(NamedTuple):
-    """What the views of one iteration tell an event; V views, N rows."""
+    """Views of one iteration, for events; V views, N rows."""
 
     cameras: Camera
     """V cameras, stacked."""
@@ -69,30 +69,30 @@ class Seen(NamedTuple):
 
 
 class Now(NamedTuple):
-    """What an event inside the step is told, all traced."""
+    """Information for an event inside the step, all traced."""
 
     keys: Array
     """[num_keys] random keys."""
     iteration: Array
-    """Just done, from 1."""
+    """Iteration just done, from 1."""
     rate_of_means: Array
     """Learning rate of the means, in world units."""
     num_iterations: Array
-    """Of the stage."""
+    """Length of the stage."""
     scene_scale: Array
     """1.1 × the largest distance of a camera from the cameras' mean."""
     times: Times | None = None
-    """When the event happens; None: after every iteration."""
+    """Times at which the event happens; None: after every iteration."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Due:
-    """What an event on the host is told."""
+    """Information for an event on the host."""
 
     index: int = 1
-    """Which of the event's times in the stage it is, from 1."""
+    """Number of this time among the event's times in the stage, from 1."""
     count: int = 1
-    """How many times it has."""
+    """Number of the event's times in the stage."""
     views: Sequence[View] = ()
     """Training views, with the cameras that the scene gives."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
@@ -100,20 +100,20 @@ class Due:
 
 
 class EventInfo(NamedTuple):
-    """What an event did inside the step, traced."""
+    """Outcome of an event inside the step, traced."""
 
     is_possible: Any = True
     """False: training cannot go on (`StepEvent.impossible` says why), and the step is not taken."""
     num_refused: Any = 0
-    """Gaussians that wanted to be added, for which there was no room."""
+    """Number of Gaussians that found no room."""
 
 
 class Change(NamedTuple):
-    """What an event leaves."""
+    """Result of an event."""
 
     model: Model
     moments: AdamState
-    """Of (gaussians, params)."""
+    """Moments of (gaussians, params)."""
     state: Any
     info: EventInfo = EventInfo()
     rows: np.ndarray | None = None
@@ -139,20 +139,20 @@ class FieldError(ValueError):
 
 
 class Event:
-    """What both kinds of event have in common."""
+    """Base class of both kinds of event."""
 
     @property
     def statistic(self) -> Statistic | None:
-        """The statistic of the gradients that `observe` wants."""
+        """Statistic of the gradients that `observe` wants; None: none."""
         return None
 
     @property
     def observes(self) -> bool:
-        """Whether `observe` is to be called. Without a statistic it is told no `Seen.gradients` and `is_visible`."""
+        """Whether `observe` is called. Without a statistic, `Seen.gradients` and `is_visible` are zeros."""
         return self.statistic is not None
 
     def init(self, model: Model) -> Any:
-        """The state that `observe` starts from, a pytree of arrays; () where nothing is gathered.
+        """Return the state that `observe` starts from, a pytree of arrays; () if nothing is gathered.
 
         It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
         none does. `gather` follows those that move on the host.
@@ -160,7 +160,7 @@ class Event:
         return ()
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """The state where row i is the former row rows[i] (host). As here where arrays have a row for each Gaussian.
+        """Return the state whose row i is the former row rows[i] (host). The default wants a row for each Gaussian.
 
         Raises:
           ValueError: if an array has not.
@@ -177,29 +177,29 @@ class Event:
         return jax.tree.map(moved, state)
 
     def observe(self, state: Any, model: Model, seen: Seen) -> Any:
-        """The state after the views of an iteration; traced, and called while the event is still ahead."""
+        """Return the state after the views of an iteration; traced, and called while the event is still ahead."""
         return state
 
     @property
     def most_gaussians(self) -> int | None:
-        """How many Gaussians training may start from at most; None where the event does not mind."""
+        """Largest number of Gaussians that training may start from; None: any."""
         return None
 
     def num_rows(self, num: int, num_iterations: int) -> int:
-        """How many Gaussians the event can reach from `num`: so many rows are allocated (host)."""
+        """Return the number of Gaussians that the event can reach from `num`, and of allocated rows (host)."""
         return num
 
     def num_after(self, num: int, num_iterations: int) -> int:
-        """How many of `num` Gaussians there are at the end of the stage at most, for forecasts (host)."""
+        """Return the largest number of Gaussians at the end of the stage, of `num`, for forecasts (host)."""
         return num
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
-        """About how many bytes it leaves of a model of `num` Gaussians that has so many, for forecasts (host)."""
+        """Return the bytes that it leaves of a model of `num` Gaussians, about, for forecasts (host)."""
         return num_bytes
 
 
 class StepEvent(Event):
-    """Happens inside the step, at fixed shapes."""
+    """Event inside the step, at fixed shapes."""
 
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
@@ -209,27 +209,27 @@ class StepEvent(Event):
     """Advice if `EventInfo.num_refused` is not 0, such as "raise {cap}"; the event's fields stand in braces."""
 
     def times(self, num_iterations: int) -> Times:
-        """When it happens in a stage of so many iterations (host)."""
+        """Return the times of the event in a stage of so many iterations (host)."""
         return EVERY_ITERATION
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
-        """The model after the event; traced."""
+        """Return the model after the event; traced."""
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 
 class HostEvent(Event):
-    """Happens between steps, where values may be read and shapes may change."""
+    """Event between steps on the host, where values may be read and shapes may change."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        """After which iterations of a stage of so many it happens, ascending."""
+        """Return the iterations of a stage after which it happens, ascending."""
         raise NotImplementedError(f"{type(self).__name__} must say when it happens")
 
     def num_programs(self, num_iterations: int) -> int:
-        """About how many programs are compiled because of it, for forecasts: one each time, as shapes change (host)."""
+        """Return the number of programs compiled because of it, about, for forecasts: one each time (host)."""
         return len(self.iterations(num_iterations))
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
-        """The model after the event (host)."""
+        """Return the model after the event (host)."""
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 
@@ -254,13 +254,13 @@ def iterations_at(
 
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:
-    """A field of an event (or loss term) that chooses shapes or code, and is not traced."""
+    """Return a field of an event (or loss term) that chooses shapes or code, and is not traced."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
 def event(cls):
-    """Decorator: a frozen dataclass that is a pytree of its numbers."""
+    """Decorate a class: make it a frozen dataclass that is a pytree of its numbers."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
 
 
@@ -281,18 +281,18 @@ def from_options(kind: type[T], options: Any, **others: Any) -> T:
 
 
 def gather_rows(model: Model, rows: Array) -> Model:
-    """The model whose row i is the former row rows[i]."""
+    """Return the model whose row i is the former row rows[i]."""
     params = model.appearance.gather(model.params, model.layout, rows)
     return dataclasses.replace(model, gaussians=model.gaussians[rows], params=params)
 
 
 def gather_moments(model: Model, moments: AdamState, rows: Array) -> AdamState:
-    """Moments whose row i is the former row rows[i]."""
+    """Return the moments whose row i is the former row rows[i]."""
     return _of_pairs(moments, lambda g, p: (g[rows], model.appearance.gather(p, model.layout, rows)))
 
 
 def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamState:
-    """Moments with the marked rows [N] at zero."""
+    """Return the moments with the marked rows [N] at zero."""
 
     def clear(leaf: Array) -> Array:
         return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)

@@ -41,7 +41,7 @@ NOISE_TRANSPARENCY = 0.995
 
 
 class MoveInfo(NamedTuple):
-    """What an event did; scalars, traced."""
+    """Counts of one event; scalars, traced."""
 
     num_dead: Array
     """Live rows found dead by `relocate`, all of them moved; 0 from `grow`."""
@@ -52,18 +52,18 @@ class MoveInfo(NamedTuple):
 
 
 class MoveResult(NamedTuple):
-    """What `relocate` and `grow` return."""
+    """Result of `relocate` and `grow`."""
 
     gaussians: Gaussians
     moments: Any
-    """As given, with the rows of the hosts (and of the added) at zero."""
+    """Moments as given, with the rows of the hosts (and of the added) at zero."""
     num_live: Array
     """int32."""
     info: MoveInfo
 
 
 def relocate(key: Array, gaussians: Gaussians, moments, num_live: Array | int) -> MoveResult:
-    """Moves each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
+    """Move each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
 
     Host and moved ones share the opacity and size of `share`; everything else is copied from the host. The moments
     of a host become zero; the moved rows keep theirs.
@@ -88,7 +88,7 @@ def relocate(key: Array, gaussians: Gaussians, moments, num_live: Array | int) -
 
 
 def grow(key: Array, gaussians: Gaussians, moments, num_live: Array | int, cap: Array | int) -> MoveResult:
-    """Grows the live count n to min(cap, max(n + 1, ⌊1.05·n⌋)) by copies of hosts drawn as in `relocate`.
+    """Grow the live count n to min(cap, max(n + 1, ⌊1.05·n⌋)) by copies of hosts drawn as in `relocate`.
 
     Hosts and added rows start with zero moments. A count at the cap or above stays.
 
@@ -117,7 +117,7 @@ def grow(key: Array, gaussians: Gaussians, moments, num_live: Array | int, cap: 
 
 
 class Moves(NamedTuple):
-    """Which rows become copies of which; N rows, all traced."""
+    """Plan of which rows become copies of which; N rows, all traced."""
 
     rows: Array
     """[N] int32: row i becomes a copy of row rows[i], after sharing."""
@@ -176,7 +176,7 @@ def plan_growth(
 
 
 def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array | float) -> Gaussians:
-    """Adds exploration noise to the means of the live rows: Σ·ε·sigmoid(100·((1 - o) - 0.995))·lr·5e5.
+    """Add exploration noise to the means of the live rows: Σ·ε·sigmoid(100·((1 - o) - 0.995))·lr·5e5.
 
     Σ = R S Sᵀ Rᵀ is the covariance of the flat splat (its third scale is 0), ε is standard normal: the noise stays
     in the splat's plane and dies out on opaque Gaussians.
@@ -207,7 +207,7 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
 
 
 def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
-    """For every row a host, drawn independently with probability proportional to its opacity.
+    """Draw a host for every row, independently and with probability proportional to its opacity.
 
     Two draws, a block of about √N hosts and then a host in it: one cumulative sum over a million float32 weights
     would have a resolution of a tenth of a weight.
@@ -237,7 +237,7 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
 
 
 def _first_above(tables: Array, which: Array, targets: Array) -> Array:
-    """The first column whose value exceeds the target, in row `which` of ascending `tables` [B, 2^k]; [N] int32."""
+    """Return [N] int32, the first column above the target in row `which` of ascending `tables` [B, 2^k]."""
     step = tables.shape[1] // 2
     column = jnp.zeros_like(which)
     while step:
@@ -248,30 +248,30 @@ def _first_above(tables: Array, which: Array, targets: Array) -> Array:
 
 
 def _live_and_hosts(opacities: Array, num_live: Array) -> tuple[Array, Array]:
-    """[N] which rows are live, and which of those are above the death opacity."""
+    """Return masks [N] of live rows, and of live rows above the death opacity."""
     is_live = jnp.arange(opacities.shape[0], dtype=jnp.int32) < num_live
     return is_live, is_live & (opacities > DEAD_OPACITY)
 
 
 def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
-    """[N] the row that each row copies, its host where it is a target; and [N] how often each is drawn."""
+    """Return [N] the row that each row copies, the host for targets, and [N] the number of its draws."""
     num_draws = jnp.zeros(hosts.shape[0], jnp.int32).at[hosts].add(is_target.astype(jnp.int32))
     return jnp.where(is_target, hosts, jnp.arange(hosts.shape[0], dtype=jnp.int32)), num_draws
 
 
 def _copy_hosts(gaussians: Gaussians, moves: Moves) -> Gaussians:
-    """Rows copied from their hosts after sharing."""
+    """Return the rows copied from their hosts after sharing."""
     shared = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
     return dataclasses.replace(gaussians, logit_opacities=shared[0], log_scales=shared[1])[moves.rows]
 
 
 def _zero_rows(tree, is_zeroed: Array):
-    """The pytree with the marked rows of every leaf at zero."""
+    """Return the pytree with the marked rows of every leaf at zero."""
     return jax.tree.map(lambda x: jnp.where(is_zeroed.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x), tree)
 
 
 def _check_moments(gaussians: Gaussians, moments) -> None:
-    """Raises ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
+    """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
     for leaf in jax.tree.leaves(moments):
         if leaf.ndim == 0 or leaf.shape[0] != gaussians.num:
@@ -279,7 +279,7 @@ def _check_moments(gaussians: Gaussians, moments) -> None:
 
 
 def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
-    """When densification happens: the paper's 500, 25,000 and every 100 of 30,000 iterations, scaled."""
+    """Return the times of densification: the paper's 500, 25,000 and every 100 of 30,000 iterations, scaled."""
     every = max(10, round(num_iterations / 300))
     return Times(round(num_iterations / 60), int(last * num_iterations + 1e-9), every)
 
@@ -312,12 +312,12 @@ class Mcmc(StepEvent):
         return self.cap
 
     def num_rows(self, num: int, num_iterations: int) -> int:
-        """The cap, or, where growth from `num` does not reach half of it, what it reaches, rounded up to few shapes."""
+        """Return the cap, or, if growth reaches less than half of it, what it reaches, rounded up to few shapes."""
         num = self.grown(num, num_iterations)
         return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
 
     def grown(self, num: int, num_iterations: int) -> int:
-        """How many Gaussians it makes of `num` (host)."""
+        """Return the number of Gaussians after growth from `num` (host)."""
         times = self.times(num_iterations)
         for iteration in range(times.every, times.last + 1, times.every):
             if num < self.cap and iteration >= times.first:
@@ -332,7 +332,7 @@ class Mcmc(StepEvent):
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
 
     def least(self, now: Now, num_live: Array) -> Array | int:
-        """How many Gaussians growth leaves at least; traced."""
+        """Return the least number of Gaussians after growth; traced."""
         return 0
 
     @staticmethod
@@ -348,7 +348,7 @@ class Mcmc(StepEvent):
 
 @event
 class FillingMcmc(Mcmc):
-    """As `Mcmc`, but growth by 5 % is made faster where the cap would not be reached by the last of its events."""
+    """Variant of `Mcmc` that grows by more than 5 % if it takes that to reach the cap by its last event."""
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations).num_times:

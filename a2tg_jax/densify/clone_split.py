@@ -34,14 +34,14 @@ from a2tg_jax.events import (
 from a2tg_jax.model import Model
 
 SPLIT_SHRINK = 1.6
-"""The halves of a split Gaussian are so many times smaller."""
+"""Factor by which the halves of a split Gaussian are smaller."""
 LEAST_BETWEEN_RESETS = 500
 RECOVERY = 100
 """Iterations after a reset in which nothing is pruned for being faint: Adam needs them to raise an opacity again."""
 
 
 class Edit(NamedTuple):
-    """Which rows stay, and which are doubled; [N] booleans."""
+    """Rows that stay, and rows that are doubled; [N] booleans."""
 
     is_kept: Array
     is_cloned: Array
@@ -57,15 +57,15 @@ class CloneSplitPrune(StepEvent):
     """
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians. Where more are wanted the largest gradients are served, and the others counted."""
+    """Largest number of Gaussians. If more are wanted, the largest gradients are served and the others counted."""
     threshold: float = 2e-4
     """Smallest average gradient that is densified, by the position on the screen in units of half an image."""
     dense_share: float = 0.01
-    """Gaussians larger than this share of scene_scale are split, the others cloned."""
+    """Share of scene_scale above which Gaussians are split; smaller ones are cloned."""
     least_opacity: float = 0.05
-    """Fainter ones are pruned."""
+    """Smallest opacity; fainter Gaussians are pruned."""
     largest_share: float = 0.1
-    """Larger ones, as a share of scene_scale, are pruned after the first reset of opacities."""
+    """Largest size as a share of scene_scale; larger Gaussians are pruned after the first reset of opacities."""
 
     impossible: ClassVar[str] = "adaptive density control would prune every Gaussian: lower {least_opacity}"
     refused: ClassVar[str] = "raise {cap}"
@@ -96,7 +96,7 @@ class CloneSplitPrune(StepEvent):
         return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
-        """What happens to each row, and how many Gaussians there was no room for.
+        """Return the edit of each row, and the number of Gaussians without room.
 
         Args:
           gradients: [N] averages.
@@ -109,7 +109,7 @@ class CloneSplitPrune(StepEvent):
         return edit, jnp.sum(is_wanted & ~(edit.is_cloned | edit.is_split), dtype=jnp.int32)
 
     def _is_pruned(self, now: Now, model: Model) -> Array:
-        """[N] what is too faint or too large."""
+        """Return a mask [N] of rows that are too faint or too large."""
         opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
         between = reset_interval(now.num_iterations)
         is_late, since_reset = now.iteration > between, now.iteration % between
@@ -124,10 +124,10 @@ class CloneSplitPrune(StepEvent):
 
 @event
 class FillingDensity(CloneSplitPrune):
-    """As `CloneSplitPrune`, but with so many Gaussians after each event that the last leaves the cap.
+    """Variant of `CloneSplitPrune` that grows by as much in each event as it takes to end at the cap.
 
-    The largest gradients are doubled, whether above the threshold or not. Pruning goes on while those that are left
-    suffice: where too many would go, the most opaque stay.
+    The largest gradients are doubled, whether above the threshold or not. Pruning goes on while enough Gaussians are
+    left; if too many would go, the most opaque stay.
     """
 
     def num_rows(self, num: int, num_iterations: int) -> int:
@@ -157,17 +157,17 @@ class FillingDensity(CloneSplitPrune):
 
 
 def is_live(model: Model) -> Array:
-    """[N] which rows exist."""
+    """Return a mask [N] of the rows that exist."""
     return jnp.arange(model.gaussians.num, dtype=jnp.int32) < model.live_count
 
 
 def _sizes(model: Model) -> Array:
-    """[N] the larger standard deviations."""
+    """Return [N] the larger standard deviations."""
     return jnp.max(model.gaussians.scales, axis=1)
 
 
 def _ranks(values: Array, is_ranked: Array) -> Array:
-    """[N] int32 places in descending order of value, equal ones in the order of rows, those not ranked last."""
+    """Return [N] int32 places in descending order of value, equal ones in the order of rows, those not ranked last."""
     num = values.shape[0]
     order = jnp.argsort(jnp.where(is_ranked, -values, jnp.inf), stable=True)
     return jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
@@ -208,15 +208,16 @@ def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
 
 
 def reset_interval(num_iterations):
-    """Iterations between two resets of the opacities: the published 3,000 of 30,000, scaled, but 500 at least."""
+    """Return the iterations between two resets of opacities: 3,000 of 30,000 as published, scaled, at least 500."""
     return jnp.maximum(num_iterations // 10, LEAST_BETWEEN_RESETS)
 
 
 @event
 class OpacityReset(StepEvent):
-    """No Gaussian stays more opaque than `most`: every max(500, n/10) of n iterations, until n/2."""
+    """Reset of opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2."""
 
     most: float = 0.01
+    """Largest opacity after a reset."""
 
     num_keys: ClassVar[int] = 0
 

@@ -1,4 +1,4 @@
-"""Pruning: the Gaussians that show least go, so that their bytes are spent where they show.
+"""Pruning of the Gaussians that show least: their bytes are spent where they show more.
 
 What a Gaussian shows is the sum of its blending weights w = α·T over the pixels of the training views that count: how
 much of the pictures is its colour. Many that densification leaves are hidden, or too faint to matter. This event
@@ -28,17 +28,17 @@ from a2tg_jax.render import RenderSettings, plan_render, render_traced
 
 @event
 class Prune(HostEvent):
-    """Removes those Gaussians whose blending weights, summed over the training views, are least.
+    """Pruning of the Gaussians whose blending weights, summed over the training views, are least.
 
     The views are seen from the cameras that the scene gives, not from refined ones.
     """
 
     share: float = 0.1
-    """Of the Gaussians, in [0, 1), removed each time; not used where `keep` is given."""
+    """Share of the Gaussians removed each time, in [0, 1); ignored if `keep` is given."""
     keep: int | None = static(default=None)
-    """How many are left each time, at most."""
+    """Largest number of Gaussians left each time."""
     at: tuple[float, ...] = static(default=(1.0,))
-    """Fractions of the stage at which it happens; 1: at its end."""
+    """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         if any(not 0 < fraction <= 1 for fraction in self.at) or list(self.at) != sorted(set(self.at)):
@@ -73,7 +73,7 @@ class Prune(HostEvent):
 
 
 def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
-    """[N] Σ α·T of each Gaussian over the pixels of all views that count, in pixels (host).
+    """Return [N] Σ α·T of each Gaussian over the pixels of all views that count, in pixels (host).
 
     Args:
       model: N rows; those that do not exist have weight 0.
@@ -104,7 +104,7 @@ def _jitted() -> jit:
 
 
 def _weights(model: Model, cameras: Camera, counted: Array, settings: RenderSettings) -> Array:
-    """The sums over views of one size: a picture is linear in the colours, and this is the backward pass of ones."""
+    """Return the sums over views of one size: the backward pass of ones, for a picture is linear in the colours."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
     def of_view(total: Array, view: tuple[Camera, Array]) -> tuple[Array, None]:

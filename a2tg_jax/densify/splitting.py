@@ -25,7 +25,7 @@ from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
 
 LEAST_WEIGHT = 1e-12
-"""Of a host that no view has seen."""
+"""Weight of a host that no view has seen."""
 
 
 @event
@@ -60,7 +60,7 @@ class SplitByGradient(FillingMcmc):
 
 
 def draw_weights(model: Model, state: GradientStatistics) -> Array:
-    """[N] what the probability of being a host is proportional to: average gradient by position, times the size."""
+    """Return [N] weights of drawing a host: average gradient by position, times the size."""
     size = jnp.exp(jnp.mean(model.gaussians.log_scales, axis=1))
     return state.average() * size + LEAST_WEIGHT
 
@@ -88,7 +88,7 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
 def split_rows(
     key: Array, moves: Moves, model: Model, moments: AdamState, state: GradientStatistics
 ) -> tuple[Model, AdamState, GradientStatistics]:
-    """Rows copied from their hosts; hosts and copies are halved, forget Adam's moments, and share the statistic."""
+    """Copy rows from their hosts; hosts and copies are halved, lose Adam's moments and share the statistic."""
     is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
     total = state.total / moves.num_shares.astype(state.total.dtype)
     state = GradientStatistics(total[moves.rows], state.views[moves.rows])

@@ -1,4 +1,4 @@
-"""Where spherical harmonics go: a degree per Gaussian, raised where the gradient asks for it, lowered where it is idle.
+"""Adaptive spherical harmonics: a degree per Gaussian, raised where the gradient asks for it, lowered where it is idle.
 
 The image is linear in the coefficients, so that the gradient at a coefficient which a Gaussian does not have yet is
 known: Σ over views of ∂L/∂colour · Y(direction). What residuals of many views have in common adds up in it, what they
@@ -38,7 +38,7 @@ class ViewDependence:
         return ViewDependence(jnp.zeros((num, 16, 3), dtype), jnp.zeros((), jnp.int32))
 
     def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
-        """Adds V views.
+        """Add V views.
 
         Args:
           means: [N, 3] of the Gaussians.
@@ -52,7 +52,7 @@ class ViewDependence:
         return ViewDependence(total, self.views + len(colors))
 
     def strengths(self) -> np.ndarray:
-        """[N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
+        """Return [N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
         mean = np.asarray(self.total) / max(1, int(self.views))
         return np.stack([np.linalg.norm(mean[:, band], axis=(1, 2)) for band in BAND_SLICES], axis=1)
 
@@ -68,13 +68,13 @@ class AdaptDegrees(HostEvent):
     """
 
     budget_mb: float = 0.0
-    """Reported memory never exceeds this many MB (10^6 bytes)."""
+    """Largest reported memory in MB (10^6 bytes)."""
     at: tuple[float, ...] = static(default=(0.05, 0.1))
-    """Fractions of the stage at which it happens. Each time an equal part of what is left of the budget is spent."""
+    """Fractions of the stage at which degrees change. Each time spends an equal part of the remaining budget."""
     highest: int = static(default=MAX_DEGREE)
-    """No degree rises above it."""
+    """Highest degree."""
     idle: float = 0.0
-    """Bands that change a colour by less than this (root mean square over all directions) are given up."""
+    """Smallest change of a colour by a band (root mean square over all directions); bands below it are removed."""
 
     observes = True
 
@@ -107,7 +107,7 @@ class AdaptDegrees(HostEvent):
 
 
 def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:
-    """[N] degrees, one less where the highest band changes the colour by less than `idle` (host).
+    """Return [N] degrees, one less if the highest band changes the colour by less than `idle` (host).
 
     Spherical harmonics are orthonormal, so that the mean square of what a band adds, over all directions and three
     channels, is the sum of its squared coefficients by 12π.
@@ -123,19 +123,19 @@ def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:
 
 
 def saved_bytes(layout: BandLayout, degrees: np.ndarray, num: int) -> int:
-    """Bytes that the first `num` Gaussians need less at lower degrees (host)."""
+    """Return the bytes that the first `num` Gaussians save at lower degrees (host)."""
     floats = np.asarray([3 * NUM_BASES[degree] for degree in range(MAX_DEGREE + 1)])
     return BYTES_PER_FLOAT * int((floats[layout.degrees[:num]] - floats[degrees[:num]]).sum())
 
 
 def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
-    """[N] degrees, one more for as many as the budget allows, in descending order of gradient per added byte (host).
+    """Return [N] degrees, raised by one in descending order of gradient per added byte within a budget (host).
 
     Args:
       degrees: [N] 0 to 3.
       strengths: [N, 3] of the bands of degree 1, 2 and 3.
       budget: bytes.
-      highest: no degree rises above it.
+      highest: largest degree.
     """
     following = np.minimum(degrees, MAX_DEGREE - 1)
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]

@@ -1,4 +1,4 @@
-"""How small the file of a model can be: what each choice of bits costs in dB, and the smallest file within a loss.
+"""Smallest file of a model: what each choice of bits costs in dB, and the smallest file within a loss.
 
 A loss is a function of a model: how many dB it is below the one that it was made from. It is measured on photographs,
 or, where there are none, guessed from how far renders are from that model's.
@@ -35,9 +35,9 @@ LADDER: Ladder = MappingProxyType(
         "texels": (3, 4, 5, 6, 7, 8, 10),
     }
 )
-"""What is tried, of each group from coarse to fine."""
+"""Precisions that are tried, for each group from coarse to fine."""
 ASSUMED_PSNR = 30.0
-"""Of a model against photographs that are not there, in dB."""
+"""Assumed PSNR of a model on photographs that are not there, in dB."""
 LEAST_LOSS = 1e-4
 """Differences in dB below it are taken for this one: they are noise."""
 
@@ -48,11 +48,11 @@ class Trial:
 
     choices: CompactChoices
     num_bytes: int
-    """On disk."""
+    """Bytes on disk."""
     losses: tuple[float, ...]
     """dB, by each measure of loss."""
     group: str = ""
-    """What is kept more coarsely than the rest, where one group is."""
+    """Group that is kept more coarsely than the rest, if one is."""
 
     @property
     def precision(self) -> Precision:
@@ -67,7 +67,7 @@ def loss_on_views(
     background: Color | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
-    """How much PSNR, as a mean over the photographs of some views, models have less than the given one."""
+    """Return the PSNR that models lose against the given one, as a mean over the photographs of some views."""
     background = model.background if background is None else background
     draw = _drawing(model, [view.camera for view in views], background, settings)
 
@@ -86,7 +86,7 @@ def loss_beside_renders(
     assumed_psnr: float = ASSUMED_PSNR,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
-    """How much PSNR models would have less than the given one on photographs that it renders with `assumed_psnr`.
+    """Return the PSNR that models would lose on photographs that the given one renders with `assumed_psnr`.
 
     10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR stands for. Errors
     that have nothing to do with each other add up so.
@@ -103,7 +103,7 @@ def loss_beside_renders(
 
 
 def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings):
-    """Draws models like the given one for cameras, clipped to [0, 1]; compiled once as long as the room suffices."""
+    """Draw models like the given one for cameras, clipped to [0, 1]; compiled once as long as the room suffices."""
     if not cameras:
         raise ValueError("there are no views to measure a loss on")
     options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
@@ -118,7 +118,7 @@ def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings:
 
 
 def _error_on(view: View, image: np.ndarray, background: Color) -> float:
-    """Mean squared error of a render over the pixels of a photograph that count."""
+    """Return the mean squared error of a render over the pixels of a photograph that count."""
     counts = ... if view.mask is None else view.mask.read()
     return _squared_error(image[counts], np.clip(view_image(view, background), 0, 1)[counts])
 
@@ -128,19 +128,19 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> float:
 
 
 def try_choices(model: Model, choices: CompactChoices, losses: Sequence[Loss], group: str = "") -> Trial:
-    """The size of a file, and what the model that is read from it loses by each measure (host)."""
+    """Return the size of a file, and what the model that is read from it loses by each measure (host)."""
     data = encode_model(model, choices)
     again = decode_model(data)
     return Trial(choices, len(data), tuple(loss(again) for loss in losses), group)
 
 
 def finest_choices(ladder: Ladder = LADDER) -> CompactChoices:
-    """The last of each group."""
+    """Return the last of each group."""
     return CompactChoices().keeping({group: steps[-1] for group, steps in ladder.items()})
 
 
 def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDER) -> list[Trial]:
-    """Each group kept as each of its steps says, the other groups at their finest: sizes and losses (host).
+    """Return sizes and losses of each group at each of its steps, the other groups at their finest (host).
 
     Args:
       model: the model.
@@ -161,7 +161,7 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
 
 
 def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial]) -> Trial:
-    """The smallest file that loses so much at most by the first measure, found by greed (host).
+    """Return the smallest file within a loss by the first measure, found greedily (host).
 
     From the finest choices on, the step that saves most bytes for what it loses is taken, as long as the losses of all
     groups together, as measured apart, stay within; then the last steps are taken back until the file itself does, and
@@ -191,10 +191,10 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
 def _with_single_steps(
     model: Model, losses: Sequence[Loss], max_loss: float, by_size: Mapping[str, Sequence[Trial]], found: Trial
 ) -> Trial:
-    """The file with each group a step smaller, where it loses no more than it may: those that save most first."""
+    """Return the file with each group a step smaller, within the allowed loss: largest savings first."""
 
     def next_step(group: str) -> tuple[int, Precision]:
-        """What the next smaller step of a group saves, and its precision; nothing where there is none."""
+        """Return what the next smaller step of a group saves, and its precision; nothing if there is none."""
         own = by_size[group]
         at = [trial.precision for trial in own].index(getattr(found.choices, group))
         return own[at].num_bytes - own[max(at - 1, 0)].num_bytes, own[max(at - 1, 0)].precision
@@ -208,7 +208,7 @@ def _with_single_steps(
 
 
 def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[dict[str, Precision]]:
-    """The precisions after each step down, of groups' trials from small to large."""
+    """Return the precisions after each step down, of groups' trials from small to large."""
     at = {group: own[-1] for group, own in by_group.items()}
     path: list[dict[str, Precision]] = []
     while True:

@@ -29,12 +29,12 @@ HIGHEST_DEGREE = 3
 
 
 class Colors(NamedTuple):
-    """What a picture is linear in."""
+    """Colours, in which a picture is linear."""
 
     sh: Array
     """[N, K, 3] of the Gaussians."""
     bands: Any
-    """Those beyond, or ()."""
+    """Coefficients of higher degrees, or ()."""
     rgb: tuple[Array, ...]
     """[capacity, Tv, Tu, 3] of each bucket of textures."""
 
@@ -51,7 +51,7 @@ class Photographs(NamedTuple):
 
 
 def polish(model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background=None) -> Model:
-    """The model with colours nearer to the least squared error over the views (host).
+    """Return the model with colours nearer to the least squared error over the views (host).
 
     Args:
       model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
@@ -79,10 +79,10 @@ def _jitted() -> jit:
 
 
 def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):
-    """The changes of the colours."""
+    """Return the changes of the colours."""
 
     def over_views(function):
-        """The sum over all views of what a function of camera and photograph gives."""
+        """Return the sum over all views of what a function of camera and photograph gives."""
         total = jax.tree.map(jnp.zeros_like, colors_of(model))
         for group in groups:
             height, width = group.images.shape[1:3]
@@ -113,7 +113,7 @@ def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSett
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
-    """[H, W, 3] what a change of the colours adds to a picture; linear in it."""
+    """Return the change [H, W, 3] of a picture by a change of the colours; linear in it."""
     is_shown = model.rule.own_color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
     sums = changed.rule.own_color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
@@ -124,21 +124,21 @@ def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSe
 
 
 def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Array) -> Colors:
-    """The transpose of `draw_change`, of an image."""
+    """Return the transpose of `draw_change`, of an image."""
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
     _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
     return back(image)[0]
 
 
 def colors_of(model: Model) -> Colors:
-    """What a picture of the model is linear in."""
+    """Return the colours, in which a picture of the model is linear."""
     bands = model.params.bands if isinstance(model.appearance, Banded) else ()
     buckets = model.textures[0].buckets if model.textures else ()
     return Colors(model.gaussians.sh, bands, tuple(bucket[..., :3] for bucket in buckets))
 
 
 def with_colors(model: Model, colors: Colors) -> Model:
-    """The model with other colours; alpha textures stay."""
+    """Return the model with other colours; alpha textures stay."""
     gaussians = dataclasses.replace(model.gaussians, sh=colors.sh)
     params = model.params._replace(bands=colors.bands) if isinstance(model.appearance, Banded) else model.params
     model = dataclasses.replace(model, gaussians=gaussians, params=params)
@@ -162,7 +162,7 @@ def _check(model: Model, views: Sequence[View]) -> None:
 
 
 def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
-    """The views, one stack for each image size, in the dtype of the background."""
+    """Return the views, one stack for each image size, in the dtype of the background."""
     color, dtype = np.asarray(background), background.dtype
     return [
         Photographs(

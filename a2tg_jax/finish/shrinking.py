@@ -29,13 +29,13 @@ from a2tg_jax.render import RenderSettings, plan_render, render_traced
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
 
 LEAST_OPACITY = 1e-4
-"""Of a Gaussian that takes over a texel's alpha: its logit must be finite."""
+"""Largest opacity of a Gaussian after absorbing a texel's alpha: its logit must be finite."""
 LEAST_SAVED = 0.005
 """Rounds that save less of a model's bytes are the last."""
 
 
 def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.02, background=None) -> Model:
-    """The model with smaller textures, and as many Gaussians (host).
+    """Return the model with smaller textures, and as many Gaussians (host).
 
     Args:
       model: of `Textured` with signed RGB, or of `Banded` around it.
@@ -75,7 +75,7 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
 
 
 def _shrunk_once(model: Model, views: Sequence[View], background: Any, is_allowed: Any) -> Model:
-    """The model after the cheapest of one step for each texture, as many as are allowed."""
+    """Return the model after the cheapest of one step for each texture, as many as are allowed."""
     step = halved(model, texel_weights(model, views, background))
     saved = step.saved
     order = np.argsort(step.cost / np.maximum(saved, 1), kind="stable")
@@ -104,7 +104,7 @@ class Step(NamedTuple):
     """One step for each texture, of N."""
 
     gaussians: Gaussians
-    """That have taken over their single texels."""
+    """Gaussians after absorbing their 1×1 textures."""
     textures: Textures
     layout: AtlasLayout
     cost: np.ndarray
@@ -157,7 +157,7 @@ def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[n
 
 
 def _with_single_texels(model: Model) -> Gaussians:
-    """The Gaussians, those with a texture of one texel in its colour and as opaque as it makes them."""
+    """Return the Gaussians, those with a texture of one texel in its colour and as opaque as it makes them."""
     textures, layout = model.textures  # type: ignore[misc]
     gaussians = model.gaussians
     texels = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (layout.num, 1))
@@ -174,7 +174,7 @@ def _with_single_texels(model: Model) -> Gaussians:
 
 
 def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
-    """The model in which the chosen Gaussians [N] have taken their step (host)."""
+    """Return the model in which the chosen Gaussians [N] have taken their step (host)."""
     old, old_layout = model.textures  # type: ignore[misc]
     sizes = np.where(is_chosen[:, None], step.layout.sizes, old_layout.sizes)
     pieces = []
@@ -226,7 +226,7 @@ def _jitted() -> jit:
 
 
 def _weights_in(model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings) -> Textures:
-    """What one view adds to the weights."""
+    """Return the weights from one view."""
     textures, layout = model.textures  # type: ignore[misc]
 
     def draw(textures: Textures) -> Array:

@@ -1,4 +1,4 @@
-"""What test views are aligned by before they are scored: their colours by least squares, their poses by descent.
+"""Alignment of test views before they are scored: their colours by least squares, their poses by descent.
 
 A model that was trained with exposures or refined poses is right up to those of a photograph that it has never seen. As
 is the custom, these few numbers of a test photograph are found from itself, with the model held.
@@ -26,12 +26,13 @@ from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 NUM_STEPS = 100
 FIRST_RATE = 2e-3
 LAST_RATE = 2e-5
-"""In radians and units of the normalised world; the rate falls exponentially, and all steps together lead some 2.5°."""
+"""Learning rate in radians and units of the normalised world; the rate falls
+exponentially, and all steps together lead some 2.5°."""
 HEAD_ROOM = 1.5
 
 
 def color_fit(image: Any, target: Any, mask: Any = None) -> np.ndarray:
-    """The affine map of colours [3, 4] = [A | b] of least squared error |A·image + b − target|² (host).
+    """Return the affine map of colours [3, 4] = [A | b] of least squared error |A·image + b − target|² (host).
 
     Args:
       image: [H, W, 3] a render.
@@ -55,7 +56,7 @@ def align_poses(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     num_steps: int = NUM_STEPS,
 ) -> tuple[View, ...]:
-    """The views with cameras from which the model looks most like their photographs (host).
+    """Return the views with cameras from which the model looks most like their photographs (host).
 
     Adam descends the photometric loss by a twist of the camera in its own frame; the best step of each view is kept,
     so that no loss becomes worse.
@@ -80,7 +81,7 @@ class _Best(NamedTuple):
     loss: Array
     twist: Array
     overflow: Array
-    """At any step."""
+    """Least loss at any step."""
 
 
 def _aligned(view: View, model: Model, background: Array, settings: RenderSettings, num_steps: int) -> View:
@@ -103,7 +104,7 @@ def _jitted_descent() -> jit:
 
 
 def _descent(gaussians, rule, camera: Camera, target: Array, mask, background, settings, num_steps: int) -> _Best:
-    """The twist of least loss among those that Adam comes to."""
+    """Return the twist of least loss among those that Adam comes to."""
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     shown = target if mask is None else jnp.where(mask[..., None], target, 0.0)
 

@@ -32,7 +32,7 @@ class ViewMetrics:
     psnr: float
     """dB, higher is better."""
     ssim: float
-    """At most 1, higher is better."""
+    """Structural similarity, at most 1; higher is better."""
     lpips: float | None
     """Lower is better; None where no weights were given."""
     flat_psnr: float
@@ -52,7 +52,7 @@ class Evaluation:
     """Images of the first views, uint8 [H, W, 3]; as many as were asked for."""
 
     def __getitem__(self, views: slice) -> "Evaluation":
-        """The figures of some of the views."""
+        """Return the figures of some of the views."""
         return dataclasses.replace(self, per_view=self.per_view[views], renders=self.renders[views])
 
     @property
@@ -93,7 +93,7 @@ def evaluate(
     num_renders: int = 0,
     fit_colors: bool = False,
 ) -> Evaluation:
-    """Renders every view and compares it with its photograph, where its pixels count (host).
+    """Render every view and compares it with its photograph, where its pixels count (host).
 
     Args:
       views: at least one.
@@ -136,7 +136,7 @@ def evaluate(
 
 
 def _model_of(gaussians: Gaussians | Model, textures, layout, settings: RenderSettings) -> Model:
-    """The one value that all these are."""
+    """Return the model that the arguments describe."""
     if isinstance(gaussians, Model):
         if textures is not None or layout is not None:
             raise ValueError("textures and layout are part of a model: give the model alone")
@@ -148,7 +148,7 @@ def _model_of(gaussians: Gaussians | Model, textures, layout, settings: RenderSe
 
 
 def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:
-    """Time of one image; the renderer has drawn this size before."""
+    """Return the seconds of one image; the renderer has drawn this size before."""
     start = time.perf_counter()
     jax.block_until_ready(renderer(camera))
     return time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""What a result is judged by: PSNR, SSIM, LPIPS on images clipped to [0, 1], and the bytes of its parameters.
+"""Metrics: PSNR, SSIM, LPIPS on images clipped to [0, 1], and the bytes of its parameters.
 
 Images are [H, W, 3] floats, a mask is [H, W] bool, True where a pixel counts: where one does not, both images are
 black. LPIPS takes its network from a weights file, which this package does not contain.
@@ -74,7 +74,7 @@ class LpipsWeights:
 
 
 def load_lpips(path: str | os.PathLike) -> LpipsWeights:
-    """Reads LPIPS weights from an .npz file, once per path; the network is told from the arrays in it.
+    """Read LPIPS weights from an .npz file, once per path; the network is told from the arrays in it.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -121,7 +121,7 @@ def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> 
 
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
-    """Both images in [0, 1], and black where pixels do not count."""
+    """Return both images in [0, 1], and black where pixels do not count."""
     image, target = jnp.asarray(image), jnp.asarray(target)
     losses.check_same_shape(image, target)
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
@@ -133,7 +133,7 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
 
 
 def _share_of_windows(mask: Array, dtype) -> Array:
-    """Share of SSIM's windows in which at least one pixel counts."""
+    """Return the share of SSIM's windows in which at least one pixel counts."""
     window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
     counts = jax.lax.reduce_window(mask.astype(dtype), -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
     return jnp.mean(counts)
@@ -154,7 +154,7 @@ def _load_lpips(path: pathlib.Path) -> LpipsWeights:
 
 
 def _check_weights(path: pathlib.Path, weights: LpipsWeights) -> None:
-    """Raises ValueError unless the network runs on these arrays, tried by shapes alone."""
+    """Raise ValueError unless the network runs on these arrays, tried by shapes alone."""
     image = jax.ShapeDtypeStruct((1, LPIPS_MIN_SIDE, LPIPS_MIN_SIDE, 3), jnp.float32)
     try:
         features = jax.eval_shape(functools.partial(_FEATURES[weights.network], weights.arrays), image)
@@ -178,7 +178,7 @@ def _layer_distance(features: Array, linear: np.ndarray) -> Array:
 
 
 def _alexnet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
-    """The five ReLU outputs of torchvision's AlexNet that LPIPS compares; x and they are NHWC."""
+    """Return the five ReLU outputs of torchvision's AlexNet that LPIPS compares; x and they are NHWC."""
     relu1 = _conv_relu(arrays, "features.0", x, stride=4, padding=2)
     relu2 = _conv_relu(arrays, "features.3", _max_pool(relu1), padding=2)
     relu3 = _conv_relu(arrays, "features.6", _max_pool(relu2), padding=1)
@@ -188,7 +188,7 @@ def _alexnet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
 
 
 def _squeezenet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
-    """The seven outputs of torchvision's SqueezeNet 1.1 that LPIPS compares; x and they are NHWC."""
+    """Return the seven outputs of torchvision's SqueezeNet 1.1 that LPIPS compares; x and they are NHWC."""
     fire = functools.partial(_fire, arrays)
     relu1 = _conv_relu(arrays, "features.0", x, stride=2)
     fire2 = fire("features.4", fire("features.3", _max_pool(relu1, is_ceil=True)))

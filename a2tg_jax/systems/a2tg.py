@@ -30,7 +30,7 @@ from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0}
-"""What short runs want (docs/results.md)."""
+"""Options of short runs (docs/results.md)."""
 BUDGET_TEXELS = 5
 """Texels a Gaussian that a memory budget leaves room for on average: about as many as two or three upscalings of a
 quarter of the Gaussians make. Gaussians then take four fifths of the bytes."""
@@ -57,10 +57,10 @@ class TextureConfig(UpscaleChoices):
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     single_rate: float | None = None
-    """That of textures of one texel, which are no more than another colour and opacity of their Gaussian; None:
-    `rate`; 0: they stay as they begin, until they grow."""
+    """Adam's learning rate of textures of one texel, which only add a colour and opacity to their Gaussian; None:
+    `rate`; 0: constant until they grow."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read."""
+    """Options of the texture lookup."""
 
     def event(self) -> Upscale:
         """Return the upscaling of these options.
@@ -76,7 +76,7 @@ class TextureConfig(UpscaleChoices):
 
     @staticmethod
     def official() -> "TextureConfig":
-        """The choices of the authors' own program."""
+        """Return the choices of the authors' own program."""
         lookup = TextureOptions.official()
         return TextureConfig(
             select="threshold",
@@ -93,10 +93,12 @@ class A2tg(System):
     """Adaptive anisotropic textured Gaussians: MCMC densification, then textures that grow."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 30_000
+    """Iterations of the second stage."""
     densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
     noise_in_stage2: bool = False
-    """Keep the exploration noise on in stage 2, as the authors' program does."""
+    """Whether exploration noise goes on in stage 2, as in the authors' program."""
     texture: TextureConfig = dataclasses.field(default_factory=TextureConfig)
 
     name: ClassVar[str] = "a2tg"
@@ -128,7 +130,7 @@ class A2tg(System):
         return first, later_stage(self, "textures", textured, events, self.stage2_iterations, rates)
 
     def _texture(self) -> TextureConfig:
-        """The textures' options, those of a memory budget in place of others."""
+        """Return the textures' options, those of a memory budget in place of others."""
         if self.memory_budget is None:
             return self.texture
         if self.texture.budget_mb is not None:
@@ -136,7 +138,7 @@ class A2tg(System):
         return dataclasses.replace(self.texture, select="budget", budget_mb=megabytes_of(self.memory_budget))
 
     def _budget_texels(self, upscale: Upscale) -> float:
-        """Texels a Gaussian that the number of Gaussians leaves room for: at most half of what there can be."""
+        """Return the texels a Gaussian that the budget leaves room for, at most half of the largest texture."""
         with self.naming_options():
             can_grow = bool(upscale.iterations(self.stage2_iterations))
         return min(BUDGET_TEXELS, (1 + upscale.cap**2) / 2) if can_grow else 1
@@ -163,7 +165,7 @@ class A2tg(System):
         }  # fmt: skip
 
     def check_number(self, num: int) -> None:
-        """Refuses textures' bytes that the Gaussians of the first stage take up already."""
+        """Refuse textures' bytes that the Gaussians of the first stage take up already."""
         if self._texture().select != "budget" or self.memory_budget is not None or not self.densify.is_enabled:
             return
         assert self.texture.budget_mb is not None

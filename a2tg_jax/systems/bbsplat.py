@@ -16,7 +16,7 @@ class BillboardConfig:
     """The pictures, and how many of them."""
 
     side: int = 16
-    """Every picture is side × side texels, 2 to 16."""
+    """Side of every picture in texels, 2 to 16."""
     rgb: float = 2.5e-3
     """Adam's learning rate of the colours."""
     alpha: float = 1e-3
@@ -28,8 +28,8 @@ class BillboardMcmcConfig:
     """MCMC densification of billboards."""
 
     cap: int = 160_000
-    """Largest number of billboards, each, at 16 × 16, of as many bytes as 18.6 plain Gaussians. A memory_budget takes
-    its place."""
+    """Largest number of billboards; a memory_budget takes its place. A billboard of 16 × 16 texels has as many bytes as
+    18.6 plain Gaussians."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,8 +37,9 @@ class BBSplat(System):
     """Flat RGBA pictures, whose alpha takes the place of opacity and Gaussian."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 2_000
-    """Iterations that follow without densification; 0: none."""
+    """Further iterations without densification; 0: none."""
     densify: BillboardMcmcConfig = dataclasses.field(default_factory=BillboardMcmcConfig)
     billboard: BillboardConfig = dataclasses.field(default_factory=BillboardConfig)
 

@@ -1,4 +1,4 @@
-"""Bytes where they pay: many Gaussians of one colour, then view dependence and texels for those that ask for them."""
+"""Bytes where they pay: many Gaussians of one colour, then view dependence and texels for those that need them."""
 
 import dataclasses
 import math
@@ -21,25 +21,25 @@ from a2tg_jax.training.stage import Stage
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 LAST_PRUNING = 0.8
-"""Of the first stage, in which growth ends at 5/6."""
+"""Latest fraction of the first stage at which Gaussians are pruned; growth ends at 5/6."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CapConfig:
-    """How large the model becomes where there is no memory_budget."""
+    """Size of the model without a memory_budget."""
 
     cap: int = 2_000_000
-    """Its bytes are those of so many Gaussians without view dependence and textures."""
+    """Size of the model, as a number of Gaussians without view dependence and textures."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PruneConfig:
-    """Gaussians that show least, which go while others grow in their place."""
+    """Pruning of the Gaussians that show least; others grow in their place."""
 
     share: float = Prune.share
-    """Of the Gaussians, each time; 0: none before the end of the stage."""
+    """Share of the Gaussians to prune each time; 0: none before the end of the stage."""
     at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-    """Fractions of the first stage, up to 0.8. In short stages, those after the last growth are left out."""
+    """Fractions of the first stage, up to 0.8. Short stages leave out those after the last growth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,21 +47,21 @@ class ViewDependenceConfig:
     """Spherical harmonics above the Gaussians' own degree."""
 
     share: float = 0.23
-    """Of the bytes; 0: none."""
+    """Share of the bytes for view dependence; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
     idle: float = AdaptDegrees.idle
-    """Bands that change a colour by less than this are given up for others."""
+    """Smallest change of a colour by a band; bands below it are removed."""
     at: tuple[float, ...] = AdaptDegrees.at
     """Fractions of the second stage at which degrees change."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DetailTextureConfig:
-    """Textures of the Gaussians that get one."""
+    """Textures of some Gaussians."""
 
     share: float = 0.02
-    """Of the bytes; 0: none."""
+    """Share of the bytes for textures; 0: none."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     cap: int = Upscale.cap
@@ -69,17 +69,19 @@ class DetailTextureConfig:
     at: tuple[float, ...] = (0.1, 0.2, 0.3)
     """Fractions of the second stage at which textures grow."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read."""
+    """Options of the texture lookup."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bytewise(System):
-    """Gaussians of degree 0 first, then degrees and textures for those whose gradients ask for them."""
+    """Gaussians of degree 0 first, then degrees and textures for those with the largest gradients."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 30_000
+    """Iterations of the second stage."""
     base_degree: int = 0
-    """Degree of spherical harmonics that all Gaussians have; those that need it get more, up to sh_degree."""
+    """Degree of spherical harmonics of all Gaussians; those that need more rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
     prune: PruneConfig = dataclasses.field(default_factory=PruneConfig)
     view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
@@ -109,13 +111,13 @@ class Bytewise(System):
         return first, later_stage(self, "details", shown, self._details(), self.stage2_iterations, rates)
 
     def _growth(self) -> tuple[Event, ...]:
-        """Gaussians that fill all bytes. Those that show least go while others grow, and in the end for the details."""
+        """Return the events that fill all bytes, prune during growth, and make room for details in the end."""
         grow = SplitByGradient(self._num_gaussians())
         last = (Prune(keep=self._num_kept()),) if self._share else ()
         return Noise(), grow, *self._pruning(), *last
 
     def _pruning(self) -> tuple[Event, ...]:
-        """Prunes while others grow; never if the share is 0."""
+        """Prune while others grow; never if the share is 0."""
         if not self.prune.share:
             return ()
         num, last_growth = self.stage1_iterations, densify_times(self.stage1_iterations).last_time
@@ -124,20 +126,20 @@ class Bytewise(System):
 
     @property
     def _share(self) -> float:
-        """Of the bytes, for degrees and texels."""
+        """Share of the bytes for degrees and texels."""
         return self.view_dependence.share + self.texture.share
 
     def _num_gaussians(self) -> int:
-        """As many as fill all bytes."""
+        """Return the number of Gaussians that fill all bytes."""
         num = self.budget_cap()
         return self.densify.cap if num is None else num
 
     def _num_kept(self) -> int:
-        """As many as there is room for beside degrees and texels."""
+        """Return the number of Gaussians that fit beside degrees and texels."""
         return math.floor(self._num_bytes() * (1 - self._share) / bytes_per_gaussian(self.base_degree))
 
     def _num_bytes(self) -> int:
-        """Of all that there is in the end."""
+        """Return the bytes of the finished model."""
         own = int(bytes_per_gaussian(self.base_degree))
         return self.densify.cap * own if self.budget_bytes is None else self.budget_bytes
 
@@ -149,7 +151,7 @@ class Bytewise(System):
         return Banded(inner), BandedRates(self.view_dependence.rate, of_texels)
 
     def _details(self) -> tuple[Event, ...]:
-        """Degrees first, up to their share, then texels for all that is left."""
+        """Return the events of degrees first, up to their share, then of texels for all that is left."""
         megabytes = self._num_bytes() / MEGABYTE
         view, texture = self.view_dependence, self.texture
         events: list[Event] = []
@@ -202,7 +204,7 @@ class Bytewise(System):
         super().check()
 
     def _check_times(self) -> None:
-        """Refuses times that do not exist, after which nothing grows, or at which textures have taken the bytes."""
+        """Refuse times that do not exist, after which nothing grows, or at which textures have taken the bytes."""
         view, texture = self.view_dependence, self.texture
         asked = {"view_dependence.at": (view.share, view.at), "texture.at": (texture.share, texture.at)}
         times = {name: iterations_at(at, self.stage2_iterations, name) for name, (share, at) in asked.items() if share}

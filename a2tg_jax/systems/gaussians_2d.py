@@ -24,8 +24,9 @@ class Gaussians2d(System):
     """Plain 2D Gaussians: clone, split, prune, opacity reset."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 0
-    """Iterations that follow without densification; 0: none."""
+    """Further iterations without densification; 0: none."""
     densify: DensityConfig = dataclasses.field(default_factory=DensityConfig)
 
     name: ClassVar[str] = "gaussians-2d"

@@ -23,8 +23,9 @@ class Gaussians2dMcmc(System):
     """Plain 2D Gaussians, densified by MCMC."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 0
-    """Iterations that follow without densification; 0: none."""
+    """Further iterations without densification; 0: none."""
     densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
 
     name: ClassVar[str] = "gaussians-2d-mcmc"

@@ -15,7 +15,7 @@ QUICK_CAP = 10_000
 QUICK_OPACITY = 0.5
 QUICK_RATES = LearningRates(means=3 * 1.6e-4, sh_degree0=2 * 2.5e-3)
 QUICK_TEXELS = 1e-2
-"""What short runs want (docs/results.md): Gaussians that begin half opaque, and faster rates."""
+"""Options of short runs (docs/results.md): Gaussians that begin half opaque, and faster rates."""
 QUICK: dict[str, Any] = {
     "stage1_iterations": 2_000, "stage2_iterations": 1_000, "initial_opacity": QUICK_OPACITY, "rates": QUICK_RATES,
 }  # fmt: skip
@@ -44,7 +44,7 @@ class McmcConfig:
     cap: int = Mcmc.cap
     """Largest number of Gaussians; a memory_budget takes its place."""
     is_enabled: bool = True
-    """Relocate and grow."""
+    """Whether Gaussians relocate and grow."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
         """Noise after every iteration; relocation and growth at their times.
@@ -66,14 +66,14 @@ class DensityConfig:
     """Adaptive density control (3DGS, 2DGS)."""
 
     cap: int = CloneSplitPrune.cap
-    """Largest number of Gaussians; so many rows are allocated. A memory_budget takes its place."""
+    """Largest number of Gaussians and of allocated rows; a memory_budget takes its place."""
     threshold: float = CloneSplitPrune.threshold
-    """Smallest average gradient, by the position on the screen in units of half an image, that is densified. With a
-    memory_budget the largest gradients are, however small."""
+    """Smallest average gradient that is densified, by the position on the screen in units of half an image. With a
+    memory_budget the largest gradients are densified, however small."""
     least_opacity: float = CloneSplitPrune.least_opacity
-    """Fainter Gaussians are pruned."""
+    """Smallest opacity; fainter Gaussians are pruned."""
     reset_opacity: float = OpacityReset.most
-    """No Gaussian stays more opaque, every max(500, n/10) of n iterations until n/2."""
+    """Largest opacity after a reset, every max(500, n/10) of n iterations until n/2."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
         """Clone, split and prune; reset opacities.
@@ -97,7 +97,7 @@ def growing_stage(
     params_rate: Any = 0.0,
     name: str = "gaussians",
 ) -> Stage:
-    """A first stage, in which the degree of spherical harmonics rises."""
+    """Return a first stage, in which the degree of spherical harmonics rises."""
     return Stage(
         name=name,
         appearance=appearance,
@@ -119,7 +119,7 @@ def later_stage(
     iterations: int,
     params_rate: Any = 0.0,
 ) -> Stage:
-    """A second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
+    """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
     return Stage(
         name=name,
         appearance=appearance,
@@ -133,7 +133,7 @@ def later_stage(
 
 
 def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:
-    """A first stage, and one that goes on from its result without events, unless that has no iterations."""
+    """Return a first stage, and one that goes on from its result without events, unless that has no iterations."""
     if not iterations:
         return (first,)
     return first, later_stage(system, "continued", first.appearance, (), iterations, first.params_rate)

@@ -30,9 +30,13 @@ class KernelConfig:
     """Adam's learning rates of the kernels."""
 
     colors: float = 1.25e-3
+    """Learning rate of the colours."""
     logit_opacities: float = 3e-2
+    """Learning rate of the logits of the opacities."""
     centers: float = 1.25e-3
+    """Learning rate of the centres."""
     sharpness: float = 1.25e-3
+    """Learning rate of the sharpness."""
 
     def rates(self) -> MovableKernelParams:
         """Return one rate for each field of the kernels."""
@@ -45,8 +49,9 @@ class SuperGaussians(System):
     """Splats with four movable kernels each: clone, split, prune, opacity reset."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 0
-    """Iterations that follow without densification; 0: none."""
+    """Further iterations without densification; 0: none."""
     rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(log_scales=AUTHORS_LOG_SCALES))
     densify: DensityConfig = dataclasses.field(default_factory=DensityConfig)
     kernels: KernelConfig = dataclasses.field(default_factory=KernelConfig)

@@ -29,11 +29,11 @@ class FixedTextureConfig:
     """Textures of one size."""
 
     side: int = 4
-    """k: every texture is k×k texels, 1 to 16."""
+    """Side k of every texture of k×k texels, 1 to 16."""
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read."""
+    """Options of the texture lookup."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,9 @@ class TexturedGaussians(System):
     """MCMC densification, then a second stage with textures of one size."""
 
     stage1_iterations: int = 30_000
+    """Iterations of the first stage."""
     stage2_iterations: int = 30_000
+    """Iterations of the second stage."""
     densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
     texture: FixedTextureConfig = dataclasses.field(default_factory=FixedTextureConfig)
 

@@ -1,4 +1,4 @@
-"""Which views an iteration trains on: shuffled epochs that depend on the seed and the iteration alone."""
+"""Order of the views that iterations train on: shuffled epochs that depend on the seed and the iteration alone."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -52,7 +52,7 @@ class BatchOrder:
         self._epoch, self._batches = -1, self._draw(0)
 
     def indices(self, iteration: int) -> tuple[int, ...]:
-        """The views of an iteration (from 1)."""
+        """Return the views of an iteration (from 1)."""
         epoch, position = divmod(iteration - 1, len(self._batches))
         if epoch != self._epoch:
             self._epoch, self._batches = epoch, self._draw(epoch)
@@ -72,18 +72,18 @@ class BatchOrder:
 
 
 class BatchPlan(NamedTuple):
-    """How the photographs come to the device."""
+    """Plan of how the photographs come to the device."""
 
     is_resident: bool
     """All of them stay there."""
     batch_bytes: int
-    """Of the largest batch."""
+    """Bytes of the largest batch."""
     num_ahead: int
     """Batches that are made ready before they are wanted, where not all stay."""
 
 
 def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None) -> BatchPlan:
-    """Whether photographs stay on the device, or how many batches are made ready. Arguments as `PhotoStore`'s."""
+    """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
     fits = sum(view.picture.nbytes for view in views) <= (device_room() if room is None else room)
     batch_bytes = batch_size * max(view.picture.nbytes for view in views)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
@@ -122,7 +122,7 @@ class PhotoStore:
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
     def _stack(self, size: tuple[int, int]) -> tuple[Photographs, dict[int, int]]:
-        """All the photographs of a size on the device, and where each view's is."""
+        """Return all photographs of a size on the device, and the place of each view's."""
         if size not in self._stacks:
             found = [index for index, view in enumerate(self._views) if view.picture.size == size]
             stack = jax.device_put(stack_views([self._views[index] for index in found]))
@@ -147,7 +147,7 @@ class Ahead:
         self._batches: dict[int, Future[Photographs]] = {}
 
     def first(self, wanted: dict[int, tuple[int, ...]]) -> Photographs:
-        """The first of the batches that are wanted, by iteration; the others are made ready, and none besides."""
+        """Return the first of the wanted batches, by iteration; the others, and no more, are prepared."""
         for iteration in self._batches.keys() - wanted.keys():
             self._batches.pop(iteration).cancel()
         for iteration, indices in wanted.items():
@@ -161,7 +161,7 @@ class Ahead:
 
 
 def check_views(views: tuple[View, ...]) -> None:
-    """Raises ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
+    """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
     if not views:
         raise ValueError("scene.train must hold at least one view; got none")
     for view in views:
@@ -179,7 +179,7 @@ def check_views(views: tuple[View, ...]) -> None:
 
 
 def device_room() -> float:
-    """Bytes of the default device that photographs may take."""
+    """Return the bytes of the default device that photographs may take."""
     stats = jax.local_devices()[0].memory_stats()
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 

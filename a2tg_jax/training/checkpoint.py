@@ -27,15 +27,15 @@ from a2tg_jax.training.step import TrainState, initial_state
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class History:
-    """What was logged every so many iterations; arrays of one length."""
+    """Log of a training, one entry every so many iterations; arrays of one length."""
 
     stage: np.ndarray
-    """From 1."""
+    """Stage, from 1."""
     iteration: np.ndarray
-    """Within its stage, from 1."""
+    """Iteration within its stage, from 1."""
     loss: np.ndarray
     psnr: np.ndarray
-    """Of the training views of that iteration, in dB."""
+    """PSNR of the training views of that iteration, in dB."""
     num_gaussians: np.ndarray
     """Live Gaussians."""
     megabytes: np.ndarray
@@ -79,7 +79,7 @@ class HistoryLog:
         return History(*(column[: self._num] for column in self._columns))
 
     def add(self, *point: float) -> None:
-        """Adds a row, its values in the order of the fields."""
+        """Add a row, its values in the order of the fields."""
         if self._num == len(self._columns[0]):
             self._columns = [np.resize(column, 2 * self._num + FIRST_ROWS) for column in self._columns]
         for column, value in zip(self._columns, point, strict=True):
@@ -97,14 +97,14 @@ class Checkpoint:
 
     system: System
     stage: int
-    """Which of the system's stages, from 0."""
+    """Index of the stage in its system, from 0."""
     state: TrainState
     history: History
-    """Of this stage."""
+    """History of this stage."""
     num_restored: int = 0
-    """How often the stage went back to an earlier state because it diverged: which order of the views it follows."""
+    """Number of times the stage went back because it diverged; it decides the order of the views."""
     machine: Machine | None = None
-    """On which it was saved; None where that is not known, or it was not yet."""
+    """Machine on which it was saved; None if unknown or not saved yet."""
 
     @property
     def iteration(self) -> int:
@@ -118,7 +118,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
-    """Writes a checkpoint; an older file of that name is replaced once the new one is whole."""
+    """Write a checkpoint; an older file of that name is replaced once the new one is whole."""
     state, model = checkpoint.state, checkpoint.state.model
     header = {
         "system": system_to_dict(checkpoint.system),
@@ -135,7 +135,7 @@ def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None) -> Checkpoint:
-    """Reads what `save_checkpoint` wrote.
+    """Read what `save_checkpoint` wrote.
 
     Args:
       path: the file.
@@ -189,7 +189,7 @@ SHOWN = "shown/"
 
 
 def _rest(state: TrainState) -> tuple:
-    """What a checkpoint keeps besides Gaussians and what they show."""
+    """Return the part of a checkpoint besides Gaussians and what they show."""
     return state.moments, state.model.num_live, state.events, state.iteration, state.status, state.corrections
 
 
@@ -204,13 +204,13 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
 
 
 def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:
-    """The leaves of a pytree under the names of their paths, in the order of the tree."""
+    """Return the leaves of a pytree under the names of their paths, in the order of the tree."""
     paths = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
 
 
 def _filled(template, arrays: dict[str, np.ndarray]):
-    """A tree of the template's structure, each leaf being the array of its name."""
+    """Return a tree of the template's structure, each leaf being the array of its name."""
     leaves = [arrays[name] for name in _named_arrays(template, only_names=True)]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 

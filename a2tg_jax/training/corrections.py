@@ -22,10 +22,10 @@ from a2tg_jax.events import event
 
 
 class Correction:
-    """What all corrections have in common; this one changes nothing."""
+    """Base class of corrections; it changes nothing."""
 
     name: ClassVar[str]
-    """Unique in its stage; files call its rows so."""
+    """Name, unique in its stage; files use it for the rows."""
 
     @property
     def neutral(self) -> np.ndarray:
@@ -33,19 +33,19 @@ class Correction:
         raise NotImplementedError(f"{type(self).__name__} must say what changes nothing")
 
     def learning_rate(self, progress: Array) -> Array:
-        """Adam's, at a share of the stage between 0 and 1; traced."""
+        """Return Adam's learning rate at a share of the stage between 0 and 1; traced."""
         raise NotImplementedError(f"{type(self).__name__} must say how fast it learns")
 
     def camera(self, row: Array, camera: Camera) -> Camera:
-        """The camera that the view is drawn from; traced."""
+        """Return the camera that the view is drawn from; traced."""
         return camera
 
     def color(self, row: Array, color: Array) -> Array:
-        """[H, W, 3] what the photograph shows of a render [H, W, 3]; traced."""
+        """Return the colours [H, W, 3] of the photograph for a render [H, W, 3]; traced."""
         return color
 
     def project(self, rows: Array) -> Array:
-        """The rows of all views [V, ...] after a step, where they belong; traced."""
+        """Return the rows of all views [V, ...], projected to where they belong after a step; traced."""
         return rows
 
 
@@ -53,12 +53,12 @@ class Correction:
 class Exposure(Correction):
     """An affine map of colours per view, [3, 4], c ↦ A·c + b; on average over the views it changes nothing.
 
-    Where all views could change alike, the model would do so the other way round, and test views had no exposure.
+    If all views could change alike, the model would change the other way round and test views would have no exposure.
     """
 
     rate: float = 1e-2
     final_factor: float = 0.1
-    """The rate at the end of a stage over that at its start."""
+    """Factor of the rate at the end of a stage."""
 
     name = "exposure"
 
@@ -81,9 +81,9 @@ class PoseRefinement(Correction):
     """A small rigid motion per view, a twist [6] in the camera's frame (`core.rigid.moved_viewmat`)."""
 
     rate: float = 1e-3
-    """In radians, and in units of the normalised world, in which cameras are about 1 from what they look at."""
+    """Learning rate in radians and in units of the normalised world; cameras are about 1 from what they see."""
     final_factor: float = 0.01
-    """The rate at the end of a stage over that at its start."""
+    """Factor of the rate at the end of a stage."""
 
     name = "pose"
 
@@ -101,7 +101,7 @@ class PoseRefinement(Correction):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CorrectionState:
-    """What one correction has learned."""
+    """State of one correction."""
 
     rows: Array
     """[V, ...], in the order of the training views."""
@@ -110,7 +110,7 @@ class CorrectionState:
 
 
 def exposed(exposure: Array, color: Array) -> Array:
-    """A·c + b for colours [H, W, 3] and an exposure [3, 4] = [A | b]."""
+    """Return A·c + b for colours [H, W, 3] and an exposure [3, 4] = [A | b]."""
     mixed = jnp.einsum("ij,hwj->hwi", exposure[:, :3], color, precision=jax.lax.Precision.HIGHEST)
     return mixed + exposure[:, 3][None, None]
 
@@ -118,7 +118,7 @@ def exposed(exposure: Array, color: Array) -> Array:
 def initial_corrections(
     corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype
 ) -> tuple[CorrectionState, ...]:
-    """The states before a stage: as an earlier stage left them, and neutral where none did.
+    """Return the states before a stage: as an earlier stage left them, or neutral if none did.
 
     Args:
       corrections: of the stage.
@@ -149,7 +149,7 @@ def _state(rows: Array) -> CorrectionState:
 
 
 def check_corrections(states: Sequence[CorrectionState], num_views: int) -> None:
-    """Raises ValueError unless there is a row for each training view."""
+    """Raise ValueError unless there is a row for each training view."""
     for state in states:
         if len(state.rows) != num_views:
             raise ValueError(
@@ -159,19 +159,19 @@ def check_corrections(states: Sequence[CorrectionState], num_views: int) -> None
 
 
 def rows_of(states: Sequence[CorrectionState], views: Array | None) -> tuple[Array, ...]:
-    """Of each correction the rows [B, ...] of some views [B]."""
+    """Return the rows [B, ...] of some views [B], for each correction."""
     return tuple(state.rows[views] for state in states)
 
 
 def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], camera: Camera) -> Camera:
-    """The camera of a view, given its row of each correction."""
+    """Return the camera of a view, given its row of each correction."""
     for correction, row in zip(corrections, rows, strict=True):
         camera = correction.camera(row, camera)
     return camera
 
 
 def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], color: Array) -> Array:
-    """The colours of a view, given its row of each correction."""
+    """Return the colours of a view, given its row of each correction."""
     for correction, row in zip(corrections, rows, strict=True):
         color = correction.color(row, color)
     return color
@@ -180,7 +180,7 @@ def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], co
 def updated(
     correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
 ) -> CorrectionState:
-    """The state after a step of Adam on the rows of the views that were seen, and on no others.
+    """Return the state after a step of Adam on the rows of the views that were seen, and on no others.
 
     Args:
       correction: whose state it is.
@@ -202,7 +202,7 @@ def updated(
 
 
 def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: Sequence[CorrectionState]) -> Origin:
-    """The origin with what was learned, and with the training cameras as they were corrected (host).
+    """Return the origin with what was learned, and with the training cameras as they were corrected (host).
 
     Args:
       origin: of the scene, training views first.
@@ -220,14 +220,14 @@ def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: 
 
 
 def _with_neutral(correction: Correction, state: CorrectionState, num: int) -> np.ndarray:
-    """The rows of training views, followed by neutral ones of test views."""
+    """Return the rows of training views, followed by neutral ones of test views."""
     rows = np.asarray(state.rows)
     neutral = np.broadcast_to(correction.neutral, (num - len(rows), *rows.shape[1:]))
     return np.concatenate([rows, neutral.astype(rows.dtype)])
 
 
 def learned(origin: Origin) -> Mapping[str, Mapping[str, list]]:
-    """What was learned of each training photograph, as lists of numbers: name → correction → row."""
+    """Return the corrections of each training photograph, as lists of numbers: name → correction → row."""
     training = [(index, name) for index, name in enumerate(origin.names) if not origin.is_test[index]]
     return {
         name: {correction: rows[index].tolist() for correction, rows in origin.corrections.items()}

@@ -1,4 +1,4 @@
-"""What a stage of training will take, from its shapes alone: bytes of memory at its peak, seconds of an iteration.
+"""Cost of a stage of training, from its shapes alone: bytes of memory at its peak, seconds of an iteration.
 
 Photographs, rows of Gaussians and what they show are counted. What a step needs besides, for each byte of the model,
 row, pixel and pair, is what XLA says of compiled steps (`memory_analysis`); what a process takes before it holds any of
@@ -26,18 +26,18 @@ MB = 10**6
 PROCESS = 300 * MB
 """Python, JAX and what else is imported."""
 FIRST_PROGRAM, FURTHER_STAGE, FURTHER_PROGRAM = 270 * MB, 110 * MB, 25 * MB
-"""What a stage's compiled programs leave: the first stage, each further one, and each program of new shapes."""
+"""Memory that a stage's compiled programs leave: the first stage, each further one, and each program of new shapes."""
 COMPILER = 240 * MB
-"""While it compiles a step."""
+"""Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
 STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 """Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
 (colours, loss, and the gradients of both) and pair (tile lists)."""
 GEOMETRY_PER_PIXEL = 72
-"""Besides, where a term of the loss reads depth or normals."""
+"""Further bytes if a term of the loss reads depth or normals."""
 STATISTIC_PER_ROW = 480
-"""Besides, where events gather a statistic and change rows by it inside the step."""
+"""Further bytes if events gather a statistic and change rows by it inside the step."""
 VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
 """Bytes of each view of a batch, beside its gradient of the model."""
 PAIRS_PER_TILE = 90
@@ -45,7 +45,7 @@ PAIRS_PER_TILE = 90
 DECODER_PER_PIXEL = 15
 """Bytes while a photograph is read."""
 SECONDS_PER_ROW, SECONDS_PER_PIXEL = 2.4e-6, 0.72e-6
-"""Of an iteration on one core (docs/performance.md), shared by all cores."""
+"""Seconds of an iteration on one core (docs/performance.md), shared by all cores."""
 
 
 class Bytes(NamedTuple):
@@ -57,7 +57,7 @@ class Bytes(NamedTuple):
     model: float = 0
     """The model and its moments."""
     gradients: float = 0
-    """What a step makes for each Gaussian."""
+    """Gradients and other arrays that a step makes for each Gaussian."""
     pixels: float = 0
     """Renders, loss and tile lists."""
 
@@ -68,22 +68,22 @@ class Bytes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StageForecast:
-    """What one stage will take."""
+    """Forecast of one stage."""
 
     bytes: Bytes
-    """At its peak."""
+    """Bytes in memory at its peak."""
     model_bytes: float
-    """Of the model at its largest."""
+    """Bytes of the model at its largest."""
     num_rows: int
     """Gaussians that it can reach."""
     num_programs: int
-    """Compiled while it runs."""
+    """Programs compiled while it runs."""
     seconds: float
     """All its iterations, on CPUs, roughly."""
 
 
 def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
-    """What each stage of a system will take, one after the other (host; nothing is compiled)."""
+    """Yield the forecast of each stage of a system (host; nothing is compiled)."""
     num, floats, shown = min(initial_number(scene, system), len(scene.points)), 0.0, None
     for stage in system.stages():
         num = num_rows(stage, num)
@@ -102,14 +102,14 @@ def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
 
 
 def floats_shown(stage: Stage, system: System) -> float:
-    """Floats that a Gaussian shows beside its own when a stage begins."""
+    """Return the floats that a Gaussian shows beside its own when a stage begins."""
     few = no_rows(64, NUM_BASES[system.initial_sh_degree])
     _, layout = stage.appearance.allocate(jax.random.key(0), few)
     return stage.appearance.num_floats(layout, few.num) / few.num
 
 
 def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_bytes: float) -> Bytes:
-    """Bytes of a stage's last steps, programs and compilation left out.
+    """Return the bytes of a stage's last steps, programs and compilation left out.
 
     Args:
       scene: its photographs.
@@ -131,12 +131,12 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
 
 
 def held_bytes(scene: Scene) -> int:
-    """Of the photographs that the scene keeps in memory."""
+    """Return the bytes of the photographs that the scene keeps in memory."""
     return sum(view.picture.nbytes for view in (*scene.train, *scene.test) if view.picture.is_held)
 
 
 def fed_bytes(views: Sequence[View], batch_size: int) -> float:
-    """Of the photographs that wait for the step, all or those that come next, and of reading them."""
+    """Return the bytes of the photographs that wait for the step, all or the next ones, and of reading them."""
     plan = plan_batches(tuple(views), batch_size)
     if plan.is_resident:
         return sum(view.picture.nbytes for view in views)
@@ -146,11 +146,11 @@ def fed_bytes(views: Sequence[View], batch_size: int) -> float:
 
 
 def largest_view(views: Sequence[View]) -> int:
-    """Pixels of the largest."""
+    """Return the pixels of the largest view."""
     return max(view.camera.width * view.camera.height for view in views)
 
 
 def _seconds(views: Sequence[View], num: int) -> float:
-    """Of an iteration with one view."""
+    """Return the seconds of an iteration with one view."""
     pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
     return (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * pixels) / num_threads()

@@ -1,4 +1,4 @@
-"""Where training diverged: the iteration, its views, and which rows of which parameters. Asked after the fact (host).
+"""Place where training diverged: iteration, views, and rows of parameters, found after the fact (host).
 
 The step itself says no more than that it could not be taken (`step.NOT_FINITE`, `step.EXPLODED`), which costs nothing.
 """
@@ -33,7 +33,7 @@ class DivergedError(ValueError):
 
 
 def largest_loss(history: History) -> float:
-    """What the loss of a stage may not exceed; infinite before the first logged iteration."""
+    """Return the largest loss that a stage may have; infinite before the first logged iteration."""
     return max(SMALL_LOSS, EXPLOSION * float(history.loss[0])) if len(history.loss) else float("inf")
 
 
@@ -43,7 +43,7 @@ def _jitted_attempt():
 
 
 def what_diverged(arguments: tuple, names: Sequence[str]) -> str:
-    """The views and parameters whose numbers are not finite, or how large the loss is where all of them are.
+    """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite.
 
     Args:
       arguments: of `train_step`, with the state before the step that could not be taken.
@@ -59,7 +59,7 @@ def what_diverged(arguments: tuple, names: Sequence[str]) -> str:
 
 
 def _not_finite(parameters: tuple) -> Iterator[str]:
-    """Each leaf of (gaussians, params, corrections) with such numbers, and their rows."""
+    """Yield each leaf of (gaussians, params, corrections) with such numbers, and their rows."""
     for prefix, part in zip(("", "params", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
             numbers = np.asarray(leaf)

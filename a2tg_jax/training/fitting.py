@@ -17,12 +17,12 @@ from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
 
 BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
-"""On which a model is looked at, by what was behind it while it was trained."""
+"""Background behind a trained model, by the background of its training."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StageResult:
-    """What one stage leaves."""
+    """Result of one stage."""
 
     name: str
     model: Model
@@ -31,16 +31,16 @@ class StageResult:
     seconds: float
     """Training time, compilation included."""
     num_regrown: int
-    """How often the tile lists needed more room, each time at the price of a compilation."""
+    """Number of times the tile lists needed more room, each at the price of a compilation."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitResult:
-    """What training leaves."""
+    """Result of training."""
 
     system: System
     stages: tuple[StageResult, ...]
-    """Those that were trained; the earlier ones are missing where training was resumed in a later one."""
+    """Stages that were trained; if training was resumed in a later stage, the earlier ones are missing."""
 
     @property
     def model(self) -> Model:
@@ -49,7 +49,7 @@ class FitResult:
 
     @property
     def history(self) -> History:
-        """Of all the stages."""
+        """History of all stages."""
         first, *others = (stage.history for stage in self.stages)
         for other in others:
             first = first.followed_by(other)
@@ -62,7 +62,7 @@ class FitResult:
 
     @property
     def num_regrown(self) -> int:
-        """How often the tile lists needed more room."""
+        """Number of times the tile lists needed more room."""
         return sum(stage.num_regrown for stage in self.stages)
 
 
@@ -77,11 +77,11 @@ def fit(
     is_stopped: IsStopped = never,
     session: Session | None = None,
 ) -> FitResult:
-    """Trains a scene: every stage of a system, each from the result of the one before.
+    """Train all stages of a system on a scene, each from the result of the one before.
 
     Args:
       scene: from `load_scene` or `synthetic_scene`.
-      system: what happens, and every number, such as `A2tg.preset("quick")`.
+      system: stages and options, such as `A2tg.preset("quick")`.
       resume: a checkpoint of the same system to go on from.
       on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
         iteration takes over the state's buffers, so save it there and then, or copy it.
@@ -134,7 +134,7 @@ def fit_stage(
     watch: Watch = unwatched,
     session: Session | None = None,
 ) -> StageResult:
-    """Trains one stage of a system. Arguments as in `fit`.
+    """Train one stage of a system. Arguments as in `fit`.
 
     Args:
       index: which stage, from 0.
@@ -164,7 +164,7 @@ def fit_stage(
 
 
 def warn_of_budget(system: System, model: Model) -> None:
-    """Warns where a finished model is not what its memory budget asks for."""
+    """Warn if a finished model does not fill its memory budget or exceeds it."""
     budget, used = system.budget_bytes, model.num_bytes
     if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
         return

@@ -19,7 +19,7 @@ from a2tg_jax.training.corrections import Correction, corrected_camera
 
 
 class ViewGradients(NamedTuple):
-    """What `view_gradients` returns, of N Gaussians."""
+    """Result of `view_gradients`, for N Gaussians."""
 
     value: Array
     """The loss, a scalar."""
@@ -35,7 +35,7 @@ class ViewGradients(NamedTuple):
     output: RenderOutput
     """The view; `output.overflow` says that the capacity did not suffice, and nothing here may be used."""
     num_pairs: Array
-    """What a capacity must hold (`plan_render`)."""
+    """Number of pairs that a capacity must hold (`plan_render`)."""
 
 
 def view_gradients(
@@ -49,7 +49,7 @@ def view_gradients(
     sh_degree: Any = None,
     statistic: Statistic = "position",
 ) -> ViewGradients:
-    """Renders a view and differentiates any loss of it, in one pass; meant for jit.
+    """Render a view and differentiates any loss of it, in one pass; meant for jit.
 
     Average the statistic over views with `GradientStatistics`:
 
@@ -105,14 +105,14 @@ class View(NamedTuple):
 
 
 class Differentiated(NamedTuple):
-    """What `differentiate` returns."""
+    """Result of `differentiate`."""
 
     value: Array
     """The loss, a scalar."""
     told: Any
-    """What the loss function returned beside it."""
+    """Second result of the loss function."""
     num_pairs: Array
-    """What a capacity must hold."""
+    """Number of pairs that a capacity must hold."""
     gaussians: Gaussians
     """Gradient in the Gaussians."""
     params: Any

@@ -64,7 +64,7 @@ class LearningCheck:
             )
 
     def _flat(self, indices: Sequence[int]) -> float:
-        """Mean PSNR of a flat colour on some views, in dB."""
+        """Return the mean PSNR of a flat colour on some views, in dB."""
         views = [self._views[index] for index in indices]
         return float(np.mean([_flat_psnr(view, self._level) for view in views]))
 
@@ -77,7 +77,7 @@ def _flat_psnr(view: View, level: float) -> float:
 
 
 def has_learned(psnr: float, flat: float) -> bool:
-    """Whether a PSNR is above that of flat colours (`flat_psnr`); always, if the photographs are nearly flat."""
+    """Return whether a PSNR is above that of flat colours (`flat_psnr`); always, if the photographs are nearly flat."""
     return psnr > flat or flat > NEARLY_FLAT
 
 

@@ -40,11 +40,11 @@ from a2tg_jax.training.step import (
 )
 
 LAUNCHED = 10
-"""Steps between two waits for the device; fewer where the photographs of so many would take too much memory."""
+"""Steps between two waits for the device; fewer if the photographs of so many take too much memory."""
 LOG_EVERY = 10
 PLANNED_VIEWS = 64
 GROWTH_ROOM = 1.5
-"""How many times the pairs of the first image the lists of a stage have room for."""
+"""Room in the lists of a stage, as a multiple of the pairs of the first image."""
 
 OnCheckpoint = Callable[[Checkpoint], None]
 IsStopped = Callable[[], bool]
@@ -66,7 +66,7 @@ def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
 
 
 def read(infos: list[StepInfo]) -> list[StepInfo]:
-    """The scalars of some steps as numbers of the host: the one place where the loop waits for the device."""
+    """Return the scalars of some steps as host numbers: only here does the loop wait for the device."""
     return jax.device_get(infos)
 
 
@@ -149,7 +149,7 @@ class StageRun:
         is_stopped: IsStopped = never,
         watch: Watch = unwatched,
     ) -> None:
-        """Runs the stage to its end, or, with a last checkpoint and a KeyboardInterrupt, to where it is stopped.
+        """Run the stage to its end, or, with a last checkpoint and a KeyboardInterrupt, to where it is stopped.
 
         Its photographs are let go then.
         """
@@ -201,7 +201,7 @@ class StageRun:
         return [self.system.told(event, message) for event in events if (message := getattr(event, name))]
 
     def _next_stop(self, iteration: int, checkpoint_every: int | None) -> int:
-        """The iteration after which the host has something to do."""
+        """Return the iteration after which the host has something to do."""
         stops = [iteration + self.launched - iteration % self.launched, self.stage.iterations]
         stops += [due for due in self._due_on_host() if due > iteration]
         if checkpoint_every is not None:
@@ -209,7 +209,7 @@ class StageRun:
         return min(stops)
 
     def _due_on_host(self) -> list[int]:
-        """The iterations of all host events, and those after which a step event is past."""
+        """Return the iterations of all host events, and those after which a step event is past."""
         count = self.stage.iterations
         due: list[int] = []
         for event, times in zip(self.stage.events, self.clock.times, strict=True):
@@ -220,7 +220,7 @@ class StageRun:
         return due
 
     def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
-        """Iterations `first` to `last`, or up to the one that could not be taken, whose cause is mended."""
+        """Run iterations `first` to `last`, or up to one that cannot be taken, and mend its cause."""
         launched: list[StepInfo] = []
         while first + len(launched) <= last and not is_stopped():
             launched.append(self._launch(first + len(launched)))
@@ -232,7 +232,7 @@ class StageRun:
         return taken
 
     def _arguments(self, iteration: int) -> tuple:
-        """What the step of an iteration is given."""
+        """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
@@ -250,7 +250,7 @@ class StageRun:
         return self.views[self.order.indices(iteration)[0]].picture.size
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
-        """Makes more room for the tile lists; refuses to go on for every other reason."""
+        """Make more room for the tile lists; refuses to go on for every other reason."""
         self.state = dataclasses.replace(self.state, status=jnp.zeros((), jnp.int32))
         if info.status == OVERFLOW:
             self.num_regrown += 1
@@ -268,7 +268,7 @@ class StageRun:
         )
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
-        """The error that tells what was not finite, or too large."""
+        """Return the error that tells what was not finite, or too large."""
         names = [self.views[index].name for index in self.order.indices(iteration)]
         what = "loss or gradient is not finite" if info.status == NOT_FINITE else "the loss has exploded"
         return DivergedError(
@@ -288,7 +288,7 @@ class StageRun:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:
-        """The host events that follow an iteration; events that are past forget what they have gathered."""
+        """Apply the host events that follow an iteration; events that are past forget what they have gathered."""
         for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
             state = self.state.events[place]
             if isinstance(event, HostEvent):
@@ -305,7 +305,7 @@ class StageRun:
                 self._keep(place, None)
 
     def _move_rows(self, rows: np.ndarray) -> None:
-        """What the events have gathered follows the Gaussians."""
+        """Move what the events have gathered along with the Gaussians."""
         pairs = zip(self.stage.events, self.state.events, strict=True)
         events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
         self.state = dataclasses.replace(self.state, events=events)
@@ -335,7 +335,7 @@ class StageRun:
 
 
 def check_resume(resume: Checkpoint, system: System, index: int) -> None:
-    """Raises ValueError unless the checkpoint is of that stage of that system."""
+    """Raise ValueError unless the checkpoint is of that stage of that system."""
     if resume.stage != index:
         raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
     if resume.system != system:

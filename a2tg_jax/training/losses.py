@@ -1,4 +1,4 @@
-"""What training minimises: the photometric loss, 2DGS's normal consistency, and the regularisers of 3DGS-MCMC.
+"""Losses: the photometric loss, 2DGS's normal consistency, and the regularisers of 3DGS-MCMC.
 
 Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would kill the gradient where it is needed.
 """
@@ -140,19 +140,19 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
 
 
 def mean_opacity(gaussians: Gaussians, num_live: Array | int) -> Array:
-    """Mean opacity of the first `num_live` rows (the opacity regulariser of 3DGS-MCMC)."""
+    """Return the mean opacity of the first `num_live` rows (the opacity regulariser of 3DGS-MCMC)."""
     check_gaussians(gaussians)
     return _live_mean(gaussians.opacities, num_live)
 
 
 def mean_scale(gaussians: Gaussians, num_live: Array | int) -> Array:
-    """Mean scale, over both axes, of the first `num_live` rows (the scale regulariser of 3DGS-MCMC)."""
+    """Return the mean scale, over both axes, of the first `num_live` rows (the scale regulariser of 3DGS-MCMC)."""
     check_gaussians(gaussians)
     return _live_mean(jnp.mean(gaussians.scales, axis=-1), num_live)
 
 
 def check_same_shape(image: Array, target: Array) -> None:
-    """Raises ValueError unless both are floats [H, W, 3] of one shape."""
+    """Raise ValueError unless both are floats [H, W, 3] of one shape."""
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
     if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):
@@ -177,7 +177,7 @@ def _back_project(depth: Array, camera: Camera) -> Array:
 
 @jax.custom_vjp
 def _window_mean(images: Array) -> Array:
-    """[C, H, W] → [C, H-10, W-10]: the mean under SSIM's window, at every place where it fits."""
+    """Return the mean under SSIM's window at every place where it fits: [C, H, W] → [C, H-10, W-10]."""
     return _blur(_blur(images, 1), 2)
 
 
@@ -195,7 +195,7 @@ _window_mean.defvjp(_window_mean_forward, _window_mean_backward)
 
 
 def _blur(x: Array, axis: int) -> Array:
-    """The 11 Gaussian taps along one axis, as a sum of shifted slices (on a CPU far faster than a convolution)."""
+    """Apply the 11 Gaussian taps along one axis, as a sum of shifted slices (faster than a convolution on CPUs)."""
     size = x.shape[axis] - 2 * SSIM_RADIUS
     shifted = [jax.lax.slice_in_dim(x, tap, tap + size, axis=axis) for tap in range(SSIM_WINDOW)]
     blurred = shifted[SSIM_RADIUS] * SSIM_TAPS[SSIM_RADIUS]

@@ -36,7 +36,7 @@ class LossConfig:
     """Mean scale of the live Gaussians (3DGS-MCMC uses 0.01)."""
 
     def terms(self) -> tuple:
-        """The loss terms whose weight is not 0."""
+        """Return the loss terms whose weight is not 0."""
         optional = (
             Term(normals, self.normal_weight, has_geometry=True),
             Term(distortion, self.distortion_weight, has_geometry=True),
@@ -49,38 +49,39 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CorrectionConfig:
-    """How fast what `exposure` and `refine_poses` ask for is learned."""
+    """Learning rates of `exposure` and `refine_poses`."""
 
     exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
     pose_rate: float = PoseRefinement.rate
-    """That of the motions, in radians and in units of the normalised world."""
+    """Adam's learning rate of the camera motions, in radians and in units of the normalised world."""
     final_factor: float = Exposure.final_factor
-    """Both rates at the end of the first stage, and in later ones, over those at its start."""
+    """Factor of both rates at the end of the first stage, and in later stages."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class System:
     """A method of training as a value: its fields are its options, `stages` says what happens.
 
-    A system of one's own derives from this, adds fields, and composes its stages; the command line takes it as
+    Derive your own system from this class, add fields and compose its stages; the command line takes it as
     `--system package.module:NAME`. Fields are numbers, texts, tuples of them, and dataclasses of such fields.
     """
 
     batch_size: int = 1
     """Views per iteration."""
     initial_gaussians: int | None = None
-    """Gaussians to start from; None: all the points, at most the cap."""
+    """Number of Gaussians to start from; None: one per point, at most the cap."""
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from."""
     memory_budget: float | str | None = None
-    """Bytes that the model never exceeds, and takes all but half a percent of in the end: 1.5MB, 800kB, 2GB, or a
-    number of MB (10^6 bytes). It says how many Gaussians and texels there are, in place of densify.cap."""
+    """Memory budget of the model: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The model stays within it at every
+    iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, in place of densify.cap."""
     background: Literal["black", "white", "random"] = "black"
-    """Behind everything, where photographs are transparent too."""
+    """Background of renders, and of transparent photographs."""
     sh_degree: int = 3
-    """Highest degree of spherical harmonics, 0 to 3; coefficients above it do not exist."""
+    """Highest degree of spherical harmonics, 0 to 3."""
     seed: int = 0
+    """Seed of all random numbers."""
     tile_size: int = 8
     """Side of a tile in pixels; results do not depend on it."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
@@ -93,14 +94,14 @@ class System:
     corrections: CorrectionConfig = dataclasses.field(default_factory=CorrectionConfig)
 
     name: ClassVar[str] = ""
-    """What the command line calls the system."""
+    """Name on the command line."""
     ranges: ClassVar[Ranges] = {}
     """Ranges of the system's own options."""
     event_options: ClassVar[Mapping[str, str]] = {}
     """Options by the field of an event that they set, such as {"Mcmc.cap": "densify.cap"}: messages name them."""
 
     def __post_init__(self) -> None:
-        """A budget is kept as a number of MB, however it was written."""
+        """Convert the memory budget to a number of MB."""
         object.__setattr__(self, "memory_budget", megabytes_of(self.memory_budget))
 
     @property
@@ -110,15 +111,15 @@ class System:
 
     @property
     def budget_bytes(self) -> int | None:
-        """The memory budget in bytes; None where there is none."""
+        """Memory budget in bytes; None without one."""
         megabytes = megabytes_of(self.memory_budget)
         return None if megabytes is None else bytes_of(megabytes)
 
     def budget_cap(self, floats: float = 0) -> int | None:
-        """How many Gaussians the memory budget has room for; None where there is none.
+        """Return the number of Gaussians that the memory budget has room for; None without a budget.
 
         Args:
-          floats: what each of them shows besides its own floats, in the end.
+          floats: further floats of each Gaussian, in the end, such as its texels.
 
         Raises:
           ValueError: if they are fewer than 2, or than training is to start from.
@@ -138,10 +139,10 @@ class System:
         return cap
 
     def corrections_of(self, stage: int = 0) -> tuple[Correction, ...]:
-        """What a stage learns of each training view, as `exposure` and `refine_poses` ask for it.
+        """Return the corrections of a stage that `exposure` and `refine_poses` ask for.
 
         Args:
-          stage: which of them, from 0; after the first, rates stay as they were at its end.
+          stage: index of the stage, from 0; later stages keep the rates of the first one's end.
         """
         rates, last = self.corrections, self.corrections.final_factor
         start, end = (1.0, last) if stage == 0 else (last, 1.0)
@@ -150,7 +151,7 @@ class System:
         return (*poses, *exposures)
 
     def stages(self) -> tuple[Stage, ...]:
-        """What is trained, one stage after the other.
+        """Return the stages, in the order of training.
 
         Raises:
           ValueError: if options contradict each other.
@@ -159,7 +160,7 @@ class System:
 
     @classmethod
     def preset(cls, name: str) -> Self:
-        """The options of a preset: "paper", "quick" or "smoke".
+        """Return the options of a preset: "paper", "quick" or "smoke".
 
         Raises:
           ValueError: if there is no such preset.
@@ -173,11 +174,11 @@ class System:
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        """All presets by name; "paper" is what the fields default to."""
+        """Return all presets by name; "paper" has the fields' defaults."""
         return {"paper": cls()}
 
     def check(self) -> None:
-        """Refuses what cannot be trained before any time is spent.
+        """Refuse options that cannot be trained, before any time is spent.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
@@ -230,14 +231,14 @@ class System:
         return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
     def check_number(self, num: int) -> None:
-        """Refuses what cannot be trained from so many Gaussians.
+        """Refuse options that cannot be trained from so many Gaussians.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
 
     def _check_numbers(self) -> None:
-        """Refuses numbers out of the range of the options that every system has, and whatever is not finite."""
+        """Refuse numbers out of the range of the options that every system has, and whatever is not finite."""
         numbers = flatten_config(self)
         for name, value in numbers.items():
             held = value if isinstance(value, tuple) else (value,)
@@ -272,10 +273,10 @@ RANGES = {
 
 
 def like(kind: type[System] | System, other: System) -> System:
-    """A system of a kind that has the options of another, wherever both have an option of that name and type.
+    """Return a system of a kind with the options of another that have the same name and type.
 
     Args:
-      kind: its defaults, or an instance's options, are what the other does not say.
+      kind: class or instance that gives all other options.
       other: the other system.
     """
     return _like(kind() if isinstance(kind, type) else kind, other)

@@ -15,7 +15,7 @@ TIMED_SECONDS, TIMED_STEPS = 2.0, 3
 
 
 class Pace:
-    """How long a stage will take, told once, when some steps beyond the first, which are compiled, have been timed."""
+    """Forecast of a stage's duration, told once, after some steps beyond the first, which compiles, were timed."""
 
     def __init__(self, total: int, now: Callable[[], float] = time.perf_counter):
         """Args:
@@ -27,7 +27,7 @@ class Pace:
         self._is_told = False
 
     def told(self, done: int) -> str | None:
-        """A text after some iterations, or None; the first call begins the timing."""
+        """Return a text after some iterations, or None; the first call begins the timing."""
         now = self._now()
         if self._start is None:
             self._start = done, now
@@ -58,13 +58,13 @@ class ProgressBar:
         self._bar.close()
 
     def tell_pace(self, done: int) -> None:
-        """Says once, after some steps that were launched together, how long the others will take."""
+        """Say once, after some steps that were launched together, how long the others will take."""
         told = self._pace.told(done)
         if told is not None and not self._bar.disable:
             self._bar.write(f"{self._title}: {told}")
 
     def update(self, info: StepInfo, history: History) -> None:
-        """Counts one iteration; loss and PSNR are running means."""
+        """Count one iteration; loss and PSNR are running means."""
         loss, psnr = float(info.loss), float(info.psnr)
         if self._loss is None:
             self._loss, self._psnr = loss, psnr

@@ -18,14 +18,14 @@ SYSTEMS = {
     "bbsplat": "a2tg_jax.systems.bbsplat:BBSplat",
     "bytewise": "a2tg_jax.systems.bytewise:Bytewise",
 }
-"""Where the systems of this library are; each is imported where it is asked for."""
+"""Module and class of each system of this library; a system is imported when it is asked for."""
 
 
 LONGEST_REASON = 300
 
 
 def find_system(reference: str) -> System:
-    """The system of a name, or of package.module:NAME, with its own defaults; the module is imported.
+    """Return the system of a name, or of package.module:NAME, with its own defaults; the module is imported.
 
     Raises:
       ValueError: if there is no such system.
@@ -52,7 +52,7 @@ def find_system(reference: str) -> System:
 
 
 def _told(error: Exception) -> str:
-    """An error in a few words; those about a name that is missing say all."""
+    """Return an error in a few words."""
     return str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
 
 
@@ -64,18 +64,18 @@ def _with_defaults(kind: type[System], reference: str) -> System:
 
 
 def reference_of(system: System) -> str:
-    """The name of a system's class, by which `find_system` finds it."""
+    """Return the name of a system's class, by which `find_system` finds it."""
     reference = f"{type(system).__module__}:{type(system).__qualname__}"
     return next((name for name, own in SYSTEMS.items() if own == reference), reference)
 
 
 def system_to_dict(system: System) -> dict[str, Any]:
-    """A system and all its options as JSON-able values."""
+    """Return a system and all its options as JSON-able values."""
     return {"name": reference_of(system), "options": config_to_dict(system)}
 
 
 def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | None = None) -> System:
-    """The system that `system_to_dict` was given.
+    """Return the system from its options, the inverse of `system_to_dict`.
 
     A file makes this program import none but its own modules: the class of another system is looked for among the
     modules that are imported already, unless it is given.
@@ -104,7 +104,7 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
 
 
 def with_changes(system: System, changes: Mapping[str, Any], where: str) -> System:
-    """The system with some of its options changed, given as nested dictionaries as a configuration file has them.
+    """Return the system with some options changed, given as nested dictionaries as in a configuration file.
 
     Raises:
       ValueError: if an option is unknown or of another type; it is named.
@@ -122,7 +122,7 @@ def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def differences(system: System) -> dict[str, Any]:
-    """The options in which a system differs from its class's defaults, nested."""
+    """Return the options in which a system differs from its class's defaults, nested."""
     return _differences(config_to_dict(system), config_to_dict(type(system)()))
 
 

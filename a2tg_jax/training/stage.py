@@ -37,17 +37,22 @@ class LossTerm(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LearningRates:
-    """Adam's learning rate per field."""
+    """Adam's learning rates of the Gaussians."""
 
     means: float = 1.6e-4
-    """Times scene_scale; decays exponentially over each stage."""
+    """Learning rate of the means, times scene_scale; decays exponentially over each stage."""
     means_final_factor: float = 0.01
-    """The means' rate at the end of a stage over that at its start."""
+    """Factor of the means' learning rate at the end of a stage."""
     log_scales: float = 5e-3
+    """Learning rate of the logarithms of the scales."""
     quats: float = 1e-3
+    """Learning rate of the rotations."""
     logit_opacities: float = 5e-2
+    """Learning rate of the logits of the opacities."""
     sh_degree0: float = 2.5e-3
+    """Learning rate of the colours, the spherical harmonics of degree 0."""
     sh_rest: float = 1.25e-4
+    """Learning rate of the other spherical harmonics."""
 
     def of_gaussians(self, means: Any, sh_degree: int = 3) -> Gaussians:
         """One rate per field of the Gaussians, given that of the means now, and the degree of their SH."""
@@ -64,21 +69,21 @@ class Stage:
     name: str = dataclasses.field(metadata={"static": True})
     """A short word, unique in its system."""
     appearance: Appearance = dataclasses.field(metadata={"static": True})
-    """What the splats show."""
+    """Appearance of the splats."""
     events: tuple[Event, ...]
     """Densification, noise, textures that grow, in the order in which they happen."""
     losses: tuple[LossTerm, ...]
-    """What is minimised: their sum."""
+    """Loss terms; their sum is minimised."""
     rates: LearningRates
-    """Of the Gaussians."""
+    """Learning rates of the Gaussians."""
     iterations: int
     """Views seen, times the batch size."""
     params_rate: Any = 0.0
     """Learning rate of what the splats show: a number, or what `Appearance.rates` takes."""
     corrections: tuple[Correction, ...] = ()
-    """What of each training view is learned besides, such as exposures and poses."""
+    """Corrections of each training view, such as exposures and poses."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
-    """Begins with degree 0 and adds one after every thirtieth of the stage."""
+    """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
 
     @property
     def statistic(self):
@@ -87,11 +92,11 @@ class Stage:
         return next(iter(wanted), None)
 
     def is_ahead(self, event: Event) -> bool:
-        """Whether an event happens at all (host)."""
+        """Return whether an event happens at all (host)."""
         return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
 
     def check(self) -> None:
-        """Refuses what cannot be trained.
+        """Refuse a stage that cannot be trained.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
@@ -115,7 +120,7 @@ class Stage:
             raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
 
     def clock(self) -> "Clock":
-        """What the step has to know of the schedule (host)."""
+        """Return the schedule for the step (host)."""
         return Clock(
             num_iterations=self.iterations,
             per_iteration=1.0 / self.iterations,
@@ -136,7 +141,7 @@ class Clock(NamedTuple):
     sh_interval: int
     """Iterations between two degrees."""
     times: tuple[Times | None, ...]
-    """Of every event; None where it happens after every iteration, or on the host."""
+    """Times of every event; None if it happens after every iteration, or on the host."""
     largest_loss: float = math.inf
     """A larger one is an explosion: the step is not taken."""
 

@@ -1,4 +1,4 @@
-"""What training starts from: Gaussians at a scene's points, and rows for all that events can add."""
+"""Start of training: Gaussians at a scene's points, and rows for all that events can add."""
 
 from typing import Any
 
@@ -18,14 +18,14 @@ KEY_OF_PARAMETERS = 0x7E8E1
 
 
 def initial_model(scene: Scene, system: System) -> Model:
-    """Gaussians at the scene's points, as many as the first stage has room for."""
+    """Return Gaussians at the scene's points, as many as the first stage has room for."""
     num = initial_number(scene, system)
     opacity, sh_degree = system.initial_opacity, system.initial_sh_degree
     return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=opacity, sh_degree=sh_degree))
 
 
 def check_start(scene: Scene, system: System) -> None:
-    """Refuses a first stage whose events cannot do what they are to do with as many Gaussians as there are at first.
+    """Refuse a first stage whose events cannot do what they are to do with as many Gaussians as there are at first.
 
     Raises:
       ValueError: naming the options to change.
@@ -49,21 +49,21 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 
 
 def initial_number(scene: Scene, system: System) -> int:
-    """How many points the first stage has room for, of those that are asked for."""
+    """Return the number of initial Gaussians: as many as asked for, and as the first stage has room for."""
     num = system.initial_gaussians or len(scene.points)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
 
 
 def num_rows(stage: Stage, num: int) -> int:
-    """Rows that a stage allocates for `num` Gaussians: for all that its events can add."""
+    """Return the number of rows that a stage allocates for `num` Gaussians: for all that its events can add."""
     return max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
 
 
 def padded(model: Model, stage: Stage, system: System) -> Model:
-    """The model with the appearance of a stage and with rows for all that its events can add.
+    """Return the model with the appearance of a stage and with rows for all that its events can add.
 
-    What the model shows already is kept where its appearance is the stage's, and allocated anew where it is not.
+    If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew.
 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
@@ -86,12 +86,12 @@ def padded(model: Model, stage: Stage, system: System) -> Model:
 
 
 def _rows_of(params: Any) -> Any:
-    """What one row of the parameters is, however many there are."""
+    """Return the structure and shape of one row of the parameters."""
     return jax.tree.structure(params), [leaf.shape[1:] for leaf in jax.tree.leaves(params)]
 
 
 def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
-    """The Gaussians, followed by rows that do not exist yet."""
+    """Return the Gaussians, followed by rows that do not exist yet."""
     num = room - gaussians.num
     if num == 0:
         return gaussians
@@ -100,7 +100,7 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
 
 
 def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:
-    """Rows that do not exist yet."""
+    """Return rows that do not exist yet."""
     return Gaussians(
         means=jnp.zeros((num, 3), dtype),
         quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),

@@ -1,4 +1,4 @@
-"""Whether what was read from a checkpoint is a state that training can go on from. On the host."""
+"""Checks that the content of a checkpoint is a state that training can go on from (host)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from a2tg_jax.training.step import EXPLODED, TrainState
 
 
 def find_stage(system: System, index: Any) -> Stage:
-    """The stage of a header's number. ValueError: there is none."""
+    """Return the stage of a header's number. ValueError: there is none."""
     stages = system.stages()
     if type(index) is not int or not 0 <= index < len(stages):
         raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
@@ -24,7 +24,7 @@ def find_stage(system: System, index: Any) -> Stage:
 
 
 def check_is_ahead(is_ahead: Any, stage: Stage) -> Sequence[bool]:
-    """A header's list of the events that are still ahead. ValueError: it is none of this stage."""
+    """Return a header's list of the events that are still ahead. ValueError: it is none of this stage."""
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
         raise ValueError(
             f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}. Where an older "
@@ -34,7 +34,7 @@ def check_is_ahead(is_ahead: Any, stage: Stage) -> Sequence[bool]:
 
 
 def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
-    """Raises ValueError, naming the leaf, unless a state is one of a stage.
+    """Raise ValueError, naming the leaf, unless a state is one of a stage.
 
     Args:
       state: what was read; its model has been made of arrays that fit each other.
@@ -57,7 +57,7 @@ def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
 
 
 def _check_corrections(state: TrainState, stage: Stage) -> None:
-    """Raises ValueError unless there are finite rows for each correction of a stage, all for as many views."""
+    """Raise ValueError unless there are finite rows for each correction of a stage, all for as many views."""
     names, dtype = [""] * len(state.corrections[0].rows) if state.corrections else [], state.model.gaussians.means.dtype
     wanted = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
     check_like("state.corrections", state.corrections, wanted)
@@ -70,7 +70,7 @@ def _check_corrections(state: TrainState, stage: Stage) -> None:
 
 
 def check_history(history: Any) -> None:
-    """Raises ValueError, naming the column, unless its columns are numbers of one length; dB may be infinite."""
+    """Raise ValueError, naming the column, unless its columns are numbers of one length; dB may be infinite."""
     columns = {field.name: np.asarray(getattr(history, field.name)) for field in dataclasses.fields(history)}
     num = columns["iteration"].shape
     for name, column in columns.items():

@@ -48,21 +48,21 @@ class TrainState:
     moments: AdamState
     """Adam's memory of (gaussians, params)."""
     events: tuple[Any, ...]
-    """What each event has gathered; None for one that is past."""
+    """State that each event has gathered; None for one that is past."""
     iteration: Array
     """int32, iterations of this stage done so far."""
     status: Array
     """int32: FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE or EXPLODED."""
     corrections: tuple[CorrectionState, ...] = ()
-    """What each correction of the stage has learned."""
+    """State of each correction of the stage."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StepSettings:
-    """What a compiled step is made for besides its stage; hashable."""
+    """Settings that a step is compiled for, besides its stage; hashable."""
 
     render: RenderSettings
-    """With a capacity."""
+    """Render settings with a capacity."""
     background: Background
 
 
@@ -75,14 +75,14 @@ class StepInfo(NamedTuple):
     num_pairs: Array
     """The most pairs among the views: what the capacity must hold."""
     status: Array
-    """After the step."""
+    """Status after the step."""
     num_live: Array
     num_refused: Array
     """Gaussians that events wanted to add, for which there was no room."""
 
 
 def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
-    """The state before the first iteration of a stage.
+    """Return the state before the first iteration of a stage.
 
     Args:
       stage: which.
@@ -101,13 +101,13 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
 
 
 class Attempt(NamedTuple):
-    """What a step makes of a state, whether it can be taken or not."""
+    """Outcome of a step, whether the step can be taken or not."""
 
     views: "BatchGradients"
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
     """Means over the views; of the corrections, by the row of each view [V, ...]."""
     state: TrainState
-    """After the step, with the status of the state before."""
+    """State after the step, with the status of the state before."""
     info: EventInfo
 
 
@@ -121,7 +121,7 @@ def train_step(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
     scene_scale: Array, key: Array, rows: Any = None,
 ) -> tuple[TrainState, StepInfo]:  # fmt: skip
-    """One iteration.
+    """Run one iteration.
 
     Args:
       settings: static.
@@ -149,7 +149,7 @@ def attempt(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
     scene_scale: Array, key: Array, rows: Any = None,
 ) -> Attempt:  # fmt: skip
-    """What one iteration would lead to. Arguments as of `train_step`, none of them donated."""
+    """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
@@ -184,7 +184,7 @@ class BatchGradients(NamedTuple):
     num_pairs: Array
     is_overflow: Array
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
-    """By the Gaussians, by what they show, and by the view's row of each correction."""
+    """Gradients in the Gaussians, in what they show, and in the view's row of each correction."""
     statistic: Array | None
     """[V, N, 4]."""
 
@@ -192,7 +192,7 @@ class BatchGradients(NamedTuple):
 def _gradients(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration, own
 ) -> BatchGradients:
-    """Loss and gradients of every view, one after the other."""
+    """Return loss and gradients of every view, one after the other."""
     height, width = batch.images.shape[1:3]
     model, highest = state.model, settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
@@ -224,7 +224,7 @@ def _gradients(
 
 
 def _over(image: Array, alpha: Array | None, background: Array) -> Array:
-    """A photograph as floats, over the background where it is transparent."""
+    """Return a photograph as floats, over the background where it is transparent."""
     color = image.astype(background.dtype) / 255
     if alpha is None:
         return color
@@ -233,12 +233,12 @@ def _over(image: Array, alpha: Array | None, background: Array) -> Array:
 
 
 def _black_outside(mask: Array | None, color: Array) -> Array:
-    """An image [H, W, 3], black where pixels do not count: what is there reaches no loss term."""
+    """Return an image [H, W, 3], black where pixels do not count, so that no loss term sees them."""
     return color if mask is None else jnp.where(mask[..., None], color, jnp.zeros_like(color))
 
 
 def _mean_over(mask: Array | None, values: Array) -> Array:
-    """Mean of values [H, W, 3] over the pixels that count, those that do not being 0."""
+    """Return the mean of values [H, W, 3] over the pixels that count, those that do not being 0."""
     mean = jnp.mean(values)
     return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
 
@@ -250,7 +250,7 @@ def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
 
 
 def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: BatchGradients) -> Seen:
-    """What events observe."""
+    """Return the views as events observe them."""
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
     if own:
@@ -263,7 +263,7 @@ def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: Batch
 
 
 def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
-    """Model and moments after Adam, with the parameters projected to where they belong."""
+    """Return model and moments after Adam, with the parameters projected to where they belong."""
     model = state.model
     rates = (
         stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree),
@@ -275,7 +275,7 @@ def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tu
 
 
 def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState, states):
-    """What the events gather, and what those inside the step do."""
+    """Gather statistics for the events, and apply those inside the step."""
     infos, left, at = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)), [], 0
     for event, times, state in zip(stage.events, clock.times, states, strict=True):
         if state is not None and event.observes:
@@ -291,7 +291,7 @@ def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, mome
 
 
 def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: AdamState, state):
-    """The change that an event makes, if it is due; events that are past make none."""
+    """Return the change by an event if it is due; events that are past make none."""
     if times is None:
         change = event.apply(now, model, moments, state)
         return change.model, change.moments, change.state, change.info
@@ -310,7 +310,7 @@ def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: Adam
 
 
 def _status(clock: Clock, tried: Attempt) -> Array:
-    """Why a step may not be taken, the first reason that holds."""
+    """Return why a step may not be taken, the first reason that holds."""
     found, model = tried.views, tried.state.model
     rows = [known.rows for known in tried.state.corrections]
     is_finite = _all_finite((found.loss, tried.grads, model.gaussians, model.params, rows))

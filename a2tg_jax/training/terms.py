@@ -17,7 +17,7 @@ from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistenc
 
 
 class Target(NamedTuple):
-    """What a render is compared with."""
+    """Target that a render is compared with."""
 
     camera: Camera
     image: Array
@@ -57,7 +57,7 @@ class Photometric:
 
 
 def l1(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Mean absolute difference."""
+    """Return the mean absolute difference."""
     return photometric_loss(output.color, target.image, ssim_weight=0)
 
 
@@ -72,10 +72,10 @@ def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
 
 
 def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Mean opacity of the live Gaussians (3DGS-MCMC)."""
+    """Return the mean opacity of the live Gaussians (3DGS-MCMC)."""
     return mean_opacity(model.gaussians, model.live_count)
 
 
 def scale(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Mean scale of the live Gaussians (3DGS-MCMC)."""
+    """Return the mean scale of the live Gaussians (3DGS-MCMC)."""
     return mean_scale(model.gaussians, model.live_count)
