@@ -1,11 +1,15 @@
 """Start of training: Gaussians at a scene's points, and rows for all that events can add."""
 
+import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from a2tg_jax.core.gaussians import Gaussians, init_from_points
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
@@ -15,13 +19,48 @@ from a2tg_jax.training.stage import Stage
 NO_ROW_LOG_SCALE = -10.0
 """Logarithm of the scales, and logit of the opacity, of rows that do not exist yet."""
 KEY_OF_PARAMETERS = 0x7E8E1
+FILTER_VARIANCE = 0.5
+"""Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
+LEAST_OPACITY = INITIAL_OPACITY
+"""Opacity below which dense Gaussians are not made fainter: the one that 3DGS begins with."""
+NEAR = 0.2
+"""Depth from which splats are drawn."""
+SMALLEST_SIDE = 1e-6
 
 
 def initial_model(scene: Scene, system: System) -> Model:
     """Return Gaussians at the scene's points, as many as the first stage has room for."""
-    num = initial_number(scene, system)
-    opacity, sh_degree = system.initial_opacity, system.initial_sh_degree
-    return Model(init_from_points(scene.points, scene.colors, num, system.seed, opacity=opacity, sh_degree=sh_degree))
+    num, degree = initial_number(scene, system), system.initial_sh_degree
+    gaussians = init_from_points(
+        scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=degree
+    )
+    return Model(fainter_where_dense(gaussians, [view.camera for view in scene.train]))
+
+
+def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
+    """Lower the opacity of Gaussians that are smaller than a pixel to every camera (host).
+
+    The low-pass filter draws each of them over a pixel, so k = filter² / s² of them lie over each other, s being the
+    standard deviation in pixels from the camera where that is largest. They get the opacity of which k make the one
+    given, 1 − (1 − o)^(1/k), but at least `LEAST_OPACITY`. Opaque splats in many layers hide those behind them, which
+    then do not learn.
+
+    Args:
+      gaussians: with the opacities of splats that are larger than a pixel.
+      cameras: those that train.
+    """
+    means, scales = np.asarray(gaussians.means, np.float64), np.asarray(gaussians.scales, np.float64).min(axis=1)
+    largest = np.zeros(len(means))
+    for camera in cameras:
+        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+        depths = means @ viewmat[2, :3] + viewmat[2, 3]
+        pixels = np.where(depths > NEAR, scales * np.sqrt(K[0, 0] * K[1, 1]) / np.maximum(depths, NEAR), 0.0)
+        largest = np.maximum(largest, pixels)
+    layers = np.maximum(FILTER_VARIANCE / np.maximum(largest, SMALLEST_SIDE) ** 2, 1.0)
+    opacities = np.asarray(gaussians.opacities, np.float64)
+    shared = np.maximum(1 - (1 - opacities) ** (1 / layers), np.minimum(opacities, LEAST_OPACITY))
+    logits = np.where(shared < opacities, np.log(shared / (1 - shared)), np.asarray(gaussians.logit_opacities))
+    return dataclasses.replace(gaussians, logit_opacities=jnp.asarray(logits, gaussians.logit_opacities.dtype))
 
 
 def check_start(scene: Scene, system: System) -> None:
