@@ -57,7 +57,7 @@ class GrowRows(HostEvent):
     """Event that gives some Gaussians textures of one size after the first iteration."""
 
     rows: Any
-    """Whether each Gaussian gets a texture, [N] bool."""
+    """Mask of the Gaussians that get a texture, [N] bool."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return (1,)

@@ -42,7 +42,7 @@ class SceneAt:
     path: str
     downscale: int
     held_out: bool = False
-    """Whether no choice may be made on it."""
+    """Mark of a scene on which no choice may be made."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     """Options of every system, such as its background."""
 

@@ -35,8 +35,10 @@ def plan_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return hours, or minutes if they are less than an hour."""
-    return f"{seconds / 3600:.1f} hours" if seconds >= 3600 else f"{seconds / 60:.1f} minutes"
+    """Return a time in hours or minutes."""
+    if seconds >= 3600:
+        return f"{seconds / 3600:.1f} hours"
+    return f"{seconds / 60:.0f} minutes" if seconds >= 60 else "less than a minute"
 
 
 def _all_jobs(grid: Grid, records: Mapping[str, Record]) -> Iterable[Job]:
