@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from a2tg_jax.core.budget import bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_shape
@@ -154,7 +155,14 @@ class Upscale(UpscaleChoices, HostEvent):
 
 
 def next_sizes(
-    sizes, scales, *, k_a: float, k_s: float, cap: int, anisotropic: bool = True, axes: str = "paper"
+    sizes: ArrayLike,
+    scales: ArrayLike,
+    *,
+    k_a: float,
+    k_s: float,
+    cap: int,
+    anisotropic: bool = True,
+    axes: str = "paper",
 ) -> np.ndarray:
     """Return the texture sizes one upscaling would give (A²TG, anisotropic upscaling).
 
@@ -190,9 +198,9 @@ def next_sizes(
 
 
 def select(
-    statistic,
-    sizes,
-    proposed,
+    statistic: ArrayLike,
+    sizes: ArrayLike,
+    proposed: ArrayLike,
     *,
     threshold: float | None = None,
     fraction: float | None = None,
@@ -239,7 +247,12 @@ def select(
 
 
 def reallocate(
-    textures: Textures, layout: AtlasLayout, new_sizes, moments=None, known: Sequence[Shape] = (), kept=None
+    textures: Textures,
+    layout: AtlasLayout,
+    new_sizes: ArrayLike,
+    moments: Any = None,
+    known: Sequence[Shape] = (),
+    kept: ArrayLike | None = None,
 ) -> ReallocateResult:
     """Rebuild the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
@@ -267,7 +280,7 @@ def reallocate(
         old = [np.asarray(bucket) for bucket in tree.buckets]
         return _move_texels(old, new_layout.resolutions, capacities, moves, padding)
 
-    def rebuild_moments(leaf):
+    def rebuild_moments(leaf: Any) -> Any:
         if not isinstance(leaf, Textures):
             return leaf
         check_textures(leaf, layout, layout.num, "moments")
@@ -277,7 +290,7 @@ def reallocate(
     return ReallocateResult(rebuild(textures, NEUTRAL_TEXEL), new_layout, moments)
 
 
-def _kept_rows(moments: Textures, layout: AtlasLayout, kept) -> Textures:
+def _kept_rows(moments: Textures, layout: AtlasLayout, kept: ArrayLike) -> Textures:
     """Return the moments with 0 in all rows but those of the textures that are kept."""
     check_shape("kept", kept, (layout.num,))
     bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
@@ -313,7 +326,13 @@ def _plan_moves(old: AtlasLayout, new: AtlasLayout) -> list[_Move]:
     ]
 
 
-def _move_texels(old, resolutions, capacities, moves: list[_Move], padding: tuple[float, ...]) -> Textures:
+def _move_texels(
+    old: list[np.ndarray],
+    resolutions: Sequence[tuple[int, int]],
+    capacities: Sequence[int],
+    moves: list[_Move],
+    padding: tuple[float, ...],
+) -> Textures:
     """New buckets of the given shapes, filled with `padding` and then with the moved texels."""
     dtype = old[0].dtype if old else np.float32
     buckets = []
@@ -347,7 +366,7 @@ def _bytes_between(sizes: np.ndarray, larger: np.ndarray) -> int:
     return BYTES_PER_TEXEL * int(np.prod(larger, axis=1).sum() - np.prod(sizes, axis=1).sum())
 
 
-def _mask(num: int, chosen) -> np.ndarray:
+def _mask(num: int, chosen: ArrayLike) -> np.ndarray:
     mask = np.zeros(num, bool)
     mask[np.asarray(chosen, np.int64)] = True
     return mask

@@ -21,8 +21,10 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.pixel import Statistic
+from a2tg_jax.rasterize.pixel import Statistic as Statistic
 from a2tg_jax.texture import Shape
+
+T = TypeVar("T")
 
 
 class Times(NamedTuple):
@@ -259,12 +261,9 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
-def event(cls):
+def event(cls: type[T]) -> type[T]:
     """Decorate a class: make it a frozen dataclass that is a pytree of its numbers."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
-
-
-T = TypeVar("T")
 
 
 def from_options(kind: type[T], options: Any, **others: Any) -> T:
@@ -297,12 +296,12 @@ def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamSt
     def clear(leaf: Array) -> Array:
         return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
 
-    def cleared(gaussians, params):
+    def cleared(gaussians: Any, params: Any) -> tuple[Any, Any]:
         return jax.tree.map(clear, gaussians), model.appearance.clear(params, model.layout, is_cleared)
 
     return _of_pairs(moments, cleared)
 
 
-def _of_pairs(moments: AdamState, function) -> AdamState:
+def _of_pairs(moments: AdamState, function: Callable[[Any, Any], Any]) -> AdamState:
     """`function` of the Gaussians' and the parameters' part of both moments."""
     return dataclasses.replace(moments, mu=function(*moments.mu), nu=function(*moments.nu))

@@ -62,7 +62,7 @@ class MoveResult(NamedTuple):
     info: MoveInfo
 
 
-def relocate(key: Array, gaussians: Gaussians, moments, num_live: Array | int) -> MoveResult:
+def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int) -> MoveResult:
     """Move each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
 
     Host and moved ones share the opacity and size of `share`; everything else is copied from the host. The moments
@@ -87,7 +87,7 @@ def relocate(key: Array, gaussians: Gaussians, moments, num_live: Array | int) -
     return MoveResult(_copy_hosts(gaussians, moves), _zero_rows(moments, moves.is_reset), num_live, moves.info)
 
 
-def grow(key: Array, gaussians: Gaussians, moments, num_live: Array | int, cap: Array | int) -> MoveResult:
+def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, cap: Array | int) -> MoveResult:
     """Grow the live count n to min(cap, max(n + 1, ⌊1.05·n⌋)) by copies of hosts drawn as in `relocate`.
 
     Hosts and added rows start with zero moments. A count at the cap or above stays.
@@ -265,12 +265,12 @@ def _copy_hosts(gaussians: Gaussians, moves: Moves) -> Gaussians:
     return dataclasses.replace(gaussians, logit_opacities=shared[0], log_scales=shared[1])[moves.rows]
 
 
-def _zero_rows(tree, is_zeroed: Array):
+def _zero_rows(tree: Any, is_zeroed: Array) -> Any:
     """Return the pytree with the marked rows of every leaf at zero."""
     return jax.tree.map(lambda x: jnp.where(is_zeroed.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x), tree)
 
 
-def _check_moments(gaussians: Gaussians, moments) -> None:
+def _check_moments(gaussians: Gaussians, moments: Any) -> None:
     """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
     for leaf in jax.tree.leaves(moments):
@@ -288,7 +288,7 @@ def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
 class Noise(StepEvent):
     """Exploration noise on the means, after every iteration (`perturb`)."""
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means)
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
@@ -336,7 +336,7 @@ class Mcmc(StepEvent):
         return 0
 
     @staticmethod
-    def _move(model: Model, moments: AdamState, plan) -> tuple[Model, AdamState, MoveInfo]:
+    def _move(model: Model, moments: AdamState, plan: Callable[..., Moves]) -> tuple[Model, AdamState, MoveInfo]:
         appearance, layout = model.appearance, model.layout
         num_live = model.live_count
         moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)

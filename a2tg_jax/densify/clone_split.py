@@ -6,7 +6,7 @@ pruned leaves its row, the rows behind it move up, and copies are appended while
 
 import dataclasses
 import math
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -207,7 +207,7 @@ def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
     )
 
 
-def reset_interval(num_iterations):
+def reset_interval(num_iterations: Any) -> Array:
     """Return the iterations between two resets of opacities: 3,000 of 30,000 as published, scaled, at least 500."""
     return jnp.maximum(num_iterations // 10, LEAST_BETWEEN_RESETS)
 
@@ -225,11 +225,11 @@ class OpacityReset(StepEvent):
         every = int(reset_interval(num_iterations))
         return Times(every, num_iterations // 2 - 1, every)
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         before = model.gaussians, model.params
         after = model.appearance.limit_opacities(*before, model.layout, jnp.asarray(self.most))
 
-        def cleared(moment):
+        def cleared(moment: Any) -> Any:
             # Adam forgets whatever was changed.
             return jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
 

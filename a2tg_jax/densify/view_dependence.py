@@ -6,6 +6,7 @@ have not cancels.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ class ViewDependence:
     """[] int32, views so far."""
 
     @staticmethod
-    def init(num: int, dtype=jnp.float32) -> "ViewDependence":
+    def init(num: int, dtype: Any = jnp.float32) -> "ViewDependence":
         """Empty sums for `num` Gaussians."""
         return ViewDependence(jnp.zeros((num, 16, 3), dtype), jnp.zeros((), jnp.int32))
 

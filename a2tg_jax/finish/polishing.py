@@ -50,7 +50,9 @@ class Photographs(NamedTuple):
     """[V, H, W, 1]: 1 where a pixel counts, else 0; or [V, 1, 1, 1] where all of them do."""
 
 
-def polish(model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background=None) -> Model:
+def polish(
+    model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: Any = None
+) -> Model:
     """Return the model with colours nearer to the least squared error over the views (host).
 
     Args:

@@ -34,7 +34,7 @@ LEAST_SAVED = 0.005
 """Rounds that save less of a model's bytes are the last."""
 
 
-def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.02, background=None) -> Model:
+def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.02, background: Any = None) -> Model:
     """Return the model with smaller textures, and as many Gaussians (host).
 
     Args:
@@ -191,7 +191,9 @@ def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
     return dataclasses.replace(model, gaussians=gaussians).with_textures(textures, layout)
 
 
-def _filled(sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype) -> tuple[Textures, AtlasLayout]:
+def _filled(
+    sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype: Any
+) -> tuple[Textures, AtlasLayout]:
     """Textures of the given sizes [N, 2], from pieces: Gaussians and their texels [n, Tv, Tu, 4], of one size each."""
     layout, capacities = plan_layout(sizes)
     shapes = zip(capacities, layout.resolutions, strict=True)

@@ -108,13 +108,13 @@ def _descent(gaussians, rule, camera: Camera, target: Array, mask, background, s
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     shown = target if mask is None else jnp.where(mask[..., None], target, 0.0)
 
-    def loss(twist):
+    def loss(twist: Array) -> Any:
         moved = dataclasses.replace(camera, viewmat=moved_viewmat(twist, camera.viewmat))
         output, _ = render_traced(gaussians, moved, rule, background, settings, has_geometry=False)
         color = output.color if mask is None else jnp.where(mask[..., None], output.color, 0.0)
         return photometric_loss(color, shown, ssim_weight=ssim_weight), output.overflow
 
-    def step(carry, index):
+    def step(carry: Any, index: Array) -> tuple[Any, None]:
         twist, moments, best = carry
         (value, overflow), grad = jax.value_and_grad(loss, has_aux=True)(twist)
         is_better = value < best.loss

@@ -89,7 +89,7 @@ def evaluate(
     *,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     background: Color | None = None,
-    lpips_weights: str | os.PathLike | None = None,
+    lpips_weights: str | os.PathLike[str] | None = None,
     num_renders: int = 0,
     fit_colors: bool = False,
 ) -> Evaluation:
@@ -135,7 +135,9 @@ def evaluate(
     return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
 
 
-def _model_of(gaussians: Gaussians | Model, textures, layout, settings: RenderSettings) -> Model:
+def _model_of(
+    gaussians: Gaussians | Model, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
+) -> Model:
     """Return the model that the arguments describe."""
     if isinstance(gaussians, Model):
         if textures is not None or layout is not None:

@@ -9,6 +9,7 @@ import functools
 import os
 import pathlib
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +74,7 @@ class LpipsWeights:
     """`features.N.weight` and `.bias` in torchvision's layout (OIHW), `linI.weight` [1, C, 1, 1]."""
 
 
-def load_lpips(path: str | os.PathLike) -> LpipsWeights:
+def load_lpips(path: str | os.PathLike[str]) -> LpipsWeights:
     """Read LPIPS weights from an .npz file, once per path; the network is told from the arrays in it.
 
     Raises:
@@ -83,7 +84,9 @@ def load_lpips(path: str | os.PathLike) -> LpipsWeights:
     return _load_lpips(pathlib.Path(path).resolve())
 
 
-def lpips(image: Array, target: Array, weights: LpipsWeights | str | os.PathLike, mask: Array | None = None) -> Array:
+def lpips(
+    image: Array, target: Array, weights: LpipsWeights | str | os.PathLike[str], mask: Array | None = None
+) -> Array:
     """Learned perceptual distance (LPIPS v0.1, Zhang et al., 2018) of the images clipped to [0, 1]; 0 is equal.
 
     Args:
@@ -132,7 +135,7 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
 
 
-def _share_of_windows(mask: Array, dtype) -> Array:
+def _share_of_windows(mask: Array, dtype: Any) -> Array:
     """Return the share of SSIM's windows in which at least one pixel counts."""
     window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
     counts = jax.lax.reduce_window(mask.astype(dtype), -jnp.inf, jax.lax.max, window, (1, 1), "VALID")

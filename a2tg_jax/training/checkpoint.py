@@ -117,7 +117,7 @@ class Checkpoint:
         return self.state.model.live
 
 
-def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
+def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
     """Write a checkpoint; an older file of that name is replaced once the new one is whole."""
     state, model = checkpoint.state, checkpoint.state.model
     header = {
@@ -134,7 +134,7 @@ def save_checkpoint(path: str | os.PathLike, checkpoint: Checkpoint) -> None:
     write_archive(path, header, arrays | _named_arrays((model.gaussians, rest)))
 
 
-def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None) -> Checkpoint:
+def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = None) -> Checkpoint:
     """Read what `save_checkpoint` wrote.
 
     Args:
@@ -158,7 +158,9 @@ def load_checkpoint(path: str | os.PathLike, system: type[System] | None = None)
         raise ValueError(reason if str(path) in reason else f"{path}: {reason}") from error
 
 
-def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], where: str, system) -> Checkpoint:
+def _checkpoint_of(
+    header: dict[str, Any], arrays: dict[str, np.ndarray], where: str, system: type[System] | None
+) -> Checkpoint:
     options = system_from_dict(header["system"], where, system)
     options.check()
     stage = find_stage(options, header["stage"])
@@ -188,7 +190,7 @@ SHOWN = "shown/"
 """Names of the arrays of what splats show begin so."""
 
 
-def _rest(state: TrainState) -> tuple:
+def _rest(state: TrainState) -> tuple[Any, ...]:
     """Return the part of a checkpoint besides Gaussians and what they show."""
     return state.moments, state.model.num_live, state.events, state.iteration, state.status, state.corrections
 
@@ -196,26 +198,26 @@ def _rest(state: TrainState) -> tuple:
 def _packed(model: Model, moments: AdamState) -> AdamState:
     """Moments in the room that parameters have when they are read again, whatever more of it training gave them."""
 
-    def packed(moment):
+    def packed(moment: Any) -> Any:
         gaussians, params = moment
         return gaussians, model.appearance.first_rows(params, model.layout, model.gaussians.num)[0]
 
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
 
-def _named_arrays(tree, *, only_names: bool = False) -> dict[str, Any]:
+def _named_arrays(tree: Any, *, only_names: bool = False) -> dict[str, Any]:
     """Return the leaves of a pytree under the names of their paths, in the order of the tree."""
     paths = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
 
 
-def _filled(template, arrays: dict[str, np.ndarray]):
+def _filled(template: Any, arrays: dict[str, np.ndarray]) -> Any:
     """Return a tree of the template's structure, each leaf being the array of its name."""
     leaves = [arrays[name] for name in _named_arrays(template, only_names=True)]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def _wanted(stage: Stage, gaussians: Gaussians, params, layout, is_ahead: Sequence[bool]) -> TrainState:
+def _wanted(stage: Stage, gaussians: Gaussians, params: Any, layout: Any, is_ahead: Sequence[bool]) -> TrainState:
     """Shapes and dtypes of a state of a stage, of which some events may be past."""
     model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
     state = jax.eval_shape(lambda: initial_state(stage, model, [""]))

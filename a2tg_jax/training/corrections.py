@@ -7,7 +7,7 @@ event, a correction is a frozen dataclass that is a pytree of its numbers. V vie
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -116,7 +116,7 @@ def exposed(exposure: Array, color: Array) -> Array:
 
 
 def initial_corrections(
-    corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype
+    corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype: Any
 ) -> tuple[CorrectionState, ...]:
     """Return the states before a stage: as an earlier stage left them, or neutral if none did.
 
@@ -226,7 +226,7 @@ def _with_neutral(correction: Correction, state: CorrectionState, num: int) -> n
     return np.concatenate([rows, neutral.astype(rows.dtype)])
 
 
-def learned(origin: Origin) -> Mapping[str, Mapping[str, list]]:
+def learned(origin: Origin) -> Mapping[str, Mapping[str, list[Any]]]:
     """Return the corrections of each training photograph, as lists of numbers: name → correction → row."""
     training = [(index, name) for index, name in enumerate(origin.names) if not origin.is_test[index]]
     return {

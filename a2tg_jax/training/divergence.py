@@ -5,6 +5,7 @@ The step itself says no more than that it could not be taken (`step.NOT_FINITE`,
 
 import functools
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -38,11 +39,11 @@ def largest_loss(history: History) -> float:
 
 
 @functools.cache
-def _jitted_attempt():
+def _jitted_attempt() -> jit:
     return jit(attempt, static_argnums=(0,))
 
 
-def what_diverged(arguments: tuple, names: Sequence[str]) -> str:
+def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
     """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite.
 
     Args:
@@ -58,7 +59,7 @@ def what_diverged(arguments: tuple, names: Sequence[str]) -> str:
     return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 
 
-def _not_finite(parameters: tuple) -> Iterator[str]:
+def _not_finite(parameters: tuple[Any, ...]) -> Iterator[str]:
     """Yield each leaf of (gaussians, params, corrections) with such numbers, and their rows."""
     for prefix, part in zip(("", "params", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:

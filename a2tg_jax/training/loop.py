@@ -8,6 +8,7 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +68,8 @@ def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
 
 def read(infos: list[StepInfo]) -> list[StepInfo]:
     """Return the scalars of some steps as host numbers: only here does the loop wait for the device."""
-    return jax.device_get(infos)
+    on_host: list[StepInfo] = jax.device_get(infos)
+    return on_host
 
 
 class StageRun:
@@ -231,7 +233,7 @@ class StageRun:
             self._mend(first + len(taken), infos[len(taken)])
         return taken
 
-    def _arguments(self, iteration: int) -> tuple:
+    def _arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
@@ -241,6 +243,7 @@ class StageRun:
     def _launch(self, iteration: int) -> StepInfo:
         arguments, step = self._arguments(iteration), jitted_step()
         num_compiled = step.num_compiled()
+        info: StepInfo
         self.state, info = step(*arguments)
         if step.num_compiled() > num_compiled:
             self.session.after_compiling()
@@ -310,7 +313,7 @@ class StageRun:
         events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
         self.state = dataclasses.replace(self.state, events=events)
 
-    def _keep(self, place: int, gathered) -> None:
+    def _keep(self, place: int, gathered: Any) -> None:
         events = list(self.state.events)
         events[place] = gathered
         self.state = dataclasses.replace(self.state, events=tuple(events))

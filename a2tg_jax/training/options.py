@@ -13,7 +13,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
-from a2tg_jax.training.stage import LearningRates, Stage
+from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
 Ranges = dict[str, tuple[float, float]]
@@ -35,7 +35,7 @@ class LossConfig:
     scale_weight: float = 0.0
     """Mean scale of the live Gaussians (3DGS-MCMC uses 0.01)."""
 
-    def terms(self) -> tuple:
+    def terms(self) -> tuple[LossTerm, ...]:
         """Return the loss terms whose weight is not 0."""
         optional = (
             Term(normals, self.normal_weight, has_geometry=True),

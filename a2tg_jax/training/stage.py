@@ -14,6 +14,7 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.terms import Target
@@ -86,7 +87,7 @@ class Stage:
     """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
 
     @property
-    def statistic(self):
+    def statistic(self) -> Statistic | None:
         """The statistic of the gradients that its events want, or None."""
         wanted = {event.statistic for event in self.events} - {None}
         return next(iter(wanted), None)

@@ -19,7 +19,7 @@ from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.jit import jit
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
+from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
@@ -112,7 +112,7 @@ class Attempt(NamedTuple):
 
 
 @functools.cache
-def jitted_step():
+def jitted_step() -> jit:
     """`train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
     return jit(train_step, static_argnums=(0,), donate_argnums=(3,))
 
@@ -190,7 +190,14 @@ class BatchGradients(NamedTuple):
 
 
 def _gradients(
-    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, batch, backgrounds, iteration, own
+    settings: StepSettings,
+    stage: Stage,
+    clock: Clock,
+    state: TrainState,
+    batch: Photographs,
+    backgrounds: Array,
+    iteration: Array,
+    own: tuple[Array, ...],
 ) -> BatchGradients:
     """Return loss and gradients of every view, one after the other."""
     height, width = batch.images.shape[1:3]
@@ -199,7 +206,7 @@ def _gradients(
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
     has_geometry = any(term.has_geometry for term in stage.losses)
 
-    def one_view(view):
+    def one_view(view: tuple[Any, ...]) -> BatchGradients:
         viewmat, K, image, alpha, mask, background, rows = view
         photograph = _black_outside(mask, _over(image, alpha, background))
 
@@ -243,7 +250,7 @@ def _mean_over(mask: Array | None, values: Array) -> Array:
     return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
 
 
-def _backgrounds(key: Array, kind: Background, num: int, dtype) -> Array:
+def _backgrounds(key: Array, kind: Background, num: int, dtype: Any) -> Array:
     if kind == "random":
         return jax.random.uniform(key, (num, 3), dtype)
     return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
@@ -256,13 +263,13 @@ def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: Batch
     if own:
         cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(own, cameras)
     colors = found.grads[0].sh[:, :, 0] / SH_C0
-    if found.statistic is None:
+    if found.statistic is None or stage.statistic is None:
         nothing = jnp.zeros_like(colors)
         return Seen(cameras, nothing, jnp.zeros(colors.shape[:2], bool), colors)
     return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height), colors)
 
 
-def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tuple[Model, AdamState]:
+def _updated(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array) -> tuple[Model, AdamState]:
     """Return model and moments after Adam, with the parameters projected to where they belong."""
     model = state.model
     rates = (
@@ -274,7 +281,9 @@ def _updated(stage: Stage, state: TrainState, grads, rate_of_means: Array) -> tu
     return dataclasses.replace(model, gaussians=gaussians, params=stage.appearance.project(params)), step.state
 
 
-def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState, states):
+def _events(
+    stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState, states: Sequence[Any]
+) -> tuple[Model, AdamState, tuple[Any, ...], EventInfo]:
     """Gather statistics for the events, and apply those inside the step."""
     infos, left, at = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)), [], 0
     for event, times, state in zip(stage.events, clock.times, states, strict=True):
@@ -290,7 +299,9 @@ def _events(stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, mome
     return model, moments, tuple(left), infos
 
 
-def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: AdamState, state):
+def _at_its_times(
+    event: StepEvent, times: Times | None, now: Now, model: Model, moments: AdamState, state: Any
+) -> tuple[Model, AdamState, Any, EventInfo]:
     """Return the change by an event if it is due; events that are past make none."""
     if times is None:
         change = event.apply(now, model, moments, state)
@@ -298,12 +309,12 @@ def _at_its_times(event: StepEvent, times, now: Now, model: Model, moments: Adam
     if state is None:
         return model, moments, state, EventInfo()
 
-    def happen(carry):
+    def happen(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
         change = event.apply(now, *carry)
         info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))
         return change.model, change.moments, change.state, info
 
-    def wait(carry):
+    def wait(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
         return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
 
     return jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
@@ -320,5 +331,5 @@ def _status(clock: Clock, tried: Attempt) -> Array:
     return jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
 
 
-def _all_finite(tree) -> Array:
+def _all_finite(tree: Any) -> Array:
     return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
