@@ -21,7 +21,9 @@ CHUNK = 1 << 24
 LONGEST_REASON = 200
 
 
-def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, np.ndarray]:
+def read_npz(
+    path: str | os.PathLike[str], is_wanted: Callable[[str], bool] = lambda name: True
+) -> dict[str, np.ndarray]:
     """Return the wanted arrays of an .npz, by name.
 
     Raises:

@@ -35,7 +35,7 @@ APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
 """Prefixes of the names of their arrays."""
 
 
-def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
+def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, Any] | None = None) -> None:
     """Write a model's live rows, its appearance and its origin.
 
     Args:
@@ -61,7 +61,7 @@ def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] 
     write_archive(path, described, arrays, format=FORMAT)
 
 
-def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance]] = ()) -> Model:
+def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appearance]] = ()) -> Model:
     """Return the model that `save_model` wrote.
 
     A model of version 0.1.0, which knew one kind of textures, gets them with the default options.

@@ -44,7 +44,7 @@ ENCODING = "binary_little_endian"
 
 
 def save_ply(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     gaussians: Gaussians | Model,
     transform: Similarity | None = None,
     *,
@@ -59,7 +59,7 @@ def save_ply(
         their own).
       transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
-        model back to the original world of its origin, where it has one.
+        model back to the original world of its origin, if it has one.
       third_scale: write scale_2, too, a thousandth of the shorter scale, for viewers of 3DGS files.
 
     Raises:
@@ -111,11 +111,11 @@ def has_own_opacities(appearance: Appearance) -> bool:
     return type(inner).opacities is Appearance.opacities
 
 
-def load_ply(path: str | os.PathLike) -> Gaussians:
+def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
     They have the SH degree of the file; further attributes are left aside. A 3DGS file (scale_2) holds
-    ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning where that is more
+    ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more
     than a thousandth of the others.
 
     Returns:

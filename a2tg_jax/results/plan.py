@@ -123,7 +123,7 @@ def _is_equal(a: Stage, b: Stage) -> bool:
 
 
 def fingerprint(system: System, index: int) -> str:
-    """Return a text that two systems share where they make the same of a stage's start, in this process or another.
+    """Return a text shared by two systems that train a stage alike from the same start, in any process.
 
     It tells classes and functions apart by module and name, and is another one for another version's options.
 
