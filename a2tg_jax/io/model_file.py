@@ -86,7 +86,9 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
         raise ValueError(f"{os.fspath(path)}: {shortened(str(error), LONGEST_REASON)}") from error
 
 
-def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances) -> Model:
+def _model_of(
+    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances: Sequence[type[Appearance]]
+) -> Model:
     gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
     check_gaussians(gaussians)
     gaussians = jax.tree.map(jnp.asarray, gaussians)

@@ -11,6 +11,7 @@ Programs made for 3DGS want a third scale, scale_2, of the axis along the normal
 import dataclasses
 import os
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -154,7 +155,7 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
 
-    def columns(wanted) -> np.ndarray:
+    def columns(wanted: Iterable[str]) -> np.ndarray:
         with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
             return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from matplotlib import colormaps
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
@@ -32,7 +33,7 @@ LONGEST_SIDE = 1280
 """Longest side of a picture in the report, in pixels."""
 
 
-def to_uint8(image) -> np.ndarray:
+def to_uint8(image: ArrayLike) -> np.ndarray:
     """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
     return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
 

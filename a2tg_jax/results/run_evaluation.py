@@ -105,7 +105,14 @@ def _seconds(run: RunFolder, name: str) -> float:
     return read_history(run.history(name)).last_seconds
 
 
-def _measure(model: Model, scene: Scene, plan: RunPlan, system: System, seconds: float, lpips_weights) -> ModelResult:
+def _measure(
+    model: Model,
+    scene: Scene,
+    plan: RunPlan,
+    system: System,
+    seconds: float,
+    lpips_weights: str | os.PathLike[str] | None,
+) -> ModelResult:
     views = (*scene.test, *scene.train)
     found = evaluate(views, model, settings=settings_of(system), lpips_weights=lpips_weights)
     return ModelResult(
