@@ -150,7 +150,7 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
     if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
         return found
     raise ValueError(
-        f"shows the appearance {name} of the module {module}, which is unknown here: import that module first, or "
+        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
         f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
     )
 
