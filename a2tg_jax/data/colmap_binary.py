@@ -16,6 +16,7 @@ import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.host.regular_files import open_regular
@@ -40,7 +41,7 @@ class _Cursor:
             raise self.error(f"wants {num_bytes} bytes at byte {self.at}, and {left} are left")
         self.at += num_bytes
 
-    def take(self, format: struct.Struct) -> tuple:
+    def take(self, format: struct.Struct) -> tuple[Any, ...]:
         start = self.at
         self.skip(format.size)
         return format.unpack_from(self.data, start)

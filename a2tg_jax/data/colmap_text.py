@@ -18,7 +18,7 @@ Words = list[bytes]
 LONGEST_LINE = 1 << 26
 """Longest line in bytes. The points of an image with a million features take half of that."""
 ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
-"""How many lines, or pairs of lines for images, there are: a comment of COLMAP's."""
+"""COLMAP's comment on the number of lines, or of pairs of lines for images."""
 
 
 def check_text(path: Path) -> None:
@@ -113,7 +113,7 @@ LINES: dict[str, Callable[[Words], None]] = {
     "rigs": _check_rig,
     "frames": _check_frame,
 }
-"""What a line of a file must be."""
+"""Check of a line, by file name."""
 
 
 def _count(word: bytes, most: int) -> int:

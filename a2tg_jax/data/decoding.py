@@ -29,7 +29,7 @@ class PictureRefused(ValueError):
     """Error for an intact picture that is refused."""
 
 
-def read_pixels(path: str | os.PathLike) -> np.ndarray:
+def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     """Return the pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
 
     Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
@@ -43,7 +43,7 @@ def read_pixels(path: str | os.PathLike) -> np.ndarray:
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
 
-def check_picture(path: str | os.PathLike) -> tuple[int, int]:
+def check_picture(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Return (width, height) of an image file that can be decoded. Raises as `read_pixels` does."""
     with _opened(path) as image:
         image.load()
@@ -51,13 +51,13 @@ def check_picture(path: str | os.PathLike) -> tuple[int, int]:
 
 
 @contextmanager
-def _opened(path: str | os.PathLike) -> Iterator[Image.Image]:
+def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     """Open an image within the block; every decoding error becomes one ValueError."""
     with open_regular(path, MOST_BYTES) as file:
         yield from _decoded(path, file)
 
 
-def _decoded(path: str | os.PathLike, file: BufferedReader) -> Iterator[Image.Image]:
+def _decoded(path: str | os.PathLike[str], file: BufferedReader) -> Iterator[Image.Image]:
     """Yield the image in an open file, once."""
     try:
         with Image.open(file, formats=FORMATS) as image:
@@ -71,7 +71,7 @@ def _decoded(path: str | os.PathLike, file: BufferedReader) -> Iterator[Image.Im
         raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
 
 
-def _check_size(path: str | os.PathLike, image: Image.Image) -> None:
+def _check_size(path: str | os.PathLike[str], image: Image.Image) -> None:
     width, height = image.size
     if width * height > MAX_PIXELS:
         raise PictureRefused(
@@ -80,7 +80,7 @@ def _check_size(path: str | os.PathLike, image: Image.Image) -> None:
         )
 
 
-def _check_depth(path: str | os.PathLike, image: Image.Image) -> None:
+def _check_depth(path: str | os.PathLike[str], image: Image.Image) -> None:
     if image.mode.startswith(("I", "F")) or _is_deep(image):
         raise PictureRefused(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
 

@@ -27,7 +27,7 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
     """Return the file of one image and the factor by which it is still to be downscaled.
 
     Args:
-      folder: the folder of the full images; with downscale k, its sibling `<folder>_k` is preferred where it exists.
+      folder: the folder of the full images; with downscale k, its sibling `<folder>_k` is preferred if it exists.
       name: path of the image below the folder; the suffix may be missing.
       downscale: k >= 1.
 

@@ -1,4 +1,4 @@
-"""From any camera model of COLMAP to a pinhole: its intrinsics and its image without distortion."""
+"""Undistortion from any camera model of COLMAP to a pinhole: intrinsics and image."""
 
 import dataclasses
 from functools import cached_property

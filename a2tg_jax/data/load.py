@@ -12,7 +12,7 @@ from a2tg_jax.host.regular_files import is_regular
 
 
 def load_scene(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     *,
     downscale: int = 1,
     test_every: int = 8,
@@ -23,24 +23,24 @@ def load_scene(
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
     nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`).
-    Distorted cameras are undistorted to pinholes. Images in the folder without a pose are left aside. Masks, black
-    where a pixel shall not count, lie in `masks` beside `images`, or where `mask_path` says.
+    Distorted cameras are undistorted to pinholes. Images in the folder without a pose are ignored. Masks, black
+    at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
 
     Args:
       path: the scene folder, or a transforms.json.
-      downscale: k >= 1; images are read from `images_k` where that exists and made from the full ones where not.
-      test_every: every k-th of the name-sorted views, the first among them, is a test view; 0 keeps none. Has no
-        effect where the scene names its test views itself.
-      room: bytes that the photographs may take in memory, at 3 or 4 a pixel; those beyond stay on disk and are read
-        when they are needed (`Shelf`), which changes no result. None: a quarter of what the process may have.
-      alpha: what an alpha channel is: the "transparency" of what was photographed, before a background; or a "mask",
-        of which only what is opaque counts.
+      downscale: k >= 1; images are read from `images_k` if it exists, and downscaled from the full ones otherwise.
+      test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. Has no
+        effect if the scene names its own test views.
+      room: bytes of memory for photographs, at 3 or 4 a pixel; those beyond it stay on disk and are read when
+        needed (`Shelf`), which changes no result. None takes a quarter of the process's memory.
+      alpha: meaning of the alpha channel: "transparency" before a background, or a "mask", of which only opaque
+        pixels count.
 
     Returns:
-      The scene, in its normalised world; `Scene.transform` leads there from the input's.
+      The scene in its normalised world; `Scene.transform` leads there from the input's.
 
     Raises:
-      FileNotFoundError: if the path, an image or a mask that is named does not exist, or nothing there is a scene.
+      FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
     """
     if alpha not in get_args(AlphaMeaning):

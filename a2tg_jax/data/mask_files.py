@@ -23,7 +23,7 @@ AlphaMeaning = Literal["transparency", "mask"]
 
 
 def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
-    """Return the mask of an image and the factor by which it is still to be downscaled; None where there is none.
+    """Return the mask of an image and the factor by which it is still to be downscaled; None without a mask.
 
     Args:
       images: the folder of the full images; masks lie in its sibling `masks`, or `masks_k` for a downscale of k.
@@ -53,7 +53,7 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
 def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray) -> Mask | None:
     """Return the mask of a view, undistorted and downscaled as its photograph was; None for None.
 
-    A pixel counts where all that it is made of does.
+    A pixel counts if every pixel it is made of counts.
 
     Args:
       found: file and factor, of `find_mask`.
@@ -78,7 +78,7 @@ def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray
 
 
 def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) -> None:
-    """Tell of photographs without a mask where others have one, and refuses masks that leave nothing.
+    """Warn of photographs without a mask if others have one, and refuse masks that leave nothing.
 
     Args:
       shots: all of the scene.

@@ -69,10 +69,10 @@ class Shelf:
 
         Args:
           pixels: of any shape, uint8.
-          source: an image file whose pixels these are as they stand there; None where they were made of it.
+          source: an image file whose pixels these are as they stand there; None if they were made from it.
 
         Raises:
-          OSError: where there is no room on disk; it says what to do.
+          OSError: if there is no room on disk; it says what to do.
         """
         with self._lock:
             self._room -= pixels.nbytes

@@ -119,7 +119,7 @@ def views_by_size(views: Sequence[View]) -> list[list[View]]:
 
 
 def counted_pixels(views: Sequence[View]) -> np.ndarray:
-    """Return [V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] where all of them do."""
+    """Return [V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] if all do."""
     if all(view.mask is None for view in views):
         return np.ones((len(views), 1, 1, 1), bool)
     masks = [np.ones(view.picture.size, bool) if view.mask is None else view.mask.read() for view in views]

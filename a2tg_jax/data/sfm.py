@@ -1,4 +1,4 @@
-"""From plain photographs to a scene: COLMAP's features, matching and incremental mapping, through pycolmap."""
+"""Structure from motion for plain photographs: COLMAP's features, matching and mapping, through pycolmap."""
 
 import os
 import shutil
@@ -31,8 +31,8 @@ class SfmSummary(NamedTuple):
 
 
 def run_sfm(
-    photos: str | os.PathLike,
-    out: str | os.PathLike,
+    photos: str | os.PathLike[str],
+    out: str | os.PathLike[str],
     *,
     seed: int = 0,
     camera_model: str = "SIMPLE_RADIAL",
@@ -40,7 +40,7 @@ def run_sfm(
 ) -> SfmSummary:
     """Estimate poses and points, and write a scene folder that `load_scene` reads.
 
-    Every pair of photographs is matched, or neighbours by name where there are more than 200. Photographs of one size
+    Every pair of photographs is matched, or neighbours by name if there are more than 200. Photographs of one size
     share one camera. The largest model found is kept and undistorted. Runs on the CPU and uses the seed wherever COLMAP
     takes one; the mapping is done in one thread, so that a second run gives the same.
 
@@ -131,7 +131,7 @@ def _map(photos: Path, work: Path, seed: int, bar: tqdm) -> Any:
 
 
 def _check_model(model: Any, num_photos: int, photos: Path) -> None:
-    """Raise ValueError without a usable model, and warns where many photographs have no pose."""
+    """Raise ValueError without a usable model, and warn if many photographs have no pose."""
     num_registered = 0 if model is None else model.num_reg_images()
     advice = "sharp photographs that overlap by two thirds, from different places, work best"
     message = f"{photos}: only {num_registered} of {num_photos} photographs could be placed; {advice}"

@@ -1,7 +1,7 @@
 """Surfaces that rays can hit and that carry an image: what the synthetic scene is made of.
 
 Vectors have their components first, [3, P] (numpy is several times faster so), float32. Rays are
-origin + t·direction, directions not necessarily unit; t is infinite where a ray misses. (u, v) in [0, 1] run along
+origin + t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along
 the columns and rows of a surface's image.
 """
 
@@ -163,7 +163,7 @@ class Surface:
 
 
 def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (t, index of the shape), both [P], of the first hit of each ray; t is infinite where all are missed."""
+    """Return (t, index of the shape), both [P], of the first hit of each ray; t is infinite if it misses all."""
     nearest = np.full(directions.shape[1], np.inf, np.float32)
     index = np.zeros(directions.shape[1], np.int8)
     for number, shape in enumerate(shapes):

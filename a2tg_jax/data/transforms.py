@@ -40,8 +40,8 @@ logger = logging.getLogger(__name__)
 def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
     """Read a nerfstudio or instant-ngp scene.
 
-    The lists train_filenames, test_filenames and val_filenames decide about the split where the file has them (val is
-    the test where there is no test list), test_every where it has none.
+    The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
+    split without a test list); otherwise test_every does.
 
     Args:
       file: path of transforms.json.

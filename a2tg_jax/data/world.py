@@ -19,8 +19,8 @@ ZERO_SPREAD = 1e-9
 def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     """Return the similarity to the normalised world.
 
-    The origin goes to the point nearest, in least squares, to all optical axes (to the mean camera centre where the
-    axes are nearly parallel), the mean camera-up to +z (kept as it is where the ups cancel), and the median distance
+    The origin goes to the point nearest, in least squares, to all optical axes (to the mean camera centre if the
+    axes are nearly parallel), the mean camera-up to +z (unchanged if the ups cancel), and the median distance
     of the cameras from the origin becomes 1.
 
     Args:

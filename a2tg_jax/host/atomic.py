@@ -11,7 +11,7 @@ PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
 
     A run killed while it writes, or a machine that loses its power, leaves the old file, or none, never half of one.

@@ -29,7 +29,7 @@ TOML_STRING = re.compile(
 TOML_WORD = re.compile(rb"[\[\]{}=,\n]")
 STEPS = np.zeros(256, np.int8)
 STEPS[[*b"[{"]], STEPS[[*b"]}"]] = 1, -1
-"""How much deeper a text goes with each byte."""
+"""Change of depth by each byte."""
 
 
 def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:

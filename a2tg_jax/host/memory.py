@@ -33,12 +33,12 @@ def memory_limit(root: Path = Path("/")) -> int:
 
 
 def memory_peak(root: Path = Path("/")) -> int:
-    """Return bytes of memory that this process had at its peak; 0 where the system does not tell (host)."""
+    """Return bytes of memory that this process had at its peak; 0 if the system does not report it (host)."""
     return _told(root / "proc/self/status").get("VmHWM", 0)
 
 
 def _told(file: Path) -> dict[str, int]:
-    """Return the bytes of a file of lines "Name: 123 kB"; empty where there is none."""
+    """Return the bytes of a file of lines "Name: 123 kB"; empty without such a file."""
     try:
         lines = [line.replace(":", " ").split() for line in file.read_text().splitlines()]
     except OSError:

@@ -21,7 +21,9 @@ CHUNK = 1 << 24
 LONGEST_REASON = 200
 
 
-def read_npz(path: str | os.PathLike, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, np.ndarray]:
+def read_npz(
+    path: str | os.PathLike[str], is_wanted: Callable[[str], bool] = lambda name: True
+) -> dict[str, np.ndarray]:
     """Return the wanted arrays of an .npz, by name.
 
     Raises:
@@ -72,7 +74,7 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int,
     """Return the dtype of one array, whether its first index runs fastest, and its shape."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
-        raise ValueError(f"{name} is of the version {version} of .npy, which is unknown")
+        raise ValueError(f"{name} is of the version {version} of .npy, which is not known here")
     length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
     if length > LONGEST_HEADER:
         raise ValueError(f"{name} has a header of {length} bytes")

@@ -13,8 +13,8 @@ MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
 
 
-def is_regular(path: str | os.PathLike) -> bool:
-    """Return whether there is a regular file; False where there is nothing, or a folder.
+def is_regular(path: str | os.PathLike[str]) -> bool:
+    """Return whether there is a regular file; False for nothing, or a folder.
 
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.
@@ -27,7 +27,7 @@ def is_regular(path: str | os.PathLike) -> bool:
     raise ValueError(_refusal(path))
 
 
-def open_regular(path: str | os.PathLike, most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
+def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
     """Open a regular file for reading bytes.
 
     Args:
@@ -50,15 +50,15 @@ def open_regular(path: str | os.PathLike, most_bytes: int = MOST_ARRAY_BYTES) ->
     raise ValueError(_too_large(path, status.st_size, most_bytes) if stat.S_ISREG(status.st_mode) else _refusal(path))
 
 
-def read_regular(path: str | os.PathLike, most_bytes: int) -> bytes:
+def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     """Read the bytes of a regular file, up to the size that it has when it is opened. Raises as `open_regular`."""
     with open_regular(path, most_bytes) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
-def _refusal(path: str | os.PathLike) -> str:
+def _refusal(path: str | os.PathLike[str]) -> str:
     return f"{os.fspath(path)}: is not a regular file but a folder, device, pipe or socket; put a file there"
 
 
-def _too_large(path: str | os.PathLike, size: int, most_bytes: int) -> str:
+def _too_large(path: str | os.PathLike[str], size: int, most_bytes: int) -> str:
     return f"{os.fspath(path)}: has {size:,} bytes, and {most_bytes:,} are the most that such a file may have"

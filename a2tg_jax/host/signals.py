@@ -4,6 +4,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 CTRL_C = signal.SIGINT
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -60,7 +61,7 @@ def noted() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def _handled_by(handler: Callable, numbers: tuple[int, ...]) -> Iterator[None]:
+def _handled_by(handler: Callable[..., Any], numbers: tuple[int, ...]) -> Iterator[None]:
     """Install a handler within the block. Ignored signals, such as SIGHUP under nohup, stay ignored; other threads
     install none."""
     before: dict[int, object] = {}

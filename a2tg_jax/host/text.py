@@ -3,7 +3,7 @@
 from typing import Any
 
 SLACK = 10
-"""How many times the letters that are told are looked at; runs of spaces are told as one."""
+"""Multiple of the told letters that is looked at, since runs of spaces are told as one."""
 
 
 def shortened(value: Any, most: int = 80) -> str:

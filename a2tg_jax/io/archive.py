@@ -23,7 +23,7 @@ HEADER = "header"
 
 
 def write_archive(
-    path: str | os.PathLike, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, format: str = FORMAT
+    path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, format: str = FORMAT
 ) -> None:
     """Write an archive; an older file of that name is replaced once the new one is whole.
 
@@ -39,7 +39,7 @@ def write_archive(
         np.savez(file, **entries)  # type: ignore[arg-type]
 
 
-def read_archive(path: str | os.PathLike, *, format: str = FORMAT) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read_archive(path: str | os.PathLike[str], *, format: str = FORMAT) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the header and the arrays that `write_archive` was given.
 
     Raises:
@@ -50,7 +50,7 @@ def read_archive(path: str | os.PathLike, *, format: str = FORMAT) -> tuple[dict
     return header, _read_entries(Path(path), format, lambda name: name != HEADER)
 
 
-def read_archive_header(path: str | os.PathLike, *, format: str = FORMAT) -> dict[str, Any]:
+def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -> dict[str, Any]:
     """Return the header alone, without reading the arrays. Raises as `read_archive` does."""
     path = Path(path)
     entries = _read_entries(path, format, lambda name: name == HEADER)

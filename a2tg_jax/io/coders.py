@@ -52,7 +52,7 @@ def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
     """
     if num_planes * length == 0:
         if data:
-            raise CodedError("holds unexpected bytes")
+            raise CodedError("holds bytes where there should be none")
         return np.zeros((num_planes, length), np.uint8)
     try:
         planes = CODERS[coder].decode(data, num_planes, length)
@@ -85,7 +85,7 @@ def _decode_lzma(data: bytes, num_planes: int, length: int) -> np.ndarray:
     stream = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS)
     found = stream.decompress(data, num_planes * length + 1)
     if not stream.eof or stream.unused_data:
-        raise ValueError("it does not end at its announced length")
+        raise ValueError("it does not end where it should")
     return np.frombuffer(found, np.uint8)
 
 

@@ -100,7 +100,7 @@ GROUPS = tuple(field.name for field in dataclasses.fields(CompactChoices) if fie
 DEFAULT_CHOICES = CompactChoices()
 
 
-def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoices = DEFAULT_CHOICES) -> None:
+def save_compact(path: str | os.PathLike[str], model: Model, *, choices: CompactChoices = DEFAULT_CHOICES) -> None:
     """Write a model's live rows, its appearance and its origin in few bytes.
 
     Args:
@@ -117,7 +117,7 @@ def save_compact(path: str | os.PathLike, model: Model, *, choices: CompactChoic
         temporary.write_bytes(data)
 
 
-def load_compact(path: str | os.PathLike) -> Model:
+def load_compact(path: str | os.PathLike[str]) -> Model:
     """Return the model of a compact file, float32, its rows in the order of the file.
 
     Raises:

@@ -52,7 +52,7 @@ def config_from_dict(
     return kind(**values, **given)
 
 
-def has_default(field: dataclasses.Field) -> bool:
+def has_default(field: dataclasses.Field[Any]) -> bool:
     """Return whether a field of a dataclass need not be given."""
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
@@ -123,7 +123,7 @@ def _converted(hint: Any, value: Any) -> Any:
     return float(value) if hint is float else value
 
 
-def _item_hints(hint: Any, value: list) -> tuple:
+def _item_hints(hint: Any, value: list[Any]) -> tuple[Any, ...]:
     """Return the types of the items of a tuple; too few or too many match no list of that length."""
     first, *rest = typing.get_args(hint)
     if rest == [...]:

@@ -35,7 +35,7 @@ APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
 """Prefixes of the names of their arrays."""
 
 
-def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
+def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, Any] | None = None) -> None:
     """Write a model's live rows, its appearance and its origin.
 
     Args:
@@ -61,7 +61,7 @@ def save_model(path: str | os.PathLike, model: Model, header: Mapping[str, Any] 
     write_archive(path, described, arrays, format=FORMAT)
 
 
-def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance]] = ()) -> Model:
+def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appearance]] = ()) -> Model:
     """Return the model that `save_model` wrote.
 
     A model of version 0.1.0, which knew one kind of textures, gets them with the default options.
@@ -86,7 +86,9 @@ def load_model(path: str | os.PathLike, *, appearances: Sequence[type[Appearance
         raise ValueError(f"{os.fspath(path)}: {shortened(str(error), LONGEST_REASON)}") from error
 
 
-def _model_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances) -> Model:
+def _model_of(
+    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances: Sequence[type[Appearance]]
+) -> Model:
     gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
     check_gaussians(gaussians)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
@@ -148,7 +150,7 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
     if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
         return found
     raise ValueError(
-        f"shows the appearance {name} of the module {module}, which is unknown here: import that module first, or "
+        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
         f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
     )
 

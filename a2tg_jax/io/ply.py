@@ -11,6 +11,7 @@ Programs made for 3DGS want a third scale, scale_2, of the axis along the normal
 import dataclasses
 import os
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -44,7 +45,7 @@ ENCODING = "binary_little_endian"
 
 
 def save_ply(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     gaussians: Gaussians | Model,
     transform: Similarity | None = None,
     *,
@@ -59,7 +60,7 @@ def save_ply(
         their own).
       transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
-        model back to the original world of its origin, where it has one.
+        model back to the original world of its origin, if it has one.
       third_scale: write scale_2, too, a thousandth of the shorter scale, for viewers of 3DGS files.
 
     Raises:
@@ -111,11 +112,11 @@ def has_own_opacities(appearance: Appearance) -> bool:
     return type(inner).opacities is Appearance.opacities
 
 
-def load_ply(path: str | os.PathLike) -> Gaussians:
+def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
     They have the SH degree of the file; further attributes are left aside. A 3DGS file (scale_2) holds
-    ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning where that is more
+    ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more
     than a thousandth of the others.
 
     Returns:
@@ -154,7 +155,7 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
     if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
 
-    def columns(wanted) -> np.ndarray:
+    def columns(wanted: Iterable[str]) -> np.ndarray:
         with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
             return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
 

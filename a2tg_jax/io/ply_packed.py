@@ -25,8 +25,7 @@ LEAST_OPACITY = 1e-6
 
 
 def is_packed(file: BinaryIO, path: Path) -> bool:
-    """Return whether a PLY is packed so; the file is left at its beginning. Raises ValueError where it has no
-    header."""
+    """Return whether a PLY is packed so, with the file left at its beginning. Raises ValueError without a header."""
     elements = (words[1] for words in header_lines(file, path) if words[:1] == ["element"] and len(words) > 1)
     first = next(elements, "")
     file.seek(0)

@@ -28,7 +28,7 @@ def check_precision(name: str, precision: Precision) -> None:
 
 
 def ends_of(values: np.ndarray, bits: int) -> Ends:
-    """Return the smallest and the largest of all numbers; 0 and 0 where there are none.
+    """Return the smallest and the largest of all numbers; 0 and 0 without numbers.
 
     Where 0 lies between them, they are moved apart, by a step together, so that a step lies on 0: most of what is added
     to something else is about 0.
@@ -49,7 +49,7 @@ def _short(value: np.float32) -> float:
 
 
 def quantised(values: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
-    """Return the nearest of 2^bits even steps between the ends, as int64; all 0 where both ends are one."""
+    """Return the nearest of 2^bits even steps between the ends, as int64; all 0 if both ends are equal."""
     low, high = ends
     if high <= low:
         return np.zeros(values.shape, np.int64)

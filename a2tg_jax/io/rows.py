@@ -1,7 +1,7 @@
 """A model as plain tables of numbers, in the order of a Z curve, and the model again.
 
 Splats that are near each other stand near each other, so that what they show is alike. Each is turned by half about one
-of its own axes where that makes its rotation smaller, and its texture is mirrored along: it looks the same.
+of its own axes if that makes its rotation smaller, and its texture is mirrored along: it looks the same.
 """
 
 import dataclasses
@@ -79,7 +79,7 @@ def rows_of(model: Model) -> Rows:
 
 
 def ordered(rows: Rows, order: np.ndarray) -> Rows:
-    """Return the splats order[0], order[1], …, turned by half where that makes their rotations smaller."""
+    """Return the splats order[0], order[1], …, turned by half if that makes their rotations smaller."""
     quats, axis = nearest_half_turn(rows.quats[order])
     return Rows(
         means=rows.means[order],

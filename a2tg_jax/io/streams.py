@@ -140,7 +140,7 @@ class Reader:
             raise ValueError(f"the part {name} {error}") from error
 
     def take_room(self, name: str, num_bytes: int) -> None:
-        """Raise ValueError where so many bytes more than a file of this size may unpack to."""
+        """Raise ValueError if these are more bytes than a file of this size may unpack to."""
         if num_bytes > self.room:
             raise ValueError(f"{name} would take {num_bytes} bytes, which the file is too small for")
         self.room -= num_bytes

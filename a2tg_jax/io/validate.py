@@ -130,7 +130,7 @@ def check_count(name: str, value: Any, most: int) -> None:
 
 def check_like(name: str, tree: Any, wanted: Any) -> None:
     """Raise ValueError, naming the leaf, unless two pytrees of one structure have the same shapes and dtypes."""
-    pairs: Iterable = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
+    pairs: Iterable[Any] = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
     for (path, leaf), like in pairs:
         label = f"{name}{jax.tree_util.keystr(path)}"
         check_shape(label, leaf, tuple(like.shape))

@@ -144,7 +144,7 @@ def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
 
 
 def _as_shown(model: Model) -> Model:
-    """Return the model with texels as they are seen, which need no rule any more but where they are looked up."""
+    """Return the model with texels as they are seen; of their rule, only the lookup remains."""
     textured = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
     if not isinstance(textured, Textured) or model.textures is None or not model.num:
         return model
@@ -254,7 +254,7 @@ def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
 
 
 def _origin_of(header: Mapping[str, Any]) -> Origin | None:
-    """Return the cameras, in the world of the scene; None where the file has none."""
+    """Return the cameras, in the world of the scene; None without cameras."""
     cameras = header["cameras"]
     if cameras is None:
         return None

@@ -50,8 +50,8 @@ class Compressed:
 def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -> Compressed:
     """Write the smallest compact file of a model within a given loss.
 
-    Losses are those of PSNR on the training views of a run. Where the photographs are not there, or a model's file is
-    given, they are guessed from renders, for a model that would have `ASSUMED_PSNR`.
+    Losses are those of PSNR on the training views of a run. If the photographs are missing, or a model's file is
+    given, they are estimated from renders, for a model with `ASSUMED_PSNR`.
 
     Args:
       source: a run folder, of which the last model is taken; or a model, *.npz.

@@ -31,7 +31,7 @@ TITLES = {
 
 
 def measure_corrected(
-    model: Model, scene: Scene, plan: RunPlan, settings: RenderSettings, lpips_weights: str | os.PathLike | None
+    model: Model, scene: Scene, plan: RunPlan, settings: RenderSettings, lpips_weights: str | os.PathLike[str] | None
 ) -> dict[str, Evaluation]:
     """Return the further figures of a model, by split and way, if any system of its run learns exposures or poses.
 

@@ -5,7 +5,7 @@
       run.toml                   the scene, the system with every number, the systems compared: repeats the run
       checkpoints/NAME-*.npz     the newest two of the stage that is being trained, to resume from
       models/NAME.npz            what each finished stage left behind, with cameras, world and background
-      corrections/NAME.json      exposure and pose of each training view, where they were learned
+      corrections/NAME.json      exposure and pose of each training view, if they were learned
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
@@ -187,7 +187,7 @@ def iteration_of(checkpoint: Path) -> int:
     return int(checkpoint.stem.rpartition("-")[2])
 
 
-def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
+def check_free(path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Raise if a new run must not be made in a folder. The folder is not touched.
 
     Raises:
@@ -209,11 +209,11 @@ def check_free(path: str | os.PathLike, *, overwrite: bool = False) -> None:
         )
 
 
-def create_run(path: str | os.PathLike) -> RunFolder:
+def create_run(path: str | os.PathLike[str]) -> RunFolder:
     """Make a new run folder, with its parents.
 
     Args:
-      path: where; an existing folder must be empty, or hold no more than the run.toml of a run that never began.
+      path: the folder; an existing one must be empty, or hold no more than the run.toml of a run that never began.
 
     Raises:
       FileExistsError: as `check_free` does.
@@ -225,7 +225,7 @@ def create_run(path: str | os.PathLike) -> RunFolder:
     return run
 
 
-def open_run(path: str | os.PathLike) -> RunFolder:
+def open_run(path: str | os.PathLike[str]) -> RunFolder:
     """Return an existing run folder.
 
     Raises:

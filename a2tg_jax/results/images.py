@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from matplotlib import colormaps
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
@@ -32,7 +33,7 @@ LONGEST_SIDE = 1280
 """Longest side of a picture in the report, in pixels."""
 
 
-def to_uint8(image) -> np.ndarray:
+def to_uint8(image: ArrayLike) -> np.ndarray:
     """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
     return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
 
@@ -97,7 +98,7 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     """Return unique file names of the views' pictures, regardless of case; folders become part of the name.
 
-    Where that is another's, as of a/b.png and a_b.jpg, a number follows; names count in their sorted order.
+    If that name is taken, as with a/b.png and a_b.jpg, a number follows; names count in their sorted order.
     """
     names: dict[str, str] = {}
     taken: set[str] = set()
@@ -110,7 +111,7 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def save_picture(path: str | os.PathLike, picture: Image.Image | np.ndarray) -> None:
+def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
     """Write a PNG atomically."""
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     with replacing(path) as temporary:
@@ -138,7 +139,7 @@ def resolution_colors(num_levels: int) -> np.ndarray:
 
 
 def texel_levels(layout: AtlasLayout) -> np.ndarray:
-    """Return [N] integers log₂(Tu·Tv), rounded; 0 where a texture is empty."""
+    """Return [N] integers log₂(Tu·Tv), rounded; 0 for an empty texture."""
     return np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
 
 

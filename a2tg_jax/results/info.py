@@ -43,7 +43,7 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     """Return the PSNR in a metrics.json: model → test or train → dB.
 
     Raises:
-      ValueError: if there is anything else where they should be.
+      ValueError: if the file holds anything else in their place.
     """
     data = read_json(path)
     models = data.get("models") if isinstance(data, dict) else None

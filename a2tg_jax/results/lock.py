@@ -19,8 +19,8 @@ except ImportError:  # Windows
 def claimed(run: RunFolder) -> Iterator[None]:
     """Keep other processes from training and measuring in a run folder. The folder is made if it does not exist.
 
-    The lock is the operating system's, on the marker: it ends with the process, however that ends. On Windows, and
-    where the file system knows no locks, there is none. What a killed process left half written is removed, and a run
+    The lock is the operating system's, on the marker: it ends with the process, however that ends. Windows, and file
+    systems without locks, have none. What a killed process left half written is removed, and a run
     that it was about to replace is put back.
 
     Raises:
@@ -38,7 +38,7 @@ def claimed(run: RunFolder) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike) -> Iterator[RunFolder]:
+def opened(path: str | os.PathLike[str]) -> Iterator[RunFolder]:
     """Claim an existing run folder.
 
     Raises:

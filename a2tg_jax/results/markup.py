@@ -62,7 +62,7 @@ def image(uri: str, caption: str, kind: str = "") -> str:
 
 
 def layers(uris: Sequence[str], captions: Sequence[str], kind: str = "") -> str:
-    """Return pictures of one size that lie on each other; side by side where no script runs."""
+    """Return pictures of one size in layers; without a script, they stand side by side."""
     pairs = zip(uris, captions, strict=True)
     return f'<div class="layers {kind}">{"".join(image(uri, caption) for uri, caption in pairs)}</div>'
 

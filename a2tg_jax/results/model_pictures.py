@@ -37,7 +37,7 @@ def learned_textures(model: Model) -> np.ndarray | None:
     They are those that add most to the picture: by the spread of their texels times the area of the Gaussian.
 
     Returns:
-      uint8 [H, W, 4], transparent between the textures; None where no Gaussian has more than one texel.
+      uint8 [H, W, 4], transparent between the textures; None if no Gaussian has more than one texel.
     """
     inner = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
     if model.textures is None or not isinstance(inner, Textured) or isinstance(inner, Billboards):

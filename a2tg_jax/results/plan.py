@@ -109,7 +109,7 @@ def _trains_alike(a: System, b: System, index: int) -> bool:
     return _common_options(a) == _common_options(b) and _is_equal(a.stages()[index], b.stages()[index])
 
 
-def _common_options(system: System) -> list:
+def _common_options(system: System) -> list[Any]:
     """Return the options that training reads from the system itself."""
     return [getattr(system, field.name) for field in dataclasses.fields(System) if field.name not in STAGE_OPTIONS]
 
@@ -123,7 +123,7 @@ def _is_equal(a: Stage, b: Stage) -> bool:
 
 
 def fingerprint(system: System, index: int) -> str:
-    """Return a text that two systems share where they make the same of a stage's start, in this process or another.
+    """Return a text shared by two systems that train a stage alike from the same start, in any process.
 
     It tells classes and functions apart by module and name, and is another one for another version's options.
 
@@ -153,7 +153,7 @@ def _described(value: Any) -> Any:
     raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
 
 
-def _is_absent(field: dataclasses.Field, value: Any) -> bool:
+def _is_absent(field: dataclasses.Field[Any], value: Any) -> bool:
     """Return whether it is a tuple that is empty, as it is by default."""
     return isinstance(value, tuple) and not value and field.default == ()
 

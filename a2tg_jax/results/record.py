@@ -170,7 +170,7 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
     Args:
       name: as `find_system` takes it.
       other: the system that it is compared with.
-      preset: what its further options start from, where it has that preset.
+      preset: preset of its further options, if it has one of that name.
 
     Raises:
       ValueError: if there is no such system.

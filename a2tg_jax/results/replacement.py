@@ -26,8 +26,8 @@ def old_run(run: RunFolder) -> RunFolder | None:
 def set_aside(run: RunFolder) -> None:
     """Move what runs wrote into a folder, as its marker lists it, to RUN/.a2tg-old.
 
-    Where a finished run lies there already, because the one that was to replace it never ended, that one is kept, and
-    this one deleted.
+    If a finished run lies there already, because the run that was to replace it never ended, that one is kept and this
+    one deleted.
     """
     if old_run(run) is None:
         moving = RunFolder(run.path / MOVING)

@@ -44,7 +44,7 @@ REPORTED_VIEWS = 4
 
 
 def evaluate_run(
-    run: RunFolder, scene: Scene | None = None, *, lpips_weights: str | os.PathLike | None = None
+    run: RunFolder, scene: Scene | None = None, *, lpips_weights: str | os.PathLike[str] | None = None
 ) -> RunResult:
     """Measure the finished models of a run, and write the run folder's metrics, pictures and report.
 
@@ -54,7 +54,7 @@ def evaluate_run(
       lpips_weights: a weights file for LPIPS; None keeps what was measured of the same models earlier, if anything.
 
     Raises:
-      FileNotFoundError: if no stage is finished, or the scene or the weights are not where they were.
+      FileNotFoundError: if no stage is finished, or the scene or the weights are missing.
     """
     record = read_record(run)
     plan = record.plan
@@ -105,7 +105,14 @@ def _seconds(run: RunFolder, name: str) -> float:
     return read_history(run.history(name)).last_seconds
 
 
-def _measure(model: Model, scene: Scene, plan: RunPlan, system: System, seconds: float, lpips_weights) -> ModelResult:
+def _measure(
+    model: Model,
+    scene: Scene,
+    plan: RunPlan,
+    system: System,
+    seconds: float,
+    lpips_weights: str | os.PathLike[str] | None,
+) -> ModelResult:
     views = (*scene.test, *scene.train)
     found = evaluate(views, model, settings=settings_of(system), lpips_weights=lpips_weights)
     return ModelResult(

@@ -262,7 +262,7 @@ def _qualities(found: Evaluation | None) -> list[str]:
 
 
 def _figures(measured: ModelResult) -> list[str]:
-    """Return one model's column of the headline table; empty where there is no figure."""
+    """Return one model's column of the headline table; empty for a missing metric."""
 
     def megabytes(num_bytes: int) -> str:
         return f"{num_bytes / 1e6:.2f}"

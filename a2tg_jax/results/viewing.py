@@ -113,7 +113,7 @@ class ServedPhotographs:
 
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None]):
         """Args:
-        origin: the cameras, and the background behind photographs that are transparent; None where there are none.
+        origin: the cameras, and the background behind photographs that are transparent; None without cameras.
         load_scene: finds the photographs, or None.
         """
         self._origin, self._load_scene = origin, load_scene

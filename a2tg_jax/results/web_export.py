@@ -44,7 +44,7 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
       photographs: into the folder go the cameras' photographs too.
 
     Raises:
-      ValueError: if browsers cannot show the model, or photographs are asked for where there are none, or in one file.
+      ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
     """
     if single_file and photographs:
         raise ValueError("--photographs needs a folder beside the page: leave out --single-file")
