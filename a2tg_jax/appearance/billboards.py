@@ -11,6 +11,7 @@ that the initial colours stay; here the rule subtracts the initial RGB, and the 
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
-from a2tg_jax.appearance.rule import AppearanceRule
+from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_divide
@@ -58,7 +59,9 @@ class BillboardRule(AppearanceRule):
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         return jnp.clip(self._place(u), 0.0, self.side - 1.0), jnp.clip(self._place(v), 0.0, self.side - 1.0)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         *rgb, alpha = values
         inside = self._inside(u) * self._inside(v)
         red, green, blue = (inside * channel - self.initial_rgb for channel in rgb)
@@ -132,12 +135,16 @@ class Billboards(Bucketed):
         """Return the mean alpha [N] of the texels."""
         return self._means(params)[: gaussians.num]
 
-    def limit_opacities(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, most: Array):
+    def limit_opacities(
+        self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, most: Array
+    ) -> tuple[Gaussians, Textures]:
         """Fade pictures whose mean alpha is larger than `most`, by one factor each."""
         fading = jnp.minimum(safe_divide(jnp.asarray(most, params.buckets[0].dtype), self._means(params), 1.0), 1.0)
         return gaussians, self._with_alpha(params, lambda alpha: alpha * fading[:, None, None])
 
-    def share(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, num_shares: Array):
+    def share(
+        self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, num_shares: Array
+    ) -> tuple[Gaussians, Textures]:
         """Return texels such that n over each other are as opaque as one was; scales stay unchanged."""
         (bucket,) = self.only(params)
         num_shares = jnp.pad(num_shares, (0, bucket.shape[0] - gaussians.num), constant_values=1)
@@ -154,6 +161,6 @@ class Billboards(Bucketed):
         """Return the mean alphas [capacity]."""
         return jnp.mean(self.only(params)[0][..., 3], axis=(1, 2))
 
-    def _with_alpha(self, params: Textures, change) -> Textures:
+    def _with_alpha(self, params: Textures, change: Callable[[Array], Array]) -> Textures:
         (bucket,) = self.only(params)
         return Textures((bucket.at[..., 3].set(change(bucket[..., 3])),))

@@ -40,7 +40,9 @@ class Bucketed(Appearance):
     def textures(self, params: Textures, layout: AtlasLayout) -> tuple[Textures, AtlasLayout]:
         return params, layout
 
-    def with_textures(self, params: Textures, layout: AtlasLayout, textures: Textures, atlas: AtlasLayout):
+    def with_textures(
+        self, params: Textures, layout: AtlasLayout, textures: Textures, atlas: AtlasLayout
+    ) -> tuple[Textures, AtlasLayout]:
         return textures, atlas
 
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.copies import LARGEST_OPACITY, share
-from a2tg_jax.appearance.rule import PlainRule, gaussian_cutoff
+from a2tg_jax.appearance.rule import Factor, PlainRule, Residual, gaussian_cutoff
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit
 
@@ -69,7 +69,9 @@ class MovableKernelsRule(PlainRule):
     def opacities(self, gaussians: Gaussians) -> Array:
         return jnp.ones(gaussians.num, gaussians.means.dtype)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         totals = [jnp.zeros_like(u)] * 4
         for first in range(0, len(numbers), FLOATS_PER_KERNEL):
             x, y, sharpness, *shown = numbers[first : first + FLOATS_PER_KERNEL]
@@ -90,7 +92,7 @@ class MovableKernels(Appearance):
     max_alpha: float = 0.99
     """Upper limit of alpha."""
 
-    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[MovableKernelParams, tuple]:
+    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[MovableKernelParams, tuple[()]]:
         """Return colourless kernels around the mean, where they are together as opaque as the Gaussian, up to 0.82."""
         num, dtype = gaussians.num, gaussians.means.dtype
         centers = jnp.asarray(INITIAL_CENTERS, dtype)
@@ -104,21 +106,23 @@ class MovableKernels(Appearance):
         )
         return params, ()
 
-    def rule(self, params: MovableKernelParams, layout: tuple) -> MovableKernelsRule:
+    def rule(self, params: MovableKernelParams, layout: tuple[()]) -> MovableKernelsRule:
         return MovableKernelsRule(max_alpha=self.max_alpha, kernels=params)
 
     def project(self, params: MovableKernelParams) -> MovableKernelParams:
         """Return kernels with sharpness of at least 0."""
         return dataclasses.replace(params, sharpness=jnp.maximum(params.sharpness, 0.0))
 
-    def num_floats(self, layout: tuple, num: int) -> int:
+    def num_floats(self, layout: tuple[()], num: int) -> int:
         """Return 27 per splat, beside the Gaussian's own: its opacity is not trained."""
         return (NUM_KERNELS * FLOATS_PER_KERNEL - 1) * num
 
-    def num_published_floats(self, layout: tuple, num: int) -> int:
+    def num_published_floats(self, layout: tuple[()], num: int) -> int:
         return PUBLISHED_FLOATS * num
 
-    def share(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple, num_shares: Array):
+    def share(
+        self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple[()], num_shares: Array
+    ) -> tuple[Gaussians, MovableKernelParams]:
         """Share the mean opacity of the kernels like that of a Gaussian; all kernels fade by one factor."""
         before = self.opacities(gaussians, params, layout)
         logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
@@ -130,11 +134,13 @@ class MovableKernels(Appearance):
             dataclasses.replace(params, logit_opacities=logits),
         )
 
-    def opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple) -> Array:
+    def opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple[()]) -> Array:
         """Return the mean opacity [N] of the kernels, which bounds that of the splat to 10⁻⁴ of it."""
         return jnp.mean(params.opacities, axis=1)
 
-    def limit_opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple, most: Array):
+    def limit_opacities(
+        self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple[()], most: Array
+    ) -> tuple[Gaussians, MovableKernelParams]:
         """Limit the opacity of every kernel to `most`."""
         limit = logit(jnp.asarray(most, params.logit_opacities.dtype))
         return gaussians, dataclasses.replace(params, logit_opacities=jnp.minimum(params.logit_opacities, limit))

@@ -21,5 +21,5 @@ class Plain(Appearance):
     def is_linear(self) -> bool:
         return True
 
-    def rule(self, params: tuple, layout: tuple) -> PlainRule:
+    def rule(self, params: tuple[()], layout: tuple[()]) -> PlainRule:
         return PlainRule(max_alpha=self.max_alpha)

@@ -144,7 +144,9 @@ class RuleAround(AppearanceRule):
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         return self.inner.texel_position(region, u, v)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         return self.inner.shade(numbers, values, u, v)
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:

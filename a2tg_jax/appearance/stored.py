@@ -78,6 +78,6 @@ def parameter_shapes(appearance: Any) -> tuple[Any, Any]:
     return jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
 
 
-def _name(path: tuple) -> str:
+def _name(path: tuple[Any, ...]) -> str:
     """Return a leaf's name in a file, such as "kernels.centers"."""
     return jax.tree_util.keystr(path, simple=True, separator=".")

@@ -15,7 +15,7 @@ from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
 from a2tg_jax.appearance.options import TextureOptions
-from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
+from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
@@ -49,7 +49,9 @@ class TexturedRule(AppearanceRule):
         width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
         return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         red, green, blue, alpha = values
         if self.options.outside == "identity":
             is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
