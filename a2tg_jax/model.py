@@ -1,4 +1,4 @@
-"""A model: Gaussians and what they show, as one value that is trained, rendered, counted, moved and saved."""
+"""A model: Gaussians and their appearance, as one value that is trained, rendered, counted, moved and saved."""
 
 import dataclasses
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
+from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import short_repr
@@ -23,29 +24,29 @@ from a2tg_jax.texture import AtlasLayout, Textures
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """What is trained, saved, loaded, rendered and counted in bytes."""
+    """Gaussians, their appearance with its parameters, and their origin."""
 
     gaussians: Gaussians
-    """Rows allocated, of which the first `num_live` exist."""
+    """Allocated rows, of which the first `num_live` exist."""
     params: Any = ()
-    """Parameters of what the splats show."""
+    """Parameters of the appearance."""
     layout: Any = ()
-    """Integers beside them, not differentiable."""
+    """Integers of the appearance beside its parameters, not differentiable."""
     num_live: Array | None = None
-    """int32; None where all rows exist."""
+    """int32 number of rows that exist; None if all do."""
     appearance: Appearance = dataclasses.field(default_factory=Plain, metadata={"static": True})
-    """What the splats show."""
+    """Kind of appearance, with its options."""
     origin: Origin | None = dataclasses.field(default=None, metadata={"static": True})
-    """Where it was trained; None where that is not known."""
+    """Training cameras and world; None if unknown."""
 
     @property
     def rule(self) -> AppearanceRule:
-        """What the renderer is given."""
+        """Appearance rule for the renderer."""
         return PlainRule() if self.gaussians.num == 0 else self.appearance.rule(self.params, self.layout)
 
     @property
     def live(self) -> "Model":
-        """The model of the rows that exist, and no others (host)."""
+        """Model of only the rows that exist (host)."""
         if self.num_live is None:
             return self
         params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
@@ -55,7 +56,7 @@ class Model:
 
     @property
     def num(self) -> int:
-        """Gaussians that exist (host)."""
+        """Number of Gaussians that exist (host)."""
         return self.gaussians.num if self.num_live is None else int(self.num_live)
 
     @property
@@ -75,28 +76,54 @@ class Model:
         return BYTES_PER_FLOAT * (own + self.appearance.num_published_floats(self.layout, self.num))
 
     def bytes_of(self, num: int) -> int:
-        """Bytes of the trained floats of the first `num` Gaussians and of what they show (host)."""
+        """Return the bytes of the trained floats of the first `num` Gaussians and their appearance (host)."""
         return BYTES_PER_FLOAT * (self.gaussians.floats_per_row * num + self.appearance.num_floats(self.layout, num))
 
     @property
     def num_padding_bytes(self) -> int:
-        """Bytes that exist in the buffers only (host)."""
+        """Bytes of padding in the buffers (host)."""
         allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.params))
         return int(allocated) + BYTES_PER_FLOAT * self.gaussians.floats_per_row * self.num - self.num_bytes
 
     @property
     def textures(self) -> tuple[Textures, AtlasLayout] | None:
-        """Textures and their layout; None where splats show none."""
+        """Textures and their layout; None without textures."""
         return self.appearance.textures(self.params, self.layout)
 
     def with_textures(self, textures: Textures, layout: AtlasLayout) -> "Model":
-        """The same model with other textures."""
+        """Return the same model with other textures."""
         params, layout = self.appearance.with_textures(self.params, self.layout, textures, layout)
         return dataclasses.replace(self, params=params, layout=layout)
 
     @property
+    def bands(self) -> tuple[Bands, BandLayout] | None:
+        """Spherical harmonics beyond those of the Gaussians, and their owners; None without degrees per Gaussian."""
+        return self.appearance.bands(self.params, self.layout)
+
+    def with_bands(self, bands: Bands, owners: BandLayout) -> "Model":
+        """Return the same model with other spherical harmonics beyond those of the Gaussians."""
+        params, layout = self.appearance.with_bands(self.params, self.layout, bands, owners)
+        return dataclasses.replace(self, params=params, layout=layout)
+
+    @property
+    def sh(self) -> np.ndarray:
+        """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian (host)."""
+        own = np.asarray(self.gaussians.sh)
+        return own if self.bands is None else dense_sh(own, *self.bands)
+
+    def with_sh(self, sh: np.ndarray) -> "Model":
+        """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host)."""
+        own = jnp.asarray(sh[:, : self.gaussians.sh.shape[1]], self.gaussians.sh.dtype)
+        model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=own))
+        if self.bands is None:
+            return model
+        _, owners = self.bands
+        bands, _ = split_sh(sh, owners.degrees, owners.base_degree)
+        return model.with_bands(bands, owners)
+
+    @property
     def background(self) -> tuple[float, float, float]:
-        """RGB behind everything: the origin's, or black."""
+        """RGB behind all splats: that of the origin, or black."""
         return BLACK if self.origin is None else self.origin.background
 
     def render(
@@ -106,12 +133,12 @@ class Model:
         background: Any = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     ) -> RenderOutput:
-        """What a camera sees; as `render_appearance`, of the rows that exist.
+        """Render the view of a camera, as `render_appearance` does, from the rows that exist.
 
         Args:
           camera: the view.
           background: [3] colour; None is the model's own.
-          settings: static choices; how textures are read is the appearance's, not theirs.
+          settings: static options; `texture` is not used, for the appearance has options of its own.
         """
         background = self.background if background is None else background
         return render_appearance(
@@ -119,17 +146,15 @@ class Model:
         )
 
     def transform(self, similarity: Similarity) -> "Model":
-        """The same model in the world that `similarity` leads to, its cameras carried along (host).
+        """Return the same model in the world that `similarity` leads to, with its cameras (host).
 
-        View dependence turns with the world; what the splats show besides is theirs and stays as it is.
+        View dependence turns with the world; all other parameters of the appearance stay.
         """
-        sh = self.appearance.sh(self.gaussians, self.params, self.layout)
-        turned = transform_gaussians(dataclasses.replace(self.gaussians, sh=jnp.asarray(sh)), similarity)
-        own = turned.sh[:, : self.gaussians.sh.shape[1]]
+        turned = transform_gaussians(dataclasses.replace(self.gaussians, sh=jnp.asarray(self.sh)), similarity)
+        model = self.with_sh(np.asarray(turned.sh))
         return dataclasses.replace(
-            self,
-            gaussians=dataclasses.replace(turned, sh=own),
-            params=self.appearance.with_sh(np.asarray(turned.sh), self.params, self.layout),
+            model,
+            gaussians=dataclasses.replace(turned, sh=model.gaussians.sh),
             origin=None if self.origin is None else self.origin.moved(similarity),
         )
 

@@ -1,7 +1,7 @@
 """Images of textured 2D Gaussians: project, list the tiles, composite, with capacities planned on the host.
 
-N splats, H×W pixels. `render_image` called eagerly plans for itself; under jit or vmap it takes the capacity from its
-settings, which `plan_render` fills in.
+N splats, H×W pixels. An eager call of `render_image` plans its own capacity. Under jit or vmap, the capacity comes from
+the settings, which `plan_render` fills in.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, textured_rule
+from a2tg_jax.appearance import Appearance, AppearanceRule, PlainRule, TextureOptions, appearance_for
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
@@ -34,23 +34,25 @@ BATCH_ON_ACCELERATOR = 4096
 
 @dataclasses.dataclass(frozen=True)
 class RenderSettings:
-    """Static choices of a rendering; hashable, so that it can be closed over or passed to jit as static."""
+    """Static options of a rendering; hashable, so that jit can close over them or take them as static."""
 
     tile_size: int = 8
-    """Side of a tile in pixels; the image does not depend on it."""
+    """Side of a tile in pixels; it does not change the image."""
     near_plane: float = 0.2
-    """Splats and hits nearer than this do not show; positive."""
+    """Least depth of visible splats and hits; positive."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read."""
+    """How textures are read when Gaussians and textures are given apart (`render_image`, `plan_render`, `evaluate`).
+
+    A `Model` and a rule have options of their own, which win: this field is then not used."""
     capacity: int | None = None
-    """Room for (splat, tile) pairs; None: found by an eager call, an error under jit."""
+    """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
     compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
-    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA; "auto": the first that can be had, and
-    XLA, with a warning, where an appearance rule uses what native loops cannot do."""
+    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
+    and XLA with a warning if native loops do not support the appearance rule."""
     tile_batch: int | None = None
-    """Tiles composited at once by XLA: 1 in sequence, 0 all; None: 1 on CPUs, 4096 elsewhere."""
+    """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
 
     def __post_init__(self) -> None:
         if not self.near_plane > 0:
@@ -58,12 +60,12 @@ class RenderSettings:
 
     @staticmethod
     def official() -> "RenderSettings":
-        """The authors' own texture conventions."""
+        """Return settings with the texture conventions of the authors' program."""
         return RenderSettings(texture=TextureOptions.official())
 
 
 class RenderOutput(NamedTuple):
-    """What a view shows. Depth and normal are weighted sums, not divided by alpha, without the background."""
+    """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background."""
 
     color: Array
     """[H, W, 3], background included, not clipped."""
@@ -74,7 +76,7 @@ class RenderOutput(NamedTuple):
     normal: Array
     """[H, W, 3] Σ n·α·T, in the world, facing the camera."""
     overflow: Array
-    """Boolean: the capacity did not suffice; the image is then the background and must not be used."""
+    """Whether the capacity was too small; the image is then only the background and must not be used."""
     distortion: Array
     """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
 
@@ -88,25 +90,25 @@ def render_image(
     background: Any = (0, 0, 0),
     settings: RenderSettings = RenderSettings(),
 ) -> RenderOutput:
-    """Renders a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
+    """Render a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
 
     Args:
       gaussians: N Gaussians.
       camera: the view.
-      textures, layout: their textures; neither, and the splats are plain 2DGS.
+      textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
       background: [3] colour behind everything.
-      settings: static choices. An eager call, also under `jax.grad`, needs no capacity and never overflows.
+      settings: static options. An eager call, also under `jax.grad`, needs no capacity and never overflows.
 
     Returns:
-      What the view shows. Where a splat would show, but a number of it is not finite (mean, rotation, scales, opacity
-      or colour), all of the picture is NaN, and so are the gradients; a texel that is NaN is seen where it shows.
+      The images of the view. If a visible splat has a mean, rotation, scale, opacity or colour that is not finite, the
+      whole image and all gradients are NaN. A NaN texel is NaN in the image where it is visible.
 
     Raises:
       ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, if the layout
-        is of another number of Gaussians, or if an argument has another shape than it must have.
+        has another number of Gaussians, or if an argument has a wrong shape.
     """
     check_gaussians(gaussians)
-    rule = appearance_of(gaussians, textures, layout, settings)
+    rule = rule_of(gaussians, textures, layout, settings)
     return render_appearance(gaussians, camera, rule, background=background, settings=settings)
 
 
@@ -119,7 +121,7 @@ def render_appearance(
     settings: RenderSettings = RenderSettings(),
     num_live: Array | int | None = None,
 ) -> RenderOutput:
-    """As `render_image`, of splats that show what `rule` says; only the first `num_live` rows, where that is given."""
+    """Render a view as `render_image` does, with an appearance rule; of the first `num_live` rows, if given."""
     check_gaussians(gaussians)
     check_camera(camera)
     check_background(background)
@@ -132,7 +134,7 @@ def render_appearance(
 
 
 def check_background(background: Any) -> None:
-    """Raises ValueError unless it is one colour."""
+    """Raise ValueError unless the background is one colour."""
     if np.ndim(background) == 3:
         raise ValueError(
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
@@ -159,16 +161,17 @@ def render_traced(
     probe: Array | None = None,
     statistic: Statistic | None = "position",
 ) -> tuple[RenderOutput, Array]:
-    """What training differentiates: the output, and how many pairs the view has, for `capacity_for`.
+    """Return the output, which training differentiates, and the number of pairs of the view for `capacity_for`.
 
     Args:
-      background: [3].
-      settings: with a capacity.
-      has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
-      sh_degree: overrides the settings' by a value that may be traced.
-      num_live: only the first so many rows show; may be traced.
-      probe: [N, 4] zeros, at which the gradient is the statistic, and the number of pixels (`compositor.composite`).
-      statistic: which (`rasterize.pixel.positional_gradient`); not used without a probe.
+      gaussians, camera, rule: as for `render_appearance`.
+      background: [3] colour.
+      settings: static options, with a capacity.
+      has_geometry: if False, depth, normal and distortion are zeros and cost nothing.
+      sh_degree: replaces that of the settings; may be traced.
+      num_live: number of rows that exist; may be traced.
+      probe: [N, 4] zeros, at which the gradient is the statistic and the number of pixels (`compositor.composite`).
+      statistic: kind of statistic (`rasterize.pixel.positional_gradient`); not used without a probe.
     """
     compositor = choose(settings.compositor, settings.tile_size)
     compositing = _compositing_settings(
@@ -210,7 +213,7 @@ def _compositing_settings(
 
 
 def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOutput:
-    """What a view without Gaussians shows."""
+    """Return the output of a view without Gaussians."""
     grid = compositing.grid
     channels = jnp.zeros((compositing.num_channels, grid.height, grid.width), background.dtype)
     transmittance = jnp.ones((grid.height, grid.width), background.dtype)
@@ -238,19 +241,19 @@ def plan_render(
     head_room: float = HEAD_ROOM,
     settings: RenderSettings = RenderSettings(),
 ) -> RenderSettings:
-    """The settings with a capacity that suffices for every one of the cameras, with head room (host).
+    """Return the settings with a capacity that suffices for every camera, with head room (host).
 
     Args:
       gaussians: N Gaussians.
       cameras: one or more.
-      textures, layout: their textures; neither, and the splats are plain 2DGS.
-      rule: what the splats show, instead of textures.
+      textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
+      rule: appearance rule, instead of textures.
       head_room: factor, at least 1, on the pairs of the fullest view.
-      settings: all but the capacity.
+      settings: static options; their capacity is replaced.
 
     Raises:
-      ValueError: if there is no camera, if both textures and a rule are given, or if called under a transformation,
-        where shapes cannot be chosen.
+      ValueError: if there is no camera, if both textures and a rule are given, or under jit and vmap, where shapes
+        are fixed.
     """
     cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
     if not cameras:
@@ -259,7 +262,7 @@ def plan_render(
         raise ValueError(f"head_room must be at least 1; got {head_room}")
     check_gaussians(gaussians)
     if rule is None:
-        rule = appearance_of(gaussians, textures, layout, settings)
+        rule = rule_of(gaussians, textures, layout, settings)
     elif textures is not None or layout is not None:
         raise ValueError("rule already says what the splats show: give it, or textures and layout")
     for camera in cameras:
@@ -269,28 +272,37 @@ def plan_render(
 
 
 def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
-    """A capacity with head room for so many pairs, rounded up so that few distinct shapes occur."""
+    """Return a capacity with head room for a number of pairs, rounded up so that few shapes occur."""
     return max(1024, -(-int(pairs * head_room) // 1024) * 1024)
 
 
 def appearance_of(
     gaussians: Gaussians, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
-) -> AppearanceRule:
-    """The rule for textures, or plain 2DGS where there are none, or no Gaussians."""
+) -> Appearance:
+    """Return the appearance of Gaussians and textures given apart, which `settings.texture` decides.
+
+    Raises:
+      ValueError: if only one of textures and layout is given, or they do not fit the Gaussians.
+    """
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
-    if textures is None or layout is None:
-        return PlainRule(max_alpha=settings.texture.max_alpha)
-    check_textures(textures, layout, gaussians.num)
-    if gaussians.num == 0:
-        return PlainRule(max_alpha=settings.texture.max_alpha)
-    return textured_rule(textures, layout, settings.texture)
+    if textures is not None and layout is not None:
+        check_textures(textures, layout, gaussians.num)
+    return appearance_for(settings.texture, has_textures=textures is not None)
+
+
+def rule_of(
+    gaussians: Gaussians, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
+) -> AppearanceRule:
+    """Return the rule of `appearance_of`; without Gaussians, that of plain 2DGS. Raises as it does."""
+    appearance = appearance_of(gaussians, textures, layout, settings)
+    return appearance.rule(textures, layout) if gaussians.num else PlainRule(max_alpha=settings.texture.max_alpha)
 
 
 def pairs_of_view(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
 ) -> int:
-    """(splat, tile) pairs of one view, of the first `num_live` rows, before the outline test (host)."""
+    """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
     try:
         return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
@@ -314,7 +326,7 @@ def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
 def with_capacity(
     settings: RenderSettings, gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any = None
 ) -> RenderSettings:
-    """The settings; where they lack a capacity with one for this view, which an eager call can find.
+    """Return the settings; if they lack a capacity, with one for this view, which an eager call can find.
 
     Raises:
       ValueError: under jit or vmap without a capacity.
@@ -332,7 +344,7 @@ def with_capacity(
 
 
 def _primal_value(x):
-    """The concrete array behind the tracers of `jax.grad`; the tracer itself where jit or vmap hide the value."""
+    """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
     while isinstance(x, jax.core.Tracer):
         try:
             return np.asarray(jax.lax.stop_gradient(x))

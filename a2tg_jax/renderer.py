@@ -1,4 +1,4 @@
-"""A renderer for cameras that move: room for the tile lists is allocated on the host and kept while it suffices."""
+"""A renderer for moving cameras: the host allocates room for the tile lists and keeps it while it suffices."""
 
 import dataclasses
 import functools
@@ -7,29 +7,37 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from a2tg_jax.appearance import AppearanceRule, Plain
+from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import jit
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderOutput, RenderSettings, capacity_for, check_background, pairs_of_view, render_traced
+from a2tg_jax.render import (
+    RenderOutput,
+    RenderSettings,
+    appearance_of,
+    capacity_for,
+    check_background,
+    pairs_of_view,
+    render_traced,
+)
 
 FIRST_ROOM = 1.5
-"""Head room over the views that room is first made for."""
+"""Head room over the first views."""
 GROWTH = 3
-"""The least factor by which room grows."""
+"""Least factor by which a capacity grows."""
 PLANNED_CAMERAS = 16
-"""Of a model's own cameras, so many are looked at before room is made."""
+"""Number of a model's own cameras for which the first capacity is planned."""
 
 Size = tuple[int, int]
 
 
 class Renderer:
-    """Draws one model from any camera.
+    """Renderer of one model from any camera.
 
-    Each image size is compiled for a capacity, which suffices for the first view and the model's own cameras. A view
-    that needs more is drawn again with at least three times the room, so that a long flight compiles a few times only,
-    and no camera is refused. Models of equal shapes share what is compiled.
+    Each image size is compiled for a capacity that suffices for the first view and the model's own cameras. A view that
+    needs more is drawn again with at least three times the capacity. A long flight therefore compiles only a few times,
+    and no camera is refused. Models of equal shapes share compiled programs.
 
         renderer = Renderer(model)
         for camera in smooth_path(cameras, 200):
@@ -47,23 +55,24 @@ class Renderer:
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
         has_geometry: bool = True,
     ):
-        """Prepares to draw.
+        """Prepare to draw.
 
         Args:
-          model: a model; or Gaussians, of which all rows show.
-          rule: what the Gaussians show; None is plain 2DGS. A model says it itself.
-          cameras: room is made for these at once; others may come.
-          capacities: room to begin with, such as that of a renderer of a model like this one.
+          model: a model, or Gaussians of which all rows exist.
+          rule: appearance rule of Gaussians; None is plain 2DGS. A model has its own.
+          cameras: cameras for which the first capacities are planned; others may follow.
+          capacities: initial capacities, such as those of the renderer of a similar model.
           background: [3] colour; None is the model's own, or black.
-          settings: all but the capacity, which is found.
-          has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
+          settings: static options; the renderer finds the capacity.
+          has_geometry: if False, depth, normal and distortion are zeros and cost nothing.
 
         Raises:
-          ValueError: if a rule is given beside a model, or an argument has another shape than it must have.
+          ValueError: if a rule is given beside a model, or an argument has a wrong shape.
         """
         if isinstance(model, Model) and rule is not None:
             raise ValueError("rule: a model says itself what its splats show; give Gaussians with a rule")
-        model = model if isinstance(model, Model) else Model(model, appearance=Plain(settings.texture.max_alpha))
+        if not isinstance(model, Model):
+            model = Model(model, appearance=appearance_of(model, None, None, settings))
         background = model.background if background is None else background
         check_background(background)
         check_gaussians(model.gaussians)
@@ -74,16 +83,16 @@ class Renderer:
         own = [] if model.origin is None else model.origin.cameras
         self._known = own[:: -(-len(own) // PLANNED_CAMERAS) or 1]
         self.capacities: dict[Size, int] = dict(capacities or {})
-        """Room for (splat, tile) pairs by image size, (width, height)."""
+        """Capacities for (splat, tile) pairs by image size, (width, height)."""
         self._plan(list(cameras))
 
     def __call__(self, camera: Camera) -> RenderOutput:
-        """What a camera sees (host); never an overflow."""
+        """Render the view of a camera (host); never an overflow."""
         check_camera(camera)
         size = camera.width, camera.height
         if size not in self.capacities:
             cameras = [camera, *(resize_camera(known, *size) for known in self._known)]
-            # A first view may see next to nothing; where all are seen, each Gaussian is in a tile at least.
+            # A first view may see next to nothing; if all Gaussians are visible, each is in at least one tile.
             pairs = max(self._gaussians.num, *map(self._num_pairs, cameras))
             self.capacities[size] = capacity_for(pairs, FIRST_ROOM)
         output, pairs = self._draw(camera)
@@ -93,7 +102,7 @@ class Renderer:
         return output
 
     def _plan(self, cameras: list[Camera]) -> None:
-        """Room for all these cameras."""
+        """Plan capacities for all these cameras."""
         for camera in cameras:
             check_camera(camera)
             size = camera.width, camera.height
@@ -110,7 +119,7 @@ class Renderer:
 
 @functools.cache
 def _jitted_draw() -> jit:
-    """Draws on the device; its cache counts the compilations."""
+    """Return the jitted drawing function; its cache counts the compilations."""
 
     def draw(gaussians, num_live, camera, rule, background, settings, has_geometry):
         return render_traced(

@@ -1,10 +1,10 @@
-"""Textures of mixed resolutions as they are stored and trained: padded buckets, and the layout beside them.
+"""Textures of mixed resolutions as they are stored and trained: padded buckets, and a layout beside them.
 
-What a texture makes visible, and where (u, v) lies in it, is in `appearance.textured`; interpolation in `bilinear`.
+`appearance.textured` defines how a texture is shown and where (u, v) lies in it; `core.bilinear` interpolates.
 
 N Gaussians; texture i is [Tv, Tu, 4] = signed RGB residual and alpha factor; u indexes columns (Tu), v rows (Tv).
 Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past the used ones are padding.
-`Textures` holds parameters only and is differentiable; `AtlasLayout` says which row of which bucket is whose.
+`Textures` holds parameters only and is differentiable; `AtlasLayout` holds the bucket and row of each Gaussian.
 """
 
 import dataclasses
@@ -39,12 +39,12 @@ class Textures:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class AtlasLayout:
-    """Where the texture of each Gaussian lies. Integers only: not differentiable, kept apart from `Textures`."""
+    """Place of each Gaussian's texture. Integers only: not differentiable, kept apart from `Textures`."""
 
     bucket: Array
-    """[N] int32, the bucket of Gaussian i."""
+    """[N] int32 bucket of each Gaussian."""
     row: Array
-    """[N] int32, its row in that bucket."""
+    """[N] int32 row in that bucket."""
     resolutions: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     """(Tv, Tu) of each bucket, ascending."""
 
@@ -55,16 +55,19 @@ class AtlasLayout:
 
     @property
     def sizes(self) -> np.ndarray:
-        """[N, 2] integers (Tv, Tu) on the host."""
+        """[N, 2] integers (Tv, Tu) (host)."""
         return np.asarray(self.resolutions, np.int64).reshape(-1, 2)[np.asarray(self.bucket)]
 
     @property
     def num_texels(self) -> int:
-        """Texels in use, padding not counted (host)."""
+        """Number of texels in use, without padding (host)."""
         return self.count_texels(self.num)
 
     def count_texels(self, num: int) -> int:
-        """Texels of the first `num` Gaussians (host). The log asks for it every few steps, so it makes no [N, 2]."""
+        """Return the number of texels of the first `num` Gaussians (host).
+
+        The log calls it every few steps, so that it makes no [N, 2].
+        """
         areas = np.asarray([height * width for height, width in self.resolutions], np.int64)
         return int(areas[np.asarray(self.bucket)[:num]].sum())
 
@@ -73,7 +76,7 @@ class AtlasLayout:
 
 
 def check_textures(textures: Textures, layout: AtlasLayout, num: int, name: str = "textures") -> None:
-    """Raises ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians."""
+    """Raise ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians."""
     if not isinstance(textures, Textures) or not isinstance(layout, AtlasLayout):
         kinds = f"{type(textures).__name__} and {type(layout).__name__}"
         raise ValueError(f"{name} and layout must be Textures and their AtlasLayout; got {kinds}")
@@ -87,8 +90,21 @@ def check_textures(textures: Textures, layout: AtlasLayout, num: int, name: str 
         check_floats(f"{name}.buckets[{index}]", bucket, ("capacity", *size, 4))
 
 
+def check_places(textures: Textures, layout: AtlasLayout) -> None:
+    """Raise ValueError unless each texture has a row of its own within its bucket (host)."""
+    bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
+    if bucket.size and not 0 <= bucket.min() <= bucket.max() < len(textures.buckets):
+        raise ValueError(f"layout.bucket must lie below {len(textures.buckets)}; got {bucket.min()}..{bucket.max()}")
+    capacities = np.asarray([len(texels) for texels in textures.buckets], np.int64)
+    if bucket.size and ((row < 0) | (row >= capacities[bucket])).any():
+        raise ValueError("layout.row must lie within the buckets; some do not")
+    starts = np.cumsum(capacities) - capacities
+    if bucket.size and np.bincount(starts[bucket] + row).max() > 1:
+        raise ValueError("layout must give each texture its own row; some share one")
+
+
 def bucket_capacity(count: int) -> int:
-    """Rows allotted to `count` textures: rounded up to 1/16 of its power of two, so few shapes occur."""
+    """Return the rows allotted to `count` textures, rounded up to 1/16 of its power of two so that few shapes occur."""
     if count == 0:
         return 0
     granule = max(1, 2 ** (count.bit_length() - 4))
@@ -96,27 +112,27 @@ def bucket_capacity(count: int) -> int:
 
 
 class Shape(NamedTuple):
-    """What the buckets of textures are, whoever they belong to: programs are compiled for a shape."""
+    """Resolutions and capacities of all buckets; programs are compiled for a shape."""
 
     resolutions: tuple[tuple[int, int], ...]
     """(Tv, Tu) of each bucket, ascending."""
     capacities: tuple[int, ...]
-    """Rows of each bucket."""
+    """Number of rows of each bucket."""
 
     @property
     def num_texels(self) -> int:
-        """Texels in all, padding included."""
+        """Number of texels, padding included."""
         areas = (height * width for height, width in self.resolutions)
         return sum(capacity * area for capacity, area in zip(self.capacities, areas, strict=True))
 
 
 def plan_layout(sizes, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[int, ...]]:
-    """The layout for textures of the given sizes, and the capacity of each bucket (host).
+    """Return the layout for textures of the given sizes, and the capacity of each bucket (host).
 
     Args:
-      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0: an empty texture, of no bytes.
-      known: shapes to choose from where the textures fit and it costs at most `KNOWN_SLACK` times the texels: what is
-        compiled for a shape need not be compiled again.
+      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0 for an empty texture, which takes no bytes.
+      known: shapes with compiled programs. One is taken if the textures fit and it has at most `KNOWN_SLACK` times
+        the texels.
 
     Raises:
       ValueError: if a size is out of range.
@@ -145,7 +161,7 @@ def plan_layout(sizes, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[
 
 
 def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape]) -> Shape:
-    """The smallest known shape with room for so many textures of each resolution, or a new one."""
+    """Return the smallest known shape with room for the needed textures of each resolution, or a new one."""
     new = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
 
     def has_room(shape: Shape) -> bool:
@@ -157,12 +173,12 @@ def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape]) ->
 
 
 def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Textures, AtlasLayout]:
-    """Textures of the given sizes whose texels are all (rgb, rgb, rgb, 1): with rgb = 0 they show nothing.
+    """Return textures of the given sizes with texels (rgb, rgb, rgb, 1); with rgb = 0 they change nothing.
 
     Args:
-      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0: an empty texture, of no bytes.
+      sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0 for an empty texture, which takes no bytes.
       rgb: initial RGB residual.
-      dtype: of the texels.
+      dtype: dtype of the texels.
     """
     layout, capacities = plan_layout(sizes)
     texel = jnp.asarray([rgb, rgb, rgb, 1.0], dtype)
@@ -172,7 +188,7 @@ def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Te
 
 
 def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
-    """Buckets made from N arrays [Tv, Tu, 4] of one float dtype; the inverse of `texture_arrays`.
+    """Make buckets from N arrays [Tv, Tu, 4] of one float dtype; the inverse of `texture_arrays`.
 
     Raises:
       ValueError: if an array is not floats [Tv, Tu, 4] with sides of 1 to 16, naming it.
@@ -195,14 +211,14 @@ def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
 
 
 def packed_textures(textures: Textures, layout: AtlasLayout) -> tuple[Textures, AtlasLayout]:
-    """The same textures, or moments of them, in buckets of no more room than `plan_layout` gives them (host)."""
+    """Return the same textures, or moments of them, in buckets as large as `plan_layout` makes them (host)."""
     new, capacities = plan_layout(layout.sizes)
     kept = [textures.buckets[layout.resolutions.index(resolution)] for resolution in new.resolutions]
     return Textures(tuple(bucket[:capacity] for bucket, capacity in zip(kept, capacities, strict=True))), new
 
 
 def first_textures(textures: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
-    """The textures of the first `num` Gaussians, in buckets of their own (host)."""
+    """Return the textures of the first `num` Gaussians, in buckets of their own (host)."""
     new, capacities = plan_layout(layout.sizes[:num])
     old_rows = np.asarray(layout.row)[:num]
     buckets = []
@@ -216,7 +232,7 @@ def first_textures(textures: Textures, layout: AtlasLayout, num: int) -> tuple[T
 
 
 def texture_arrays(textures: Textures, layout: AtlasLayout) -> list[np.ndarray]:
-    """The N textures as numpy arrays [Tv, Tu, 4], in the order of the Gaussians (host)."""
+    """Return the N textures as numpy arrays [Tv, Tu, 4], in the order of the Gaussians (host)."""
     check_textures(textures, layout, layout.num)
     buckets = [np.asarray(bucket) for bucket in textures.buckets]
     places = zip(np.asarray(layout.bucket), np.asarray(layout.row), strict=True)

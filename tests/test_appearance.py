@@ -8,7 +8,7 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from test_oracle import FACING, FOCAL, hand_scene
 
 from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appearance, save_model
-from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Plain, Textured
+from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Textured, appearance_for
 from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.gaussians import logit
@@ -203,3 +203,39 @@ def test_official_texels_are_left_as_trained():
 def test_wrong_options_are_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+# Capabilities
+
+
+class Own(Textured):
+    """A texture shown by a rule of one's own, as far as anyone knows."""
+
+
+CAPABILITIES = {
+    Appearance(): (False, False, None, True),
+    Plain(0.9): (True, True, None, True),
+    Textured((2, 3)): (True, True, TextureOptions(), True),
+    Textured(options=TextureOptions.official()): (True, False, TextureOptions.official(), True),
+    Own(): (False, True, TextureOptions(), True),
+    MovableKernels(): (False, False, None, False),
+    Billboards(): (False, False, None, False),
+}
+"""is_portable, is_linear, texture_options, has_own_opacities."""
+
+
+@pytest.mark.parametrize("appearance", CAPABILITIES, ids=lambda appearance: type(appearance).__name__)
+def test_a_wrapper_can_do_what_it_wraps_can(appearance):
+    for shown in (appearance, Banded(appearance)):
+        found = shown.is_portable, shown.is_linear, shown.texture_options, shown.has_own_opacities
+        assert found == CAPABILITIES[appearance]
+        assert shown.base is appearance and shown.max_alpha == appearance.max_alpha
+    assert not appearance.has_degrees and Banded(appearance).has_degrees
+    assert not Banded(Banded(appearance)).is_portable and Banded(Banded(appearance)).base is appearance
+
+
+def test_portable_appearances_come_from_their_options():
+    options = TextureOptions.official()
+    assert appearance_for(options, has_textures=False) == Plain(options.max_alpha)
+    assert appearance_for(options, has_textures=True) == Textured(options=options)
+    assert appearance_for(options, has_textures=True, has_degrees=True) == Banded(Textured(options=options))

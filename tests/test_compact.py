@@ -86,7 +86,7 @@ def order_of(model: Model, found: Model) -> np.ndarray:
 def tables(model: Model, order=None) -> dict[str, np.ndarray]:
     """All numbers by group, in an order of rows. Textures as what they have in common with all their mirrored ones."""
     order = np.arange(model.num) if order is None else order
-    sh = model.appearance.sh(model.gaussians, model.params, model.layout)[order]
+    sh = model.sh[order]
     found = {
         "means": np.asarray(model.gaussians.means)[order],
         "log_scales": np.asarray(model.gaussians.log_scales)[order],

@@ -20,11 +20,11 @@ from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.model_file import FORMAT as MODEL
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply, save_ply
-from a2tg_jax.io.validate import check_model, check_places
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.texture import AtlasLayout, Textures, check_places
 from a2tg_jax.training import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import system_from_dict
 

@@ -19,7 +19,7 @@ from a2tg_jax.core.geometry import homographies
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.native import threads
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
-from a2tg_jax.render import appearance_of, render_traced
+from a2tg_jax.render import render_traced, rule_of
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
 
 
@@ -154,7 +154,7 @@ def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
 
     def loss(gaussians, textures, probe, compositor):
         settings = RenderSettings(compositor=compositor, capacity=1024)
-        rule = appearance_of(gaussians, textures, layout, settings)
+        rule = rule_of(gaussians, textures, layout, settings)
         output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, probe=probe, statistic=statistic)
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 

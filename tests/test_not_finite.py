@@ -9,7 +9,7 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_image
-from a2tg_jax.render import appearance_of, render_traced
+from a2tg_jax.render import render_traced, rule_of
 
 COMPOSITORS = ("native", "xla", "pallas")
 SCENE = draw_scene(4, num=16, width=19, height=13)
@@ -51,7 +51,7 @@ def test_what_shows_nowhere_may_hold_anything(row, compositor):
     found = render_image(with_number(hidden, "sh", row, np.nan), camera, settings=settings).color
     np.testing.assert_array_equal(found, expected)
 
-    live, rule = 8, appearance_of(gaussians, None, None, settings)
+    live, rule = 8, rule_of(gaussians, None, None, settings)
     show = lambda gaussians: render_traced(gaussians, camera, rule, jnp.zeros(3), settings, num_live=live)[0].color  # noqa: E731
     np.testing.assert_array_equal(show(with_number(gaussians, "means", live + row, np.nan)), show(gaussians))
 

@@ -10,14 +10,14 @@ import pytest
 from oracle import DEFAULT_RULES, OFFICIAL, Scene
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_settings, as_textures, draw_scene
 
-from a2tg_jax.render import RenderSettings, appearance_of, render_traced
+from a2tg_jax.render import RenderSettings, render_traced, rule_of
 
 
 def statistic(scene: Scene, cotangent: np.ndarray, settings: RenderSettings, which: str) -> np.ndarray:
     """[N, 4] gradient at the probe: the statistic, and the number of pixels composited."""
     gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
     settings = dataclasses.replace(settings, capacity=CAPACITY)
-    rule = appearance_of(gaussians, *as_textures(scene, "float64"), settings)
+    rule = rule_of(gaussians, *as_textures(scene, "float64"), settings)
 
     def loss(probe):
         background = jnp.asarray(scene.background)

@@ -59,7 +59,7 @@ def small_numbers(data: bytes) -> dict[str, list]:
     """What a reader must find in the file, rounded, by row."""
     model = decode_web_scene(data).model
     arrays = model.appearance.arrays(model.params, model.layout)
-    sh = model.appearance.sh(model.gaussians, model.params, model.layout)
+    sh = model.sh
     found = {
         "means": model.gaussians.means,
         "log_scales": model.gaussians.log_scales,

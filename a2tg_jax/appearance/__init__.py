@@ -1,9 +1,11 @@
-"""What a splat shows: `AppearanceRule` is what the renderer is given, `Appearance` the value that makes one.
+"""What a splat shows: the renderer draws by an `AppearanceRule`, which an `Appearance` makes of its parameters.
 
-`rule` and `base` are these two interfaces; `plain`, `textured`, `movable_kernels` and `billboards` implement both,
-`banded` adds view dependence to any of them.
+`rule` and `base` are these two interfaces. `base` is made of two small ones: `rows`, which densification calls, and
+`stored`, which files call. `plain`, `textured`, `movable_kernels` and `billboards` implement all of them. `banded` adds
+view dependence to any appearance, and `around` forwards the rest to it.
 """
 
+from a2tg_jax.appearance.around import AppearanceAround as AppearanceAround
 from a2tg_jax.appearance.banded import Banded as Banded
 from a2tg_jax.appearance.banded import BandedRates as BandedRates
 from a2tg_jax.appearance.base import Appearance as Appearance
@@ -12,7 +14,9 @@ from a2tg_jax.appearance.billboards import Billboards as Billboards
 from a2tg_jax.appearance.movable_kernels import MovableKernelParams as MovableKernelParams
 from a2tg_jax.appearance.movable_kernels import MovableKernels as MovableKernels
 from a2tg_jax.appearance.movable_kernels import MovableKernelsRule as MovableKernelsRule
+from a2tg_jax.appearance.options import TextureOptions as TextureOptions
 from a2tg_jax.appearance.plain import Plain as Plain
+from a2tg_jax.appearance.portable import appearance_for as appearance_for
 from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
 from a2tg_jax.appearance.rule import GivenColors as GivenColors
 from a2tg_jax.appearance.rule import PlainRule as PlainRule
@@ -22,5 +26,4 @@ from a2tg_jax.appearance.rule import gaussian_cutoff as gaussian_cutoff
 from a2tg_jax.appearance.textured import TexelRates as TexelRates
 from a2tg_jax.appearance.textured import Textured as Textured
 from a2tg_jax.appearance.textured import TexturedRule as TexturedRule
-from a2tg_jax.appearance.textured import TextureOptions as TextureOptions
 from a2tg_jax.appearance.textured import textured_rule as textured_rule

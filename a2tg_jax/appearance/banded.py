@@ -1,4 +1,4 @@
-"""Spherical harmonics of a degree per Gaussian, beside whatever else a splat shows."""
+"""Spherical harmonics of a degree per Gaussian, on top of any other appearance."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance.around import AppearanceAround
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.plain import Plain
 from a2tg_jax.appearance.rule import RuleAround
@@ -17,25 +18,22 @@ from a2tg_jax.appearance.sh_bands import (
     allocate_bands,
     band_colors,
     clear_bands,
-    dense_sh,
     first_bands,
     gather_bands,
-    split_sh,
 )
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.texture import AtlasLayout, Textures
 
 
 class BandedParams(NamedTuple):
-    """Coefficients beyond those that all Gaussians have, and the parameters of what else is shown."""
+    """Coefficients beyond those that all Gaussians have, and the parameters of the inner appearance."""
 
     bands: Bands
     inner: Any
 
 
 class BandedLayout(NamedTuple):
-    """Whose the coefficients are, and the layout of what else is shown."""
+    """Owners of the coefficients, and the layout of the inner appearance."""
 
     bands: BandLayout
     inner: Any
@@ -47,7 +45,7 @@ class BandedLayout(NamedTuple):
 
 
 class BandedRates(NamedTuple):
-    """Learning rates of the coefficients, and what a stage says of those of what else is shown."""
+    """Learning rates of the coefficients and of the inner appearance."""
 
     bands: Any
     inner: Any = 0.0
@@ -56,7 +54,7 @@ class BandedRates(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class BandedRule(RuleAround):
-    """Another rule, with colours of more spherical harmonics for some Gaussians."""
+    """Another rule, with more spherical harmonics for some Gaussians."""
 
     bands: Bands
     layout: BandLayout
@@ -67,10 +65,18 @@ class BandedRule(RuleAround):
 
 
 @dataclasses.dataclass(frozen=True)
-class Banded(Appearance):
-    """What another appearance shows, and view dependence of a degree per Gaussian."""
+class Banded(AppearanceAround):
+    """Another appearance, and view dependence of a degree per Gaussian."""
 
     inner: Appearance = dataclasses.field(default_factory=Plain)
+
+    @property
+    def is_portable(self) -> bool:
+        return type(self) is Banded and self.inner.is_portable and not self.inner.has_degrees
+
+    @property
+    def has_degrees(self) -> bool:
+        return True
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[BandedParams, BandedLayout]:
         degrees = np.full(gaussians.num, gaussians.sh_degree)
@@ -81,66 +87,53 @@ class Banded(Appearance):
     def rule(self, params: BandedParams, layout: BandedLayout) -> BandedRule:
         return BandedRule(self.inner.rule(params.inner, layout.inner), params.bands, layout.bands)
 
-    def project(self, params: BandedParams) -> BandedParams:
-        return params._replace(inner=self.inner.project(params.inner))
-
     def rates(self, rate: Any, params: BandedParams) -> BandedParams:
-        """`BandedRates`."""
+        """Return the rates of `BandedRates`."""
         return BandedParams(rate.bands, self.inner.rates(rate.inner, params.inner))
 
     def num_floats(self, layout: BandedLayout, num: int) -> int:
         return layout.bands.count_floats(num) + self.inner.num_floats(layout.inner, num)
 
     def gather(self, params: BandedParams, layout: BandedLayout, rows: Array) -> BandedParams:
-        inner = self.inner.gather(params.inner, layout.inner, rows)
-        return BandedParams(gather_bands(params.bands, layout.bands, rows), inner)
+        bands = gather_bands(params.bands, layout.bands, rows)
+        return super().gather(params, layout, rows)._replace(bands=bands)
 
     def clear(self, params: BandedParams, layout: BandedLayout, is_cleared: Array) -> BandedParams:
-        inner = self.inner.clear(params.inner, layout.inner, is_cleared)
-        return BandedParams(clear_bands(params.bands, layout.bands, is_cleared), inner)
-
-    def share(self, gaussians: Gaussians, params: BandedParams, layout: BandedLayout, num_shares: Array):
-        gaussians, inner = self.inner.share(gaussians, params.inner, layout.inner, num_shares)
-        return gaussians, params._replace(inner=inner)
-
-    def opacities(self, gaussians: Gaussians, params: BandedParams, layout: BandedLayout) -> Array:
-        return self.inner.opacities(gaussians, params.inner, layout.inner)
-
-    def limit_opacities(self, gaussians: Gaussians, params: BandedParams, layout: BandedLayout, most: Array):
-        gaussians, inner = self.inner.limit_opacities(gaussians, params.inner, layout.inner, most)
-        return gaussians, params._replace(inner=inner)
+        bands = clear_bands(params.bands, layout.bands, is_cleared)
+        return super().clear(params, layout, is_cleared)._replace(bands=bands)
 
     def first_rows(self, params: BandedParams, layout: BandedLayout, num: int) -> tuple[BandedParams, BandedLayout]:
         bands, owners = first_bands(params.bands, layout.bands, num)
-        inner, inner_layout = self.inner.first_rows(params.inner, layout.inner, num)
-        return BandedParams(bands, inner), BandedLayout(owners, inner_layout)
+        params, layout = super().first_rows(params, layout, num)
+        return params._replace(bands=bands), layout._replace(bands=owners)
 
-    def sh(self, gaussians: Gaussians, params: BandedParams, layout: BandedLayout) -> np.ndarray:
-        return dense_sh(np.asarray(gaussians.sh), params.bands, layout.bands)
+    def bands(self, params: BandedParams, layout: BandedLayout) -> tuple[Bands, BandLayout]:
+        return params.bands, layout.bands
 
-    def with_sh(self, sh: np.ndarray, params: BandedParams, layout: BandedLayout) -> BandedParams:
-        bands, _ = split_sh(sh, layout.bands.degrees, layout.bands.base_degree)
-        return params._replace(bands=bands)
+    def with_bands(
+        self, params: BandedParams, layout: BandedLayout, bands: Bands, owners: BandLayout
+    ) -> tuple[BandedParams, BandedLayout]:
+        return params._replace(bands=bands), layout._replace(bands=owners)
 
-    def textures(self, params: BandedParams, layout: BandedLayout) -> tuple[Textures, AtlasLayout] | None:
-        return self.inner.textures(params.inner, layout.inner)
-
-    def with_textures(self, params: BandedParams, layout: BandedLayout, textures: Textures, atlas: AtlasLayout):
-        inner, inner_layout = self.inner.with_textures(params.inner, layout.inner, textures, atlas)
-        return params._replace(inner=inner), layout._replace(inner=inner_layout)
-
-    # Files.
+    def check(self, params: BandedParams, layout: BandedLayout, gaussians: Gaussians) -> None:
+        own, base = gaussians.sh_degree, layout.bands.base_degree
+        if own != base:
+            raise ValueError(f"Banded has bands above degree {base}, but the Gaussians have degree {own}")
+        if layout.bands.num != gaussians.num:
+            raise ValueError(f"Banded has {layout.bands.num} degrees, but there are {gaussians.num} Gaussians")
+        super().check(params, layout, gaussians)
 
     def arrays(self, params: BandedParams, layout: BandedLayout) -> dict[str, np.ndarray]:
-        """`degrees` [N], `base_degree`, of each band above that `band_l` [M, 2l + 1, 3] in the Gaussians' order, and
-        what else is shown, as `inner.NAME`."""
+        """Return `degrees` [N], `base_degree`, each band above it, and the inner appearance's arrays as `inner.NAME`.
+
+        Band l is `band_l` [M, 2l + 1, 3], in the order of the Gaussians.
+        """
         arrays = {"degrees": layout.bands.degrees.astype(np.uint8)}
         arrays["base_degree"] = np.asarray(layout.bands.base_degree, np.uint8)
         tables = zip(layout.bands.bands, params.bands.tables, layout.bands.owners, strict=True)
         for band, table, owners in tables:
             arrays[f"band_{band}"] = np.asarray(table)[np.asarray(owners) < layout.num]
-        inner = self.inner.arrays(params.inner, layout.inner)
-        return arrays | {f"inner.{name}": array for name, array in inner.items()}
+        return arrays | super().arrays(params, layout)
 
     def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[BandedParams, BandedLayout]:
         missing = [name for name in ("degrees", "base_degree") if name not in arrays]
@@ -159,6 +152,5 @@ class Banded(Appearance):
             filled = np.zeros(table.shape, found.dtype)
             filled[: len(found)] = found
             tables.append(jnp.asarray(filled))
-        inner = {name.removeprefix("inner."): array for name, array in arrays.items() if name.startswith("inner.")}
-        params, inner_layout = self.inner.from_arrays(inner)
+        params, inner_layout = self.inner_from_arrays(arrays)
         return BandedParams(Bands(tuple(tables)), params), BandedLayout(layout, inner_layout)

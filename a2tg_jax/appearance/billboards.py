@@ -6,11 +6,12 @@ beyond the border:
 
     α = min(max_alpha, A(u, v)),   colour = SH colour + RGB(u, v) − initial RGB
 
-There is no low-pass filter. RGB is the sigmoid of what is trained. The authors lower the first SH coefficient so that
-colours start as they were; here the rule subtracts what RGB starts with, the Gaussians staying as they are.
+There is no low-pass filter. RGB is the sigmoid of the trained numbers. The authors lower the first SH coefficient so
+that the initial colours stay; here the rule subtracts the initial RGB, and the Gaussians stay unchanged.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -18,32 +19,32 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
-from a2tg_jax.appearance.rule import AppearanceRule
+from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures
 
 INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
-"""Of the Gaussian picture that alpha starts as; with σ = 0.3 in u it falls to 0.002 at the border, less than shows."""
+"""Peak and σ, in units of u, of the initial alpha picture; it falls to an invisible 0.002 at the border."""
 LEAST_PEAK = 0.999 / 255
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class BillboardRule(AppearanceRule):
-    """An appearance rule: RGB residual and alpha from each splat's own picture."""
+    """Appearance rule: RGB residual and alpha from each splat's own picture."""
 
     texels: Array
-    """[T, 4] of all pictures, RGB in (0, 1) and alpha."""
+    """[T, 4] texels of all pictures, RGB in (0, 1) and alpha."""
     first: Array
-    """[N] where the pictures begin."""
+    """[N] first texel of each picture."""
     peaks: Array
-    """[N] the largest alpha of each; bounds only, without gradient."""
+    """[N] largest alpha of each picture; only for bounds, without gradient."""
     side: int = dataclasses.field(metadata={"static": True})
-    """S."""
+    """Side S of a picture in texels."""
     initial_rgb: float = dataclasses.field(metadata={"static": True})
-    """Subtracted from RGB."""
+    """Initial RGB, which is subtracted."""
     max_alpha: float = dataclasses.field(default=0.99, metadata={"static": True})
     has_low_pass: bool = dataclasses.field(default=False, metadata={"static": True})
 
@@ -58,7 +59,9 @@ class BillboardRule(AppearanceRule):
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         return jnp.clip(self._place(u), 0.0, self.side - 1.0), jnp.clip(self._place(v), 0.0, self.side - 1.0)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         *rgb, alpha = values
         inside = self._inside(u) * self._inside(v)
         red, green, blue = (inside * channel - self.initial_rgb for channel in rgb)
@@ -68,30 +71,30 @@ class BillboardRule(AppearanceRule):
         return jnp.ones_like(rho)
 
     def cutoff(self, opacities: Array) -> Array:
-        """The circle around the picture, border included."""
+        """Return the circle around the picture, border included."""
         half_side = 1 + 2 / (self.side - 1)
         return jnp.where(opacities * self.peaks >= LEAST_PEAK, 2 * half_side * half_side, -1.0)
 
     def _place(self, u: Array) -> Array:
-        """Where u lies along an axis, in texels."""
+        """Return the position of u along an axis, in texels."""
         return (u + 1) * ((self.side - 1) / 2)
 
     def _inside(self, u: Array) -> Array:
-        """1 up to the outer texels, 0 from one texel beyond them: with it, clamped lookups are those among zeros."""
+        """Return 1 up to the outer texels and 0 from one texel beyond: clamped lookups become those among zeros."""
         x = self._place(u)
         return jnp.clip(1 - jnp.maximum(-x, x - (self.side - 1.0)), 0.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Billboards(Bucketed):
-    """A picture for each splat: `params` are `Textures` of one size, raw RGB and alpha; `layout` is their layout."""
+    """Picture for each splat: `params` are `Textures` of one size, raw RGB and alpha; `layout` is their layout."""
 
     side: int = 16
-    """S, 2 to 16."""
+    """Side S of a picture in texels, 2 to 16."""
     initial_rgb: float = 0.1
-    """RGB of new pictures, in (0, 1)."""
+    """Initial RGB, in (0, 1)."""
     max_alpha: float = 0.99
-    """Alpha never exceeds it."""
+    """Upper limit of alpha."""
 
     def __post_init__(self) -> None:
         if not 2 <= self.side <= MAX_SIDE:
@@ -100,7 +103,7 @@ class Billboards(Bucketed):
             raise ValueError(f"initial_rgb must lie in (0, 1); got {self.initial_rgb}")
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Textures, AtlasLayout]:
-        """Pictures of a Gaussian, half opaque in the middle, that leave the splats' colour as it is."""
+        """Return pictures of a Gaussian, half opaque in the middle, that do not change the splats' colour."""
         textures, layout = allocate_textures(np.full((gaussians.num, 2), self.side), dtype=gaussians.means.dtype)
         along = np.exp(-0.5 * (np.linspace(-1, 1, self.side) / INITIAL_SIGMA) ** 2)
         picture = np.full((self.side, self.side, 4), np.log(self.initial_rgb / (1 - self.initial_rgb)))
@@ -116,29 +119,33 @@ class Billboards(Bucketed):
         return BillboardRule(shown.reshape(-1, 4), first, peaks, self.side, self.initial_rgb, self.max_alpha)
 
     def project(self, params: Textures) -> Textures:
-        """Alpha in [0, 1]."""
+        """Return pictures with alpha clamped to [0, 1]."""
         return self._with_alpha(params, lambda alpha: jnp.clip(alpha, 0.0, 1.0))
 
     def rates(self, rate: tuple[float, float], params: Textures) -> Array:
-        """Of RGB and of alpha."""
+        """Return the rates of RGB and alpha, given as a pair."""
         rgb, alpha = rate
         return jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
 
     def num_floats(self, layout: AtlasLayout, num: int) -> int:
-        """4·S² − 1 more than the Gaussian's own: its opacity is not trained."""
+        """Return 4·S² − 1 per splat, beside the Gaussian's own: its opacity is not trained."""
         return (4 * self.side**2 - 1) * num
 
     def opacities(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout) -> Array:
-        """[N] mean alpha of the texels."""
+        """Return the mean alpha [N] of the texels."""
         return self._means(params)[: gaussians.num]
 
-    def limit_opacities(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, most: Array):
-        """Pictures whose mean alpha was larger, made fainter throughout."""
+    def limit_opacities(
+        self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, most: Array
+    ) -> tuple[Gaussians, Textures]:
+        """Fade pictures whose mean alpha is larger than `most`, by one factor each."""
         fading = jnp.minimum(safe_divide(jnp.asarray(most, params.buckets[0].dtype), self._means(params), 1.0), 1.0)
         return gaussians, self._with_alpha(params, lambda alpha: alpha * fading[:, None, None])
 
-    def share(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, num_shares: Array):
-        """Every texel as opaque as makes n of them one over the other what one was; scales stay as they are."""
+    def share(
+        self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, num_shares: Array
+    ) -> tuple[Gaussians, Textures]:
+        """Return texels such that n over each other are as opaque as one was; scales stay unchanged."""
         (bucket,) = self.only(params)
         num_shares = jnp.pad(num_shares, (0, bucket.shape[0] - gaussians.num), constant_values=1)
         exponents = (1 / num_shares.astype(bucket.dtype))[:, None, None]
@@ -151,9 +158,9 @@ class Billboards(Bucketed):
         return params, layout
 
     def _means(self, params: Textures) -> Array:
-        """[capacity] mean alphas."""
+        """Return the mean alphas [capacity]."""
         return jnp.mean(self.only(params)[0][..., 3], axis=(1, 2))
 
-    def _with_alpha(self, params: Textures, change) -> Textures:
+    def _with_alpha(self, params: Textures, change: Callable[[Array], Array]) -> Textures:
         (bucket,) = self.only(params)
         return Textures((bucket.at[..., 3].set(change(bucket[..., 3])),))

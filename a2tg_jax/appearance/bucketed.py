@@ -1,6 +1,6 @@
-"""What appearances have in common whose parameters are `Textures`: moving rows, and arrays for files.
+"""Base class of appearances whose parameters are `Textures`: moving rows, and arrays for files.
 
-`Textured` and `Billboards` derive from it; the buckets themselves are `texture`'s.
+`Textured` and `Billboards` derive from it; `texture` manages the buckets.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from a2tg_jax.texture import (
 
 @dataclasses.dataclass(frozen=True)
 class Bucketed(Appearance):
-    """An image for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
+    """Image for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
 
     def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
         (bucket,) = self.only(params)
@@ -40,11 +40,13 @@ class Bucketed(Appearance):
     def textures(self, params: Textures, layout: AtlasLayout) -> tuple[Textures, AtlasLayout]:
         return params, layout
 
-    def with_textures(self, params: Textures, layout: AtlasLayout, textures: Textures, atlas: AtlasLayout):
+    def with_textures(
+        self, params: Textures, layout: AtlasLayout, textures: Textures, atlas: AtlasLayout
+    ) -> tuple[Textures, AtlasLayout]:
         return textures, atlas
 
     def arrays(self, params: Textures, layout: AtlasLayout) -> dict[str, np.ndarray]:
-        """`sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], the textures one after the other, each row by row."""
+        """Return `sizes` [N, 2] as (Tv, Tu), and `texels` [M, 4], texture after texture, row by row."""
         texels = [array.reshape(-1, 4) for array in texture_arrays(params, layout)]
         return {"sizes": layout.sizes, "texels": np.concatenate(texels) if texels else np.zeros((0, 4), np.float32)}
 
@@ -62,7 +64,7 @@ class Bucketed(Appearance):
         return textures_from_arrays([piece.reshape(*size, 4) for piece, size in zip(pieces, sizes, strict=True)])
 
     def only(self, params: Textures) -> tuple[Array]:
-        """The one bucket of images that all have one size."""
+        """Return the one bucket of images of one size. Raise ValueError if there are several sizes."""
         if len(params.buckets) != 1:
             raise ValueError(
                 f"textures of {len(params.buckets)} sizes cannot change rows inside a step: densify before they grow"

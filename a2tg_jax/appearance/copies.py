@@ -16,15 +16,15 @@ QUADRATURE_STEPS = 32
 
 
 def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple[Array, Array]:
-    """Opacity and size with which `num_shares` coincident copies replace one Gaussian (3DGS-MCMC, relocation).
+    """Return opacity and size of `num_shares` coincident copies that replace one Gaussian (3DGS-MCMC, relocation).
 
     o' = 1 - (1 - o)^(1/N), clamped to [0.005, 1 - 2⁻²³], keeps the opacity at the centre; the scales, multiplied by
     o / S(o', N), keep the integral of the opacity along a line through it.
 
     Args:
-      logit_opacities: [N] of the originals.
-      log_scales: [N, 2] of the originals.
-      num_shares: [N] integers of at least 1; 1 leaves a row as it is.
+      logit_opacities: [N] logits of the originals.
+      log_scales: [N, 2] log-scales of the originals.
+      num_shares: [N] integers of at least 1; 1 leaves a row unchanged.
 
     Returns:
       logit_opacities [N] and log_scales [N, 2] of each copy.
@@ -43,7 +43,7 @@ def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple
 
 
 def stacked_integral(opacities: Array, num_shares: Array) -> Array:
-    """S = π^(-1/2)·∫ [1 - (1 - o·e^(-x²))^N] dx: the opacity of N coincident Gaussians, integrated along a line.
+    """Return S = π^(-1/2)·∫ [1 - (1 - o·e^(-x²))^N] dx: the opacity of N coincident Gaussians, integrated along a line.
 
     Equal to the binomial double sum of 3DGS-MCMC, without its cancellation. The integrand is even and entire, so the
     trapezoidal rule converges exponentially: 32 steps on [0, 5] are off by less than 1e-10 for N up to 51.
@@ -53,7 +53,7 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
       num_shares: [N] integers, 1 to 51.
 
     Returns:
-      [N], positive; `opacities` itself where `num_shares` is 1.
+      Positive integrals [N]; `opacities` itself if `num_shares` is 1.
     """
     count = num_shares.astype(opacities.dtype)
     spacing = QUADRATURE_END / QUADRATURE_STEPS

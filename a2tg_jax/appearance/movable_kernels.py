@@ -1,7 +1,7 @@
 """The appearance of SuperGaussians: four kernels that move over the splat, each with a colour and an opacity.
 
-Kernel i has a centre (x_i, y_i) in standard deviations, a sharpness k_i, an opacity o_i and a colour c_i; 28 numbers a
-splat. With the weights w_i = exp(−k_i·|(u, v) − (x_i, y_i)|²) + 10⁻⁴ the splat shows
+Kernel i has a centre (x_i, y_i) in standard deviations, a sharpness k_i, an opacity o_i and a colour c_i; 28 numbers
+per splat. With the weights w_i = exp(−k_i·|(u, v) − (x_i, y_i)|²) + 10⁻⁴ the splat shows
 
     α = mean_i(o_i·w_i)·exp(−ρ/2),   colour = SH colour + mean_i(c_i·w_i)
 
@@ -18,7 +18,7 @@ from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.copies import LARGEST_OPACITY, share
-from a2tg_jax.appearance.rule import PlainRule, gaussian_cutoff
+from a2tg_jax.appearance.rule import Factor, PlainRule, Residual, gaussian_cutoff
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit
 
@@ -29,38 +29,38 @@ INITIAL_SHARPNESS = 0.1
 LARGEST_INITIAL_OPACITY = 0.999
 FLOATS_PER_KERNEL = 7
 PUBLISHED_FLOATS = 16
-"""Floats of the kernels of a splat that the authors' figures of memory, 74 a splat in all, imply."""
+"""Floats of a splat's kernels by the authors' memory figures, which imply 74 floats per splat."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class MovableKernelParams:
-    """The kernels of N splats."""
+    """Kernels of N splats."""
 
     centers: Array
-    """[N, 4, 2] in standard deviations."""
+    """[N, 4, 2] centres in standard deviations."""
     sharpness: Array
-    """[N, 4], not negative; where it is, the kernel is as wide as with 0."""
+    """[N, 4] sharpness, not negative; a negative one acts as 0."""
     logit_opacities: Array
-    """[N, 4]."""
+    """[N, 4] logits of the opacities."""
     colors: Array
-    """[N, 4, 3] of either sign."""
+    """[N, 4, 3] colours of either sign."""
 
     @property
     def opacities(self) -> Array:
-        """[N, 4] in (0, 1)."""
+        """[N, 4] opacities in (0, 1)."""
         return jax.nn.sigmoid(self.logit_opacities)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MovableKernelsRule(PlainRule):
-    """An appearance rule: colour residual and opacity from four kernels."""
+    """Appearance rule: colour residual and opacity from four kernels."""
 
     kernels: MovableKernelParams
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
-        """[N, 28]: of each kernel x, y, k, o, and its colour."""
+        """Return [N, 28]: x, y, k, o and the colour of each kernel."""
         kernels = self.kernels
         sharpness = jnp.where(kernels.sharpness >= 0, kernels.sharpness, 0.0)
         columns = [kernels.centers, sharpness[..., None], kernels.opacities[..., None], kernels.colors]
@@ -69,7 +69,9 @@ class MovableKernelsRule(PlainRule):
     def opacities(self, gaussians: Gaussians) -> Array:
         return jnp.ones(gaussians.num, gaussians.means.dtype)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         totals = [jnp.zeros_like(u)] * 4
         for first in range(0, len(numbers), FLOATS_PER_KERNEL):
             x, y, sharpness, *shown = numbers[first : first + FLOATS_PER_KERNEL]
@@ -85,13 +87,13 @@ class MovableKernelsRule(PlainRule):
 
 @dataclasses.dataclass(frozen=True)
 class MovableKernels(Appearance):
-    """Four movable kernels a splat: `params` are `MovableKernelParams`, there is no layout."""
+    """Four movable kernels per splat: `params` are `MovableKernelParams`, there is no layout."""
 
     max_alpha: float = 0.99
-    """Alpha never exceeds it."""
+    """Upper limit of alpha."""
 
-    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[MovableKernelParams, tuple]:
-        """Colourless kernels around the mean, where together they are as opaque as the Gaussian was, 0.82 at most."""
+    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[MovableKernelParams, tuple[()]]:
+        """Return colourless kernels around the mean, where they are together as opaque as the Gaussian, up to 0.82."""
         num, dtype = gaussians.num, gaussians.means.dtype
         centers = jnp.asarray(INITIAL_CENTERS, dtype)
         weight_at_mean = float(np.exp(-2 * INITIAL_SHARPNESS)) + LEAST_WEIGHT
@@ -104,22 +106,24 @@ class MovableKernels(Appearance):
         )
         return params, ()
 
-    def rule(self, params: MovableKernelParams, layout: tuple) -> MovableKernelsRule:
+    def rule(self, params: MovableKernelParams, layout: tuple[()]) -> MovableKernelsRule:
         return MovableKernelsRule(max_alpha=self.max_alpha, kernels=params)
 
     def project(self, params: MovableKernelParams) -> MovableKernelParams:
-        """The kernels with sharpness of 0 at least."""
+        """Return kernels with sharpness of at least 0."""
         return dataclasses.replace(params, sharpness=jnp.maximum(params.sharpness, 0.0))
 
-    def num_floats(self, layout: tuple, num: int) -> int:
-        """27 more than the Gaussian's own: its opacity is not trained."""
+    def num_floats(self, layout: tuple[()], num: int) -> int:
+        """Return 27 per splat, beside the Gaussian's own: its opacity is not trained."""
         return (NUM_KERNELS * FLOATS_PER_KERNEL - 1) * num
 
-    def num_published_floats(self, layout: tuple, num: int) -> int:
+    def num_published_floats(self, layout: tuple[()], num: int) -> int:
         return PUBLISHED_FLOATS * num
 
-    def share(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple, num_shares: Array):
-        """As Gaussians as opaque as the kernels are on average share theirs; all kernels fade by one factor."""
+    def share(
+        self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple[()], num_shares: Array
+    ) -> tuple[Gaussians, MovableKernelParams]:
+        """Share the mean opacity of the kernels like that of a Gaussian; all kernels fade by one factor."""
         before = self.opacities(gaussians, params, layout)
         logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
         faded = params.opacities * (jax.nn.sigmoid(logits) / before)[:, None]
@@ -130,11 +134,13 @@ class MovableKernels(Appearance):
             dataclasses.replace(params, logit_opacities=logits),
         )
 
-    def opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple) -> Array:
-        """[N] mean opacity of the kernels; no splat is more opaque anywhere, but for 10⁻⁴ of it."""
+    def opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple[()]) -> Array:
+        """Return the mean opacity [N] of the kernels, which bounds that of the splat to 10⁻⁴ of it."""
         return jnp.mean(params.opacities, axis=1)
 
-    def limit_opacities(self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple, most: Array):
-        """Every kernel no more opaque than `most`."""
+    def limit_opacities(
+        self, gaussians: Gaussians, params: MovableKernelParams, layout: tuple[()], most: Array
+    ) -> tuple[Gaussians, MovableKernelParams]:
+        """Limit the opacity of every kernel to `most`."""
         limit = logit(jnp.asarray(most, params.logit_opacities.dtype))
         return gaussians, dataclasses.replace(params, logit_opacities=jnp.minimum(params.logit_opacities, limit))

@@ -1,4 +1,4 @@
-"""Plain 2DGS as an appearance: no parameters besides the Gaussians' own."""
+"""Plain 2DGS as an appearance, without parameters of its own."""
 
 import dataclasses
 
@@ -8,10 +8,18 @@ from a2tg_jax.appearance.rule import PlainRule
 
 @dataclasses.dataclass(frozen=True)
 class Plain(Appearance):
-    """Plain 2DGS."""
+    """Plain 2D Gaussians."""
 
     max_alpha: float = 0.99
-    """Alpha never exceeds it."""
+    """Upper limit of alpha."""
 
-    def rule(self, params: tuple, layout: tuple) -> PlainRule:
+    @property
+    def is_portable(self) -> bool:
+        return type(self) is Plain
+
+    @property
+    def is_linear(self) -> bool:
+        return True
+
+    def rule(self, params: tuple[()], layout: tuple[()]) -> PlainRule:
         return PlainRule(max_alpha=self.max_alpha)

@@ -1,15 +1,15 @@
-"""Appearance rules: what a splat shows at (u, v). The compositor is given one and knows nothing else about it.
+"""Appearance rules: what a splat shows at (u, v). The compositor knows nothing else about appearances.
 
-Each of N splats may own a texture of one texel or more among all texels [T, C], and K numbers. At (u, v), in standard
-deviations, the rule says where the texture is looked up (`texel_position`), and what the C values found there
-(`bilinear`), with the K numbers, make visible (`shade`):
+Each of N splats may own a texture of one or more texels among all texels [T, C], and K numbers. At (u, v), in standard
+deviations, the rule gives the position of the texture lookup (`texel_position`). From the C interpolated values and the
+K numbers it computes a colour residual and an alpha factor (`shade`):
 
     residual, factor = rule.shade(numbers, texture interpolated at rule.texel_position(region, u, v), u, v)
     α = min(max_alpha, opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
 
 `texel_position`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They see the rule
-without its arrays (`StaticRule`): whatever is differentiated, or differs between splats, is in the texels or in the
-numbers. All else is computed by XLA for the N splats at once, and may use any field.
+without its arrays (`StaticRule`): put whatever is differentiated, or differs between splats, in the texels or in the
+numbers. XLA computes all else for the N splats at once, from any field.
 """
 
 import dataclasses
@@ -32,59 +32,59 @@ Factor = Array | None
 
 
 class AppearanceRule:
-    """The splat's own colour, weighted by its Gaussian. A rule is a pytree that overrides what it does otherwise."""
+    """Base class of rules: the splat's own colour, weighted by its Gaussian. A subclass is a pytree."""
 
     max_alpha: float = 0.99
-    """Static. Alpha never exceeds it; less than 1."""
+    """Static upper limit of alpha, in (0, 1)."""
     has_low_pass: bool = True
-    """Static. The low-pass filter of 2DGS shows splats that are smaller than a pixel, or seen edge-on. Without it, ρ is
-    u² + v² where the pixel's ray meets the splat, and nothing shows where it does not."""
+    """Static. Whether the low-pass filter of 2DGS shows splats that are smaller than a pixel or seen edge-on.
+    Without it, ρ is u² + v² at the hit of the pixel's ray, and a splat without a hit is invisible."""
 
     empty: tuple[float, ...] = ()
-    """Static. The C values of a splat without a texture, whose region has no texels; () where all splats have one."""
+    """Static C values of a splat without a texture, whose region has no texels; () if all splats have one."""
 
     texels: Array
-    """[T, C] the texels of all splats, differentiable; T >= 1, and C >= 1 where there are textures."""
+    """[T, C] texels of all splats, differentiable; T >= 1, and C >= 1 with textures."""
     regions: TextureRegion | None
-    """[N] each: where the splats' textures lie among the texels. None where nothing of them is read."""
+    """[N] places of the splats' textures among the texels; None without textures."""
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
-        """[N, K] what else `shade` and `falloff` know of each splat, differentiable; it may depend on the view.
+        """Return the numbers [N, K] of `shade` and `falloff`, differentiable; they may depend on the view.
 
-        It is called once per view and differentiated by JAX, gradients of rows that do not show being zero.
+        The renderer calls it once per view, and JAX differentiates it. Gradients of invisible rows are zero.
         """
         return jnp.zeros((gaussians.num, 0), gaussians.means.dtype)
 
     def opacities(self, gaussians: Gaussians) -> Array:
-        """[N] peak opacities."""
+        """Return the peak opacities [N]."""
         return gaussians.opacities
 
     def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        """[N, 3] colours in this view, of spherical harmonics up to `degree`, which may be traced."""
+        """Return the colours [N, 3] in this view, of spherical harmonics up to `degree`, which may be traced."""
         return jnp.maximum(self.own_color_sums(gaussians, camera, degree) + 0.5, 0.0)
 
     def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        """[N, 3] sums of spherical harmonics, of either sign, that `own_colors` makes colours of; linear in them."""
+        """Return the sums of spherical harmonics [N, 3] behind `own_colors`, of either sign; linear in them."""
         return sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
-        """(x, y) where a texture is looked up, in texels, held in [0, width − 1] and [0, height − 1]."""
+        """Return the lookup position (x, y) in texels, clamped to [0, width − 1] and [0, height − 1]."""
         raise NotImplementedError(f"{type(self).__name__} has textures, but does not say where they are looked up")
 
     def shade(
         self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
     ) -> tuple[Residual, Factor]:
-        """Colour residual and alpha factor at (u, v), given the splat's K numbers and the C values of its texture."""
+        """Return colour residual and alpha factor at (u, v), from the K numbers and the C values of the texture."""
         return None, None
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
-        """The kernel at squared distance rho; exp(−rho/2) for a Gaussian."""
+        """Return the kernel at squared distance rho; exp(−rho/2) for a Gaussian."""
         return jnp.exp(-0.5 * rho)
 
     def cutoff(self, opacities: Array) -> Array:
-        """[N] squared distance rho beyond which the splat shows less than 1/255; not positive where it never does.
+        """Return the squared distance rho [N] beyond which alpha is below 1/255; not positive if it always is.
 
-        Bounds only: no gradient flows. Too large a bound costs time, too small a one cuts the splat off.
+        These are bounds without gradient. Too large a bound costs time, too small a one cuts the splat off.
         """
         return gaussian_cutoff(opacities)
 
@@ -92,7 +92,7 @@ class AppearanceRule:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PlainRule(AppearanceRule):
-    """Plain 2DGS; also what a rule without textures derives from."""
+    """Rule of plain 2DGS, and base class of rules without textures."""
 
     max_alpha: float = dataclasses.field(default=0.99, kw_only=True, metadata={"static": True})
 
@@ -108,7 +108,7 @@ class PlainRule(AppearanceRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RuleAround(AppearanceRule):
-    """Shows what another rule shows; what derives from it changes some of that."""
+    """Base class of rules that change a part of another rule and forward the rest."""
 
     inner: AppearanceRule
 
@@ -144,7 +144,9 @@ class RuleAround(AppearanceRule):
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         return self.inner.texel_position(region, u, v)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         return self.inner.shade(numbers, values, u, v)
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
@@ -157,10 +159,10 @@ class RuleAround(AppearanceRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GivenColors(RuleAround):
-    """Another rule, with the colours of the Gaussians given."""
+    """Another rule with given colours of the Gaussians."""
 
     given: Array
-    """[N, 3]."""
+    """[N, 3] colours."""
 
     def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
         return self.given
@@ -168,12 +170,12 @@ class GivenColors(RuleAround):
 
 @dataclasses.dataclass(frozen=True)
 class StaticRule:
-    """A rule without its arrays; hashable, so that code can be compiled for it."""
+    """Rule without its arrays; hashable, so that code can be compiled for it."""
 
     structure: Any
-    """Its tree structure, with the static fields."""
+    """Tree structure of the rule, with the static fields."""
     classes: tuple[type, ...]
-    """Its class, and of all within, which equality of tree structures disregards (`classes`)."""
+    """Classes of the rule and its inner nodes, which equality of tree structures ignores (`core.jit`)."""
 
     @staticmethod
     def of(rule: AppearanceRule) -> "StaticRule":
@@ -181,7 +183,7 @@ class StaticRule:
 
     @property
     def rule(self) -> Any:
-        """The rule as its element-wise functions see it: an array field refuses to be used."""
+        """Rule as its element-wise functions see it: every use of an array field raises."""
         numbered = jax.tree.unflatten(self.structure, range(self.structure.num_leaves))
         paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
         name = self.classes[0].__name__
@@ -189,7 +191,7 @@ class StaticRule:
 
 
 class _LeftOut:
-    """Stands where a rule has an array, and says what to do instead where it is used."""
+    """Stand-in for an array of a rule; every use raises an error that says what to do instead."""
 
     def __init__(self, name: str):
         self._name = name
@@ -212,5 +214,5 @@ class _LeftOut:
 
 
 def gaussian_cutoff(peak: Array) -> Array:
-    """r² = 2·ln(255·peak), where peak·exp(−r²/2) = 1/255; peaks that are not positive give a negative r²."""
+    """Return r² = 2·ln(255·peak), at which peak·exp(−r²/2) = 1/255; negative if the peak is not positive."""
     return 2 * jnp.log(jnp.maximum(255 * peak, 1e-6))

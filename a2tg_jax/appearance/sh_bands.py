@@ -1,8 +1,8 @@
 """Spherical harmonics of a degree per Gaussian, as they are stored and trained: one padded table for each band.
 
 Band l holds the 2l + 1 coefficients of degree l. All Gaussians have those of `Gaussians.sh`; one of a higher degree
-owns a row in the table of every band between. `Bands` holds parameters only and is differentiable; `BandLayout` says
-whose a row is. A Gaussian without a row in a table pays nothing for it.
+owns a row in the table of every band between. A Gaussian without a row in a table takes no bytes there. `Bands` holds
+parameters only and is differentiable; `BandLayout` holds the owners of the rows.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ MAX_DEGREE = 3
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Bands:
-    """The coefficients beyond those that all Gaussians have."""
+    """Coefficients beyond those that all Gaussians have."""
 
     tables: tuple[Array, ...]
-    """Of the bands above the Gaussians' own degree up to 3: [capacity, 2l + 1, 3]; rows that nobody owns are 0."""
+    """Tables [capacity, 2l + 1, 3] of the bands above the Gaussians' own degree; rows without an owner are 0."""
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -37,10 +37,10 @@ class Bands:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class BandLayout:
-    """Whose the rows of the tables are. Integers only: not differentiable, kept apart from `Bands`."""
+    """Owners of the rows of the tables. Integers only: not differentiable, kept apart from `Bands`."""
 
     owners: tuple[Array, ...]
-    """[capacity] int32 of each table, ascending: the Gaussian that owns a row; N where nobody does."""
+    """[capacity] int32 owner of each row of each table, ascending; N for a row without an owner."""
     num: int = dataclasses.field(metadata={"static": True})
     """Number of Gaussians N."""
 
@@ -58,13 +58,13 @@ class BandLayout:
         return degrees
 
     def count_floats(self, num: int) -> int:
-        """Floats of the first `num` Gaussians beyond those that all have (host)."""
+        """Return the floats of the first `num` Gaussians beyond those that all have (host)."""
         rows = [int(np.count_nonzero(np.asarray(owners) < num)) for owners in self.owners]
         return sum(count * floats_of_band(degree) for count, degree in zip(rows, self.bands, strict=True))
 
     @property
     def bands(self) -> range:
-        """The degree of each table."""
+        """Degree of each table."""
         return range(self.base_degree + 1, MAX_DEGREE + 1)
 
     def __repr__(self) -> str:
@@ -72,17 +72,17 @@ class BandLayout:
 
 
 def floats_of_band(degree: int) -> int:
-    """Of one Gaussian: 9, 15 and 21 for the bands of degree 1, 2 and 3."""
+    """Return the floats of a band of one Gaussian: 9, 15 and 21 for degree 1, 2 and 3."""
     return 3 * (2 * degree + 1)
 
 
 def allocate_bands(degrees, base_degree: int, dtype=jnp.float32) -> tuple[Bands, BandLayout]:
-    """Tables of zeros for Gaussians of the given degrees (host).
+    """Return tables of zeros for Gaussians of the given degrees (host).
 
     Args:
       degrees: [N] integers, `base_degree` to 3.
-      base_degree: that of `Gaussians.sh`.
-      dtype: of the coefficients.
+      base_degree: degree of `Gaussians.sh`.
+      dtype: dtype of the coefficients.
 
     Raises:
       ValueError: if a degree is out of range.
@@ -101,13 +101,13 @@ def allocate_bands(degrees, base_degree: int, dtype=jnp.float32) -> tuple[Bands,
 
 
 def reallocate_bands(bands: Bands, layout: BandLayout, degrees, moments: Any = None) -> tuple[Bands, BandLayout, Any]:
-    """Tables for other degrees (host): what a Gaussian keeps stays as it is, what is new begins at 0.
+    """Return tables for other degrees (host): kept coefficients stay unchanged, new ones are 0.
 
     Args:
-      bands: the present coefficients.
-      layout: whose they are.
+      bands: present coefficients.
+      layout: owners of the coefficients.
       degrees: [N] integers, the layout's base degree to 3.
-      moments: any pytree: all `Bands` in it are rebuilt as well, other leaves stay as they are.
+      moments: any pytree; all `Bands` in it are rebuilt as well, other leaves stay unchanged.
     """
     check_shape("degrees", degrees, (layout.num,))
 
@@ -120,10 +120,9 @@ def reallocate_bands(bands: Bands, layout: BandLayout, degrees, moments: Any = N
 
 
 def gather_bands(bands: Bands, layout: BandLayout, rows: Array) -> Bands:
-    """Coefficients whose Gaussian i shows those of the former Gaussian rows[i]; traceable.
+    """Return coefficients whose Gaussian i has those of the former Gaussian rows[i]; traceable.
 
-    The degrees stay where they are: what a Gaussian lacks room for is left out, what it has room for and the other
-    lacked is 0.
+    Each row keeps its degree: coefficients above it are dropped, and those that the former Gaussian lacked are 0.
     """
     tables = []
     for table, owners in zip(bands.tables, layout.owners, strict=True):
@@ -136,7 +135,7 @@ def gather_bands(bands: Bands, layout: BandLayout, rows: Array) -> Bands:
 
 
 def clear_bands(bands: Bands, layout: BandLayout, is_cleared: Array) -> Bands:
-    """Moments of coefficients with those of the marked Gaussians [N] at zero; traceable."""
+    """Return moments of coefficients with those of the marked Gaussians [N] at zero; traceable."""
     marks = jnp.concatenate([is_cleared, jnp.zeros((1,), bool)])
     cleared = [
         jnp.where(marks[owners].reshape(-1, 1, 1), jnp.zeros_like(table), table)
@@ -146,17 +145,17 @@ def clear_bands(bands: Bands, layout: BandLayout, is_cleared: Array) -> Bands:
 
 
 def first_bands(bands: Bands, layout: BandLayout, num: int) -> tuple[Bands, BandLayout]:
-    """The coefficients of the first `num` Gaussians, in tables of their own (host)."""
+    """Return the coefficients of the first `num` Gaussians, in tables of their own (host)."""
     dense = [table[:num] for table in _dense_tables(bands, layout)]
     return _packed(dense, layout.degrees[:num], layout.base_degree)
 
 
 def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, degree: Any) -> Array:
-    """[N, 3] what the bands add to Σ Y_l·sh_l of each Gaussian, before 0.5 is added and negatives are cut off.
+    """Return the sums [N, 3] that the bands add to Σ Y_l·sh_l, before 0.5 is added and negatives are cut off.
 
     Args:
       bands: coefficients.
-      layout: whose they are.
+      layout: owners of the coefficients.
       means: [N, 3] positions in the world.
       center: [3] camera centre in the world.
       degree: highest degree used; may be traced.
@@ -173,21 +172,21 @@ def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, d
 
 
 def dense_sh(sh: np.ndarray, bands: Bands, layout: BandLayout) -> np.ndarray:
-    """[N, K, 3] all coefficients, with zeros for what a Gaussian lacks; K is that of the highest degree (host)."""
+    """Return all coefficients [N, K, 3], zeros above a Gaussian's degree; K is that of the highest degree (host)."""
     highest = int(layout.degrees.max(initial=layout.base_degree))
     own = np.asarray(sh)
     return np.concatenate([own, *_dense_tables(bands, layout)], axis=1, dtype=own.dtype)[:, : NUM_BASES[highest]]
 
 
 def split_sh(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> tuple[Bands, BandLayout]:
-    """The inverse of `dense_sh`, given the degrees: what lies above a Gaussian's degree is left out (host)."""
+    """Invert `dense_sh`, given the degrees: coefficients above a Gaussian's degree are dropped (host)."""
     bands = range(base_degree + 1, MAX_DEGREE + 1)
     dense = np.asarray(dense)
     return _packed([dense[:, NUM_BASES[band - 1] : NUM_BASES[band]] for band in bands], degrees, base_degree)
 
 
 def _dense_tables(bands: Bands, layout: BandLayout) -> list[np.ndarray]:
-    """[N, 2l + 1, 3] of each band, zeros where a Gaussian lacks it (host)."""
+    """Return each band as [N, 2l + 1, 3], zeros for Gaussians without it (host)."""
     tables = []
     for table, owners in zip(bands.tables, layout.owners, strict=True):
         rows = _owned(owners, layout.num)
@@ -198,7 +197,7 @@ def _dense_tables(bands: Bands, layout: BandLayout) -> list[np.ndarray]:
 
 
 def _packed(dense: Sequence[np.ndarray], degrees, base_degree: int) -> tuple[Bands, BandLayout]:
-    """Tables of what Gaussians of these degrees have of dense ones; those of bands that nobody has may lack columns."""
+    """Pack dense tables for Gaussians of these degrees; tables of bands without owners may lack columns."""
     empty, layout = allocate_bands(degrees, base_degree)
     tables = []
     for values, fresh, owners in zip(dense, empty.tables, layout.owners, strict=True):
@@ -211,6 +210,6 @@ def _packed(dense: Sequence[np.ndarray], degrees, base_degree: int) -> tuple[Ban
 
 
 def _owned(owners: Array, num: int) -> np.ndarray:
-    """The Gaussians that own the rows in use, in the rows' order."""
+    """Return the owners of the used rows, in the order of the rows."""
     found = np.asarray(owners)
     return found[found < num]

@@ -1,12 +1,12 @@
 """The appearance of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
 
-What a texture is taken for: where (u, v) lies in it, and what its RGB and alpha make of the splat. How textures are
-stored is in `texture`, how one is interpolated in `bilinear`, the interface in `appearance.rule`. The renderer sees all
-textures one after the other as texels [T, 4], each row by row.
+This module defines where (u, v) lies in a texture, and how its RGB and alpha change the splat. `texture` stores
+textures, `core.bilinear` interpolates them, `appearance.rule` is the interface. The renderer sees all textures one
+after the other as texels [T, 4], each row by row.
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.bucketed import Bucketed
-from a2tg_jax.appearance.rule import AppearanceRule, gaussian_cutoff
+from a2tg_jax.appearance.options import TextureOptions
+from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
@@ -23,43 +24,17 @@ EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TextureOptions:
-    """How textures are read. The defaults are the paper's text; `official()` is the authors' program."""
-
-    uv: Literal["texel-centre", "align-corners"] = "texel-centre"
-    """Texel centres at half-texel offsets over ±3σ, or the outer ones at ±3σ exactly."""
-    outside: Literal["clamp", "identity"] = "clamp"
-    """Beyond ±3σ: the edge texel goes on, or the texture shows nothing (RGB 0, alpha 1)."""
-    rgb: Literal["signed", "unit"] = "signed"
-    """RGB residuals of either sign, or clipped to [0, 1]."""
-    uv_gradient: bool = True
-    """Whether the lookup position carries gradients into the geometry."""
-    initial_rgb: float = 0.0
-    """RGB of new textures."""
-    alpha: Literal["projected", "global-maximum"] = "projected"
-    """Alpha factors as they are, kept in [0, 1] after each update; or any numbers, divided by the largest of all
-    textures and clipped to [0, 1]."""
-    max_alpha: float = 0.99
-    """Alpha of a splat never exceeds it."""
-
-    @staticmethod
-    def official() -> "TextureOptions":
-        """The conventions of the authors' own program."""
-        return TextureOptions("align-corners", "identity", "unit", False, 0.1, "global-maximum", max_alpha=0.999)
-
-
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TexturedRule(AppearanceRule):
-    """An appearance rule: RGB residual and alpha factor from each splat's own texture."""
+    """Appearance rule: RGB residual and alpha factor from each splat's own texture."""
 
     texels: Array
-    """[T, 4] of all textures."""
+    """[T, 4] texels of all textures."""
     regions: TextureRegion
-    """[N] each: where the textures lie, Tv × Tu."""
+    """[N] places of the textures, Tv × Tu."""
     peaks: Array
-    """[N] the largest alpha factor of each splat; bounds only, without gradient."""
+    """[N] largest alpha factor of each splat; only for bounds, without gradient."""
     options: TextureOptions = dataclasses.field(metadata={"static": True})
 
     empty = NEUTRAL_TEXEL
@@ -74,7 +49,9 @@ class TexturedRule(AppearanceRule):
         width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
         return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
 
-    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array):
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
         red, green, blue, alpha = values
         if self.options.outside == "identity":
             is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
@@ -87,9 +64,9 @@ class TexturedRule(AppearanceRule):
 
 
 def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> TexturedRule:
-    """The rule that shows `textures`, laid out as `layout` says. Traceable; differentiable in the texels.
+    """Return the rule of textures and their layout. Traceable; differentiable in the texels.
 
-    An empty texture changes nothing: it has a region of no texels.
+    An empty texture has a region of no texels and changes nothing.
     """
     textures = shown_textures(textures, layout, options)
     resolutions = [bucket.shape[1:3] for bucket in textures.buckets]
@@ -112,7 +89,7 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
 
 
 def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> Textures:
-    """RGB residuals and alpha factors as they are seen, from the texels that are trained."""
+    """Return RGB residuals and alpha factors as they are shown, from the trained texels."""
     if options.rgb == "signed" and options.alpha == "projected":
         return textures
     divisor = _largest_alpha(textures, layout) + 1e-6 if options.alpha == "global-maximum" else None
@@ -127,8 +104,10 @@ def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOpti
 
 
 def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
-    """The largest alpha of all texels, buckets' padding left out; where several are, they share its gradient. 1 where
-    all textures are empty."""
+    """Return the largest alpha of all texels without padding, or 1 if all textures are empty.
+
+    Several equal maxima share the gradient.
+    """
     alphas = [jnp.ones(1, textures.buckets[0].dtype)] if not any(bucket.size for bucket in textures.buckets) else []
     for index, bucket in enumerate(textures.buckets):
         num_used = jnp.sum(layout.bucket == index, dtype=jnp.int32)
@@ -138,7 +117,7 @@ def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
 
 
 def _padded_peaks(bucket: Array, length: int) -> Array:
-    """[length] largest alpha of each texture of a bucket, 1 of empty ones, zeros past its capacity."""
+    """Return the largest alpha [length] of each texture of a bucket: 1 if empty, 0 past the capacity."""
     if not bucket.size:
         return jnp.ones(length, bucket.dtype)
     peaks = jnp.max(bucket[..., 3], axis=(1, 2))
@@ -146,7 +125,7 @@ def _padded_peaks(bucket: Array, length: int) -> Array:
 
 
 def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
-    """Where u, in standard deviations, lies among the `size` texels of its axis, clamped to [0, size − 1]."""
+    """Return the position of u, in standard deviations, among the `size` texels of its axis, in [0, size − 1]."""
     unit = (u * (1 / EXTENT) + 1) * 0.5
     x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
     return jnp.clip(x, 0.0, size - 1)
@@ -156,8 +135,9 @@ class TexelRates(NamedTuple):
     """Learning rates of texels by the size of their texture."""
 
     larger: Any
+    """Rate of textures of more than one texel."""
     single: Any
-    """Of textures of one texel, which are no more than another colour and opacity of their Gaussian."""
+    """Rate of textures of one texel, which only change the colour and opacity of their Gaussian."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,9 +145,25 @@ class Textured(Bucketed):
     """A texture for each splat: `params` are `Textures`, `layout` is their `AtlasLayout`."""
 
     start: tuple[int, int] = (1, 1)
-    """(Tv, Tu) of every texture at first, each 1 to 16; (0, 0): none has a texture until it grows."""
-    options: TextureOptions = TextureOptions()
-    """How textures are read."""
+    """Initial (Tv, Tu) of every texture, each 1 to 16; (0, 0): no textures until they grow."""
+    options: TextureOptions = TextureOptions()  # noqa: RUF009 - frozen
+    """Conventions of the textures."""
+
+    @property
+    def max_alpha(self) -> float:  # type: ignore[override]
+        return self.options.max_alpha
+
+    @property
+    def is_portable(self) -> bool:
+        return type(self) is Textured
+
+    @property
+    def is_linear(self) -> bool:
+        return self.options.rgb == "signed"
+
+    @property
+    def texture_options(self) -> TextureOptions:
+        return self.options
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Textures, AtlasLayout]:
         sizes = np.broadcast_to(np.asarray(self.start, np.int64), (gaussians.num, 2))
@@ -180,7 +176,7 @@ class Textured(Bucketed):
         return project_texels(params, self.options)
 
     def rates(self, rate: Any, params: Textures) -> Any:
-        """One for all texels, or `TexelRates`."""
+        """Return one rate for all texels, or those of `TexelRates`."""
         if not isinstance(rate, TexelRates):
             return rate
         is_single = [bucket.shape[1:3] == (1, 1) for bucket in params.buckets]
@@ -191,8 +187,10 @@ class Textured(Bucketed):
 
 
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:
-    """Alpha factors clamped to [0, 1]; RGB too where it is unsigned. Where alpha is divided by its maximum, nothing is
-    moved: what is shown is clipped instead."""
+    """Return textures with alpha factors clamped to [0, 1], and RGB too if it is unsigned.
+
+    If alpha is divided by its maximum, texels stay as they are: `shown_textures` clips them instead.
+    """
     if options.alpha == "global-maximum":
         return textures
     is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]

@@ -1,7 +1,7 @@
-"""Bilinear interpolation in a splat's texture: which texels a position lies between, and what they weigh.
+"""Bilinear interpolation in a splat's texture: the texels around a position, and their weights.
 
-The arithmetic of a texture lookup. Where a splat's texture is looked up says its appearance rule (`appearance.rule`);
-how textures of many sizes are stored, `texture`; `kernels.texels` does the same for vectors of pixels.
+This is the arithmetic of a texture lookup. The appearance rule (`appearance.rule`) gives the position; `texture` stores
+textures of many sizes; `rasterize.kernels.native.texels` does the same lookup for vectors of pixels.
 
 The textures of all splats lie in one array of texels [T, C], each a `TextureRegion` of it, row by row. Every function
 is element-wise: it takes scalars, or arrays that broadcast. (x, y) counts texels from the centre of the first one and
@@ -16,20 +16,21 @@ from jax import Array
 
 
 class TextureRegion(NamedTuple):
-    """Where the texture of a splat lies among all texels; int32."""
+    """Place of a splat's texture among all texels; int32."""
 
     first: Array
     """Index of its first texel."""
     height: Array
-    """In texels, as the width; both are 0 where the splat has no texture."""
+    """Height in texels; 0 without a texture."""
     width: Array
+    """Width in texels; 0 without a texture."""
 
 
 class Corner(NamedTuple):
     """One of the four texels around (x, y)."""
 
     texel: Array
-    """Its index among all texels."""
+    """Index among all texels."""
     weight: Array
     """Bilinear weight, in [0, 1]."""
     slope_x: Array
@@ -39,7 +40,7 @@ class Corner(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What a texture shows at (x, y): C values, and their derivatives."""
+    """C interpolated values at (x, y), and their derivatives."""
 
     values: tuple[Array, ...]
     """The C interpolated numbers."""
@@ -50,18 +51,18 @@ class Sample(NamedTuple):
 
 
 class Lookup(NamedTuple):
-    """What was read of a splat's texture, and where."""
+    """A sample of a splat's texture, and the texels it was read from."""
 
     region: TextureRegion
-    """Where the texture lies."""
+    """Place of the texture."""
     sample: Sample
-    """What it shows."""
+    """Interpolated values."""
     corners: tuple[Corner, ...] = ()
-    """The texels that were read; empty where their cotangents are found in another way."""
+    """Texels that were read; empty if the kernel finds their cotangents in another way."""
 
 
 def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
-    """The texels above left, above right, below left and below right of (x, y); of no weight where there is none."""
+    """Return the texels above left, above right, below left and below right of (x, y); weight 0 without a texture."""
     right_most, bottom_most = jnp.maximum(region.width - 1, 0), jnp.maximum(region.height - 1, 0)
     # Whatever x and y are, nothing outside of the texture is read.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
@@ -80,7 +81,7 @@ def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
 
 
 def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ...]) -> Sample:
-    """The sample, given the C numbers of each corner's texel."""
+    """Return the sample, given the C numbers of each corner's texel."""
 
     def weighed(weights):
         return tuple(
@@ -92,7 +93,7 @@ def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ..
 
 
 def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) -> Sample:
-    """The sample, or the values of a splat without a texture where the region has no texels."""
+    """Return the sample, or the values `empty` if the region has no texels."""
     if not empty:
         return sample
     values = zip(empty, sample.values, strict=True)
@@ -100,7 +101,7 @@ def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) ->
 
 
 def follow(sample: Sample, x: Array, y: Array) -> tuple[Array, ...]:
-    """The sample's values, with the derivatives that they have where (x, y) moves."""
+    """Return the sample's values, differentiable in (x, y)."""
     dx, dy = x - jax.lax.stop_gradient(x), y - jax.lax.stop_gradient(y)
     columns = zip(*sample, strict=True)
     return tuple(value + slope_x * dx + slope_y * dy for value, slope_x, slope_y in columns)

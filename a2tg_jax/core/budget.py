@@ -1,4 +1,4 @@
-"""Memory budgets: how one is written, how many Gaussians it has room for, and where its bytes bring most."""
+"""Memory budgets: parsing, the number of Gaussians that fit, and the choice of where to spend bytes."""
 
 import decimal
 import math
@@ -15,13 +15,13 @@ from a2tg_jax.host.text import shortened
 BYTES_PER_FLOAT = 4
 MEGABYTE = 10**6
 MEGABYTES = {"": "1", "kb": "1e-3", "mb": "1", "gb": "1e3"}
-"""Of each unit; a number without one is of megabytes."""
+"""Megabytes of each unit; a number without a unit is in megabytes."""
 LARGEST_SHORTFALL = 0.005
-"""A model that leaves a larger share of its budget unused is warned of."""
+"""Largest unused fraction of a budget without a warning."""
 
 
 def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> float | None:
-    """A budget in MB (10^6 bytes), from "1.5MB", "800 kB", "2GB" or a number of MB; None stays None.
+    """Return a budget in MB (10^6 bytes), from "1.5MB", "800 kB", "2GB" or a number of MB; None stays None.
 
     Raises:
       ValueError: if it is none of these, or not positive.
@@ -43,24 +43,24 @@ def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> flo
 
 
 def bytes_of(megabytes: float) -> int:
-    """Whole bytes of a budget."""
+    """Return the whole bytes of a budget in MB."""
     return round(megabytes * MEGABYTE)
 
 
 def bytes_per_gaussian(sh_degree: int, floats: float = 0) -> float:
-    """Bytes of a Gaussian that shows `floats` floats besides its own."""
+    """Return the bytes of a Gaussian with `floats` appearance parameters."""
     return BYTES_PER_FLOAT * (floats_per_gaussian(sh_degree) + floats)
 
 
 def number_to_reach(num: Array, cap: int, num_left: Any) -> Array:
-    """How many Gaussians an event leaves, so that the last of `num_left` like it, itself included, leaves `cap`.
+    """Return the number of Gaussians after an event, such that the last of `num_left` events reaches `cap`.
 
-    ⌈n·(cap/n)^(1/r)⌉: all of them grow by one factor. Traceable.
+    ⌈n·(cap/n)^(1/r)⌉: every event grows by the same factor. Traceable.
 
     Args:
-      num: n int32, how many there are, at most the cap.
-      cap: how many there shall be.
-      num_left: r int32, at least 1.
+      num: n int32, present number, at most the cap.
+      cap: number after the last event.
+      num_left: r int32, events left with this one, at least 1.
 
     Returns:
       int32.
@@ -73,15 +73,15 @@ def number_to_reach(num: Array, cap: int, num_left: Any) -> Array:
 
 
 def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget_bytes: float) -> np.ndarray:
-    """[N] who is chosen: in descending order of statistic per byte each that still fits into the budget.
+    """Return a mask [N] of the candidates chosen in descending order of statistic per byte while they fit.
 
-    What stays unspent is less than the cheapest candidate that was not chosen.
+    The unspent rest is less than the cheapest candidate that was not chosen.
 
     Args:
-      statistic: [N] of what is gained, at least 0.
-      can_grow: [N] the candidates.
+      statistic: [N] gain, at least 0.
+      can_grow: [N] mask of the candidates.
       cost: [N] bytes, positive for candidates.
-      budget_bytes: what may be spent.
+      budget_bytes: bytes to spend.
 
     Raises:
       ValueError: if the budget is negative.
@@ -93,8 +93,8 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
     gain = statistic[candidates].astype(np.float64) / cost[candidates]
     queue = candidates[np.argsort(-gain, kind="stable")]
     chosen = []
-    # Whatever fails once fails for good, for the rest of the budget only shrinks. So each round takes all up to the
-    # first that does not fit and drops everything dearer than the rest: one round per distinct cost at most.
+    # The rest of the budget only shrinks, so that a candidate that does not fit never will. Each round takes all up to
+    # the first misfit and drops everything dearer than the rest: at most one round per distinct cost.
     while len(queue):
         spent = np.cumsum(cost[queue])
         num = int(np.searchsorted(spent, budget, side="right"))
@@ -108,7 +108,7 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
 
 
 def event_budget(total_bytes: float, current_bytes: float, event_index: int, num_events: int) -> int:
-    """Bytes that event j of m may add: 1/(m - j + 1) of what is left of the memory budget, rounded down.
+    """Return the bytes that event j of m may add: 1/(m - j + 1) of the unspent memory budget, rounded down.
 
     Args:
       total_bytes: largest reported memory (`measure.metrics.parameter_bytes`).

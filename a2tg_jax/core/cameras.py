@@ -10,11 +10,11 @@ from jax import Array
 from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, short_repr
 
 LONGEST_SIDE = 100_000
-"""Pixels of the longer side of an image."""
+"""Largest longer side of an image, in pixels."""
 SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
-"""Focal lengths, in units of the longer side: an angle of view of 180° but for 0.1°, and one of 2 arc seconds."""
+"""Limits of focal lengths, in units of the longer side: angles of view of 179.9° and 2 arc seconds."""
 LARGEST_OFFSET = 100.0
-"""The principal point is at most so many longer sides away from the image's corner."""
+"""Largest distance of the principal point from the image's corner, in units of the longer side."""
 MAX_SKEW = 1e-2
 """Largest deviation of a rotation from an orthonormal matrix that still passes as rounding."""
 LARGEST_COORDINATE = LARGEST_NUMBER
@@ -45,7 +45,7 @@ class Camera:
 
 
 def check_camera(camera: Camera, name: str = "camera") -> None:
-    """Raises ValueError, naming the field, unless the matrices have their shapes and the image a size."""
+    """Raise ValueError, naming the field, unless the matrices have their shapes and the image a size."""
     if not isinstance(camera, Camera):
         raise ValueError(f"{name} must be a Camera; got {type(camera).__name__}")
     check_floats(f"{name}.viewmat", camera.viewmat, (4, 4))
@@ -57,16 +57,16 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
 
 
 def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, what: str) -> None:
-    """Refuses numbers of a camera, read from a file, that no camera has (host).
+    """Check the numbers of a camera that was read from a file (host).
 
     Args:
       viewmat: [4, 4].
       K: [3, 3] in pixels.
       width, height: of the image.
-      what: the camera, as the error names it.
+      what: name of the camera in the error.
 
     Raises:
-      ValueError: if a number is NaN, infinite, or outside the bounds that this module opens with.
+      ValueError: if a number is NaN, infinite, or outside the limits at the top of this module.
     """
     check_intrinsics(K, width, height, what)
     rotation = viewmat[:3, :3]
@@ -77,7 +77,7 @@ def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: in
 
 
 def check_intrinsics(K: np.ndarray, width: int, height: int, what: str) -> None:
-    """The part of `check_calibration` that is about the image and K. Raises as it does."""
+    """Check the image size and K as `check_calibration` does, with the same errors."""
     side = max(width, height)
     if not 1 <= min(width, height) <= side <= LONGEST_SIDE:
         raise ValueError(f"{what}: its image must have sides of 1..{LONGEST_SIDE} pixels; got {width}x{height}")
@@ -98,7 +98,7 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view sampled at another image size: K scales with each side (pixel edges stay edges)."""
+    """Return the same view at another image size: K scales with each side (pixel edges stay edges)."""
     dtype = camera.K.dtype
     factors = jnp.asarray([[width / camera.width], [height / camera.height], [1.0]], dtype)
     return Camera(camera.viewmat, camera.K * factors, width, height)

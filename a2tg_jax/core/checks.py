@@ -1,6 +1,6 @@
-"""Shapes and dtypes of arguments: checked with an error that names the argument, and written short.
+"""Checks of shapes and dtypes, with errors that name the argument; short texts for arrays.
 
-Only `shape` and `dtype` are looked at, so that tracers pass and nothing is computed.
+Checks read only `shape` and `dtype`, so that tracers pass and nothing is computed.
 """
 
 import dataclasses
@@ -12,17 +12,19 @@ import numpy as np
 LARGEST_NUMBER = 1e12
 """Largest magnitude of a number that geometry in float32 carries: products of it with focal lengths, and their
 squares, stay finite, and with them gradients, which overflow from 1e20 on."""
+FLOATS = ("float32", "float64")
+"""Names of the dtypes that models may have."""
 Wanted = tuple[int | str, ...]
-"""Sides of an array: numbers, or letters for any size, such as ("N", 16, 3)."""
+"""Sizes of the axes of an array: numbers, or letters for any size, such as ("N", 16, 3)."""
 
 
 def check_shape(name: str, x: Any, wanted: Wanted) -> None:
-    """Raises ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
+    """Raise ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
 
     Args:
-      name: of the argument, as the caller knows it.
+      name: name of the argument in the error.
       x: an array, a tracer, or nested sequences of numbers.
-      wanted: its sides.
+      wanted: sizes of its axes.
     """
     shape = np.shape(x)
     if len(shape) != len(wanted) or not _fits(shape, wanted):
@@ -30,19 +32,19 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
 
 
 def check_floats(name: str, x: Any, wanted: Wanted) -> None:
-    """As `check_shape`; x must also hold floats."""
+    """Raise ValueError unless x has the wanted shape, as in `check_shape`, and holds floats."""
     check_shape(name, x, wanted)
     if not jnp.issubdtype(dtype_of(x), jnp.floating):
         raise ValueError(f"{name} must be floats; got {dtype_of(x)}")
 
 
 def dtype_of(x: Any) -> Any:
-    """The dtype of an array, a tracer, or nested sequences of numbers."""
+    """Return the dtype of an array, a tracer, or nested sequences of numbers."""
     return x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
 
 
 def described(value: Any) -> str:
-    """A value in a few characters: arrays by dtype and shape, as in float32[7, 3]."""
+    """Describe a value in a few characters: arrays by dtype and shape, as in float32[7, 3]."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{value.dtype}{_written(value.shape)}"
     if type(value) is tuple:
@@ -51,7 +53,7 @@ def described(value: Any) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """The `repr` of a dataclass that holds arrays."""
+    """Return the `repr` of a dataclass that holds arrays."""
     fields = (f"{field.name}={described(getattr(value, field.name))}" for field in dataclasses.fields(value))
     return f"{type(value).__name__}({', '.join(fields)})"
 

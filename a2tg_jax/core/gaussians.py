@@ -43,12 +43,12 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree of their spherical harmonics, 0 to 3."""
+        """Highest degree of the spherical harmonics, 0 to 3."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     @property
     def floats_per_row(self) -> int:
-        """Floats of one Gaussian: 58 at degree 3, 13 at degree 0."""
+        """Number of floats of one Gaussian: 58 at degree 3, 13 at degree 0."""
         return floats_per_gaussian(self.sh_degree)
 
     @property
@@ -62,7 +62,7 @@ class Gaussians:
         return jax.nn.sigmoid(self.logit_opacities)
 
     def __getitem__(self, rows) -> "Gaussians":
-        """The Gaussians of the given rows (slice, mask or index array)."""
+        """Return the Gaussians of the given rows (slice, mask or index array)."""
         return jax.tree.map(lambda x: x[rows], self)
 
     def __repr__(self) -> str:
@@ -70,12 +70,12 @@ class Gaussians:
 
 
 def floats_per_gaussian(sh_degree: int = 3) -> int:
-    """Mean, rotation, scales, opacity, and the coefficients up to a degree."""
+    """Return the number of floats of mean, rotation, scales, opacity and coefficients up to a degree."""
     return 10 + 3 * NUM_BASES[sh_degree]
 
 
 def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
-    """Raises ValueError, naming the field, unless all fields have their shapes and one float dtype."""
+    """Raise ValueError, naming the field, unless all fields have their shapes and one float dtype."""
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
     check_floats(f"{name}.means", gaussians.means, ("N", 3))
@@ -90,7 +90,7 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
 
 
 def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
-    """The columns of the rotation of a quaternion (w, x, y, z), which is normalised first; element-wise."""
+    """Return the columns of the rotation of a quaternion (w, x, y, z), which is normalised first; element-wise."""
     w, x, y, z = quat
     norm = safe_sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = (safe_divide(number, norm) for number in quat)
@@ -102,31 +102,31 @@ def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
 
 
 def rotation_matrices(quats: Array) -> Array:
-    """Rotation matrices [..., 3, 3] of the quaternions [..., 4] (wxyz), which are normalised first."""
+    """Return the rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), which are normalised first."""
     columns = rotation_columns(tuple(jnp.moveaxis(quats, -1, 0)))
     return jnp.stack([jnp.stack(column, -1) for column in columns], -1)
 
 
 def logit(p: Array) -> Array:
-    """log(p / (1 - p)) for p in (0, 1)."""
+    """Return log(p / (1 - p)) for p in (0, 1)."""
     return jnp.log(p) - jnp.log1p(-p)
 
 
 def init_from_points(
     points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY, sh_degree: int = 3
 ) -> Gaussians:
-    """Initial Gaussians from points of a sparse reconstruction.
+    """Make initial Gaussians from the points of a sparse reconstruction.
 
-    log-scale = log of the root mean square distance to the 3 nearest neighbours (both axes), uniformly random
-    rotations, one opacity, SH degree 0 from the point's colour, higher degrees 0.
+    Both log-scales are the logarithm of the root mean square distance to the 3 nearest neighbours. Rotations are
+    uniformly random. SH of degree 0 come from the point's colour, higher degrees are 0.
 
     Args:
       points: [P, 3] positions, P >= 2.
       colors: [P, 3] colours in [0, 1].
-      num: how many Gaussians; None or anything >= P takes all the points, less draws that many without replacement.
-      seed: of the drawing and of the rotations.
-      opacity: of every Gaussian, between 0 and 1.
-      sh_degree: highest degree of spherical harmonics that they have coefficients of, 0 to 3.
+      num: number of Gaussians, at least 2; fewer than P are drawn without replacement, None takes all points.
+      seed: seed of the drawing and the rotations.
+      opacity: initial opacity, between 0 and 1.
+      sh_degree: highest degree of spherical harmonics, 0 to 3.
 
     Returns:
       float32 Gaussians, min(num, P) of them.

@@ -16,11 +16,11 @@ from a2tg_jax.core.gaussians import Gaussians, rotation_columns
 
 POLYGON_SIDES = 8
 BOUND_SLACK = 1e-2
-"""Squared pixels added to every bound, for rounding."""
+"""Margin of every bound for rounding, in squared pixels."""
 
 
 def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
-    """M [N, 3, 3] of each splat, and its normals [N, 3] in the world, turned to face the camera."""
+    """Return M [N, 3, 3] and normals [N, 3] in the world, turned to face the camera."""
     # Number by number: CPUs vectorise over N, and hardly over axes of 2 and 3.
     x_axis, y_axis, normal = rotation_columns(tuple(gaussians.quats[:, k] for k in range(4)))
     mean = tuple(gaussians.means[:, k] for k in range(3))
@@ -37,42 +37,46 @@ def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
 
 
 class Outline(NamedTuple):
-    """What a splat can show lies in an ellipse, or in a circle around its mean: the low-pass filter's reach."""
+    """Outline of all that a splat shows: an ellipse, or a circle around the mean, which the low-pass filter reaches."""
 
     ellipse_x: Array
     """Centre of the ellipse, in pixels."""
     ellipse_y: Array
+    """Vertical coordinate of that centre."""
     xx: Array
-    """The matrix S = [[xx, xy], [xy, yy]] with (x − e)ᵀS⁻¹(x − e) <= 1 inside the ellipse."""
+    """Entry of the matrix S = [[xx, xy], [xy, yy]], with (x − e)ᵀS⁻¹(x − e) <= 1 inside the ellipse."""
     xy: Array
+    """Entry of S off the diagonal."""
     yy: Array
+    """Second diagonal entry of S."""
     mean_x: Array
     """Centre of the circle: the projected mean."""
     mean_y: Array
+    """Vertical coordinate of that centre."""
     radius: Array
     """Radius of the circle, in pixels."""
     is_clipped: Array
-    """The disc reaches behind the near plane: this is no outline, only the box holds."""
+    """Whether the disc reaches behind the near plane: only the box is then valid."""
 
 
 class ScreenBounds(NamedTuple):
-    """Where splats can reach 1/255, in pixels, conservatively; [N] each."""
+    """Conservative boxes of pixels in which splats can reach 1/255; [N] each."""
 
     left: Array
     top: Array
     right: Array
-    """Less than `left` where the splat is invisible, as `bottom` is then less than `top`."""
+    """Right edge; less than `left` if the splat is invisible, as `bottom` is then less than `top`."""
     bottom: Array
     outline: Outline
 
 
 def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
-    """Bounds of the discs u² + v² <= cutoff seen on the screen, joined with the low-pass filter's reach.
+    """Return the bounds on the screen of the discs u² + v² <= cutoff, joined with the low-pass filter's reach.
 
     Args:
       M: [N, 3, 3] homographies.
-      cutoff: [N] r² = 2·ln(255·o·max T_A); a splat with r² <= 0 shows nowhere.
-      near_plane: depths below it are not hit.
+      cutoff: [N] r² = 2·ln(255·o·max T_A); a splat with r² <= 0 is invisible.
+      near_plane: least depth of a hit.
     """
     rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
     bounds = unclipped_bounds(rows, cutoff, near_plane)
@@ -83,7 +87,7 @@ def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
 
 
 def unclipped_bounds(M, cutoff: Array, near_plane: float) -> ScreenBounds:
-    """As `screen_bounds`, of rows M[i][k]; element-wise. Where the outline is clipped the box means nothing.
+    """Return `screen_bounds` of rows M[i][k]; element-wise. If the outline is clipped, the box is meaningless.
 
     M is shifted to the projected mean, which keeps float32 exact to a fraction of a pixel.
     """
@@ -114,9 +118,9 @@ def unclipped_bounds(M, cutoff: Array, near_plane: float) -> ScreenBounds:
 
 
 def clipped_box(M, outline: Outline, cutoff: Array, near_plane: float) -> tuple[Array, Array, Array, Array]:
-    """Left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise.
+    """Return left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise.
 
-    It means something where the outline is clipped.
+    The result is valid only if the outline is clipped.
     """
     angles = np.arange(POLYGON_SIDES) * (2 * np.pi / POLYGON_SIDES)
     reach = jnp.sqrt(jnp.maximum(cutoff, 0.0)) / math.cos(math.pi / POLYGON_SIDES)

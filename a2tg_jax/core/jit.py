@@ -1,8 +1,8 @@
-"""Programs that know the classes of what they are given.
+"""A `jit` that tells programs apart by the classes of their arguments.
 
-JAX (0.10 to 0.12) holds the tree structures of two registered dataclasses for equal where only the classes differ: a
-rule and another that overrides its `shade`, say. Their hashes differ, but `jax.jit` looks, before it compares, at seven
-bits of them, so that one such pair in 128 would run each other's program.
+JAX (0.10 to 0.12) considers the tree structures of two registered dataclasses equal if only their classes differ, such
+as a rule and a subclass that overrides `shade`. Their hashes differ, but `jax.jit` compares only seven bits of them, so
+that one such pair in 128 would run each other's program.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import jax
 
 
 def classes_of(tree: Any) -> tuple[type, ...]:
-    """The classes of a pytree's inner nodes, outermost first."""
+    """Return the classes of a pytree's inner nodes, outermost first."""
     classes: list[type] = []
     ahead: list[Any] = [jax.tree.structure(tree)]
     while ahead:
@@ -24,7 +24,7 @@ def classes_of(tree: Any) -> tuple[type, ...]:
 
 
 class jit:
-    """`jax.jit` of a function, compiled anew for other classes among its arguments."""
+    """`jax.jit` of a function, compiled anew for other classes of arguments."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class jit:
         def of_classes(classes, /, *args, **kwargs):
             return function(*args, **kwargs)
 
-        of_classes.__name__ = of_classes.__qualname__ = function.__name__  # which profiles and compiled programs bear
+        of_classes.__name__ = of_classes.__qualname__ = function.__name__  # shown in profiles
         self._jitted: Any = jax.jit(
             of_classes,
             static_argnums=(0, *(number + 1 for number in static_argnums)),
@@ -47,9 +47,9 @@ class jit:
         return self._jitted(classes_of((args, kwargs)), *args, **kwargs)
 
     def num_compiled(self) -> int:
-        """Programs that this process holds for it."""
+        """Return the number of compiled programs of this function in this process."""
         return self._jitted._cache_size()
 
     def clear_cache(self) -> None:
-        """Forgets them."""
+        """Forget the compiled programs."""
         self._jitted.clear_cache()

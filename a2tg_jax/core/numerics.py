@@ -1,6 +1,6 @@
-"""Safe division, roots and norms: each with the value and the gradient it has where the plain formula has none.
+"""Safe division, roots and norms, with finite values and gradients where the plain formulas have none.
 
-And the broadcast from splats to pixels, with a gradient that CPUs compute fast.
+Also the broadcast from splats to pixels, with a gradient that CPUs compute fast.
 """
 
 import functools
@@ -11,37 +11,40 @@ from jax import Array
 
 
 def safe_divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> Array:
-    """numerator / denominator, and `fallback` with zero gradient where the denominator is 0."""
+    """Return numerator / denominator, or `fallback` with zero gradient where the denominator is 0."""
     is_zero = denominator == 0
     quotient = numerator / jnp.where(is_zero, 1.0, denominator)
     return jnp.where(is_zero, fallback, quotient)
 
 
 def safe_sqrt(x: Array) -> Array:
-    """sqrt(max(x, 0)), with zero gradient where x <= 0."""
+    """Return sqrt(max(x, 0)), with zero gradient where x <= 0."""
     is_positive = ~(x <= 0)  # NaN stays NaN
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
-    """Euclidean norm along `axis`, with zero gradient at the origin."""
+    """Return the Euclidean norm along `axis`, with zero gradient at the origin."""
     return safe_sqrt(jnp.sum(x * x, axis=axis, keepdims=keepdims))
 
 
 def normalize(x: Array, axis: int = -1) -> Array:
-    """x / |x| along `axis`; the zero vector stays zero, with zero gradient."""
+    """Return x / |x| along `axis`; the zero vector stays zero, with zero gradient."""
     return safe_divide(x, jnp.broadcast_to(safe_norm(x, axis, keepdims=True), x.shape))
 
 
 def pixel_sum(x: Array) -> Array:
-    """[..., P] summed over the last axis. A product with ones is vectorised everywhere; a reduction on CPUs is not,
-    and would be fused with what it sums, which is then computed one pixel at a time."""
+    """Return x [..., P] summed over the last axis.
+
+    A product with ones is vectorised everywhere. CPUs do not vectorise a reduction; they fuse it with its operand,
+    which is then computed one pixel at a time.
+    """
     return jnp.dot(x, jnp.ones(x.shape[-1], x.dtype), precision=jax.lax.Precision.HIGHEST)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def spread(x: Array, num: int) -> Array:
-    """x [...] broadcast over a new last axis of `num` pixels; its gradient is a `pixel_sum`."""
+    """Broadcast x [...] over a new last axis of `num` pixels; the gradient is a `pixel_sum`."""
     return jnp.broadcast_to(x[..., None], (*x.shape, num))
 
 

@@ -1,6 +1,6 @@
 """Adam and its schedules, in jaxopt's style: pure functions that take and return (params, state).
 
-jaxopt has no Adam of its own. The only module that imports jaxopt.
+jaxopt has no Adam of its own. No other module imports jaxopt.
 """
 
 import dataclasses
@@ -24,18 +24,18 @@ with warnings.catch_warnings():
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class AdamState:
-    """Adam's memory; `mu` and `nu` have the structure, shapes and dtypes of the parameters."""
+    """State of Adam; `mu` and `nu` have the structure, shapes and dtypes of the parameters."""
 
     mu: Any
     """Decayed mean of the gradients."""
     nu: Any
     """Decayed mean of the squared gradients."""
     count: Array
-    """int32, updates made so far."""
+    """int32 number of updates so far."""
 
 
 def adam_init(params) -> AdamState:
-    """The state before the first update: zero moments.
+    """Return the state before the first update: zero moments.
 
     Args:
       params: any pytree of float arrays.
@@ -47,12 +47,12 @@ def adam_init(params) -> AdamState:
 def adam_update(
     params, grads, state: AdamState, rates, *, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
 ) -> OptStep:
-    """One update of Adam (Kingma & Ba, 2015), bias-corrected; ε is added after the correction, as in PyTorch.
+    """Make one update of Adam (Kingma & Ba, 2015), bias-corrected; ε is added after the correction, as in PyTorch.
 
     Args:
       params: pytree of float arrays.
       grads: the same pytree of gradients.
-      state: from `adam_init` or the update before.
+      state: state from `adam_init` or the previous update.
       rates: learning rates, a pytree prefix of `params`: one for all, or one per field. A rate is a scalar or an
         array that broadcasts against its leaf at equal rank ([1, K, 1] sets one per spherical harmonic).
       b1: decay of the first moment, in [0, 1).
@@ -83,12 +83,12 @@ def adam_update(
 
 
 def exponential_decay(start: float, final_factor: float, iteration: Array | int, total: int) -> Array:
-    """start · final_factor^(iteration / total): from `start` at iteration 0, log-linear, then constant.
+    """Return start · final_factor^(iteration / total): from `start` at iteration 0, log-linear, then constant.
 
     Args:
-      start: the rate at the beginning, in units of the parameter per step.
-      final_factor: the rate at `total` over that at 0, positive.
-      iteration: may be traced.
+      start: rate at iteration 0, in units of the parameter per step.
+      final_factor: rate at `total` divided by that at 0, positive.
+      iteration: current iteration; may be traced.
       total: iterations of the stage, at least 1.
 
     Returns:
@@ -99,7 +99,7 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
 
 
 def _check_like(name: str, tree, params) -> None:
-    """Raises ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
+    """Raise ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
     found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
     if found != wanted:
         raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
@@ -109,5 +109,5 @@ def _check_like(name: str, tree, params) -> None:
 
 
 def _bias_correction(decay: float, count: Array, dtype) -> Array:
-    """1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
+    """Return 1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
     return -jnp.expm1(count.astype(dtype) * math.log(decay))

@@ -1,6 +1,6 @@
-"""Where a model was trained: its cameras, the way to the original world, and what was behind the splats.
+"""The origin of a model: its training cameras, the transform from the original world, and the background.
 
-With it a model is rendered, flown past and moved without the photographs.
+With an origin, a model can be rendered, flown past and moved without the photographs.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ WHITE: Color = (1.0, 1.0, 1.0)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Origin:
-    """V cameras and the world they stand in. On the host; equal, and of one hash, where all numbers are."""
+    """V cameras and their world, on the host. Two origins are equal if all their numbers are."""
 
     viewmats: np.ndarray
     """[V, 4, 4] float64, world to camera."""
@@ -29,16 +29,16 @@ class Origin:
     sizes: np.ndarray
     """[V, 2] integers (width, height)."""
     names: tuple[str, ...]
-    """Of the photographs."""
+    """Names of the photographs."""
     is_test: np.ndarray
-    """[V] bool: the photograph was kept for testing."""
+    """[V] whether the photograph was held out for testing."""
     transform: Similarity
-    """Leads from the original world to the one of the cameras."""
+    """Transform from the original world to that of the cameras."""
     background: Color = BLACK
-    """RGB behind everything when the model is looked at."""
+    """RGB behind all splats."""
     corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """[V, ...] what was learned of each photograph besides (`corrections`), by the correction's name, in the world of
-    the training; `viewmats` are corrected by it already."""
+    """[V, ...] learned values of each photograph (`training.corrections`), by the correction's name, in the world of
+    the training. `viewmats` are corrected already."""
 
     @staticmethod
     def of_cameras(
@@ -49,7 +49,7 @@ class Origin:
         transform: Similarity | None = None,
         background: Color = BLACK,
     ) -> "Origin":
-        """Any cameras; where nothing else is said named by number, none for testing, in their original world."""
+        """Make an origin of cameras; by default named by number, none held out, in their original world."""
         num = len(cameras)
         return Origin(
             viewmats=np.array([camera.viewmat for camera in cameras], np.float64).reshape(num, 4, 4),
@@ -63,14 +63,14 @@ class Origin:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The cameras, float32."""
+        """Cameras in float32."""
         return [
             Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), int(width), int(height))
             for viewmat, K, (width, height) in zip(self.viewmats, self.Ks, self.sizes, strict=True)
         ]
 
     def moved(self, similarity: Similarity) -> "Origin":
-        """The same cameras in the world that `similarity` leads to; corrections, which are in them, are forgotten."""
+        """Return the same cameras in the world that `similarity` leads to, without the corrections they contain."""
         viewmats = [similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]
         return dataclasses.replace(
             self,

@@ -1,4 +1,4 @@
-"""Smooth camera paths: past the cameras of a scene, or through views that someone chose."""
+"""Smooth camera paths: past the cameras of a scene, or through chosen views."""
 
 from collections.abc import Sequence
 
@@ -12,16 +12,16 @@ from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.similarity import camera_centers
 
 SMOOTHING = 0.06
-"""Standard deviation of the smoothing, as a share of the path."""
+"""Standard deviation of the smoothing, as a fraction of the path."""
 TURN_WEIGHT = 0.5
-"""How much a change of viewing direction counts against a change of place when the cameras are put in order."""
+"""Weight of a change of direction relative to a change of position when cameras are ordered."""
 
 
 def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
-    """Cameras that fly past the given ones, of constant speed, smooth in position and direction.
+    """Return a flight past the given cameras at constant speed, smooth in position and direction.
 
-    The cameras are visited in a short tour; positions, viewing directions and down vectors are then smoothed along it,
-    so the path stays where photographs were taken and the scene is well known.
+    The cameras are visited in a short tour. Positions, viewing directions and down vectors are smoothed along it, so
+    that the path stays where photographs were taken.
 
     Args:
       cameras: at least two; the first one's intrinsics and image size are used throughout.
@@ -46,7 +46,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
 
 
 def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
-    """Cameras of a smooth flight through some views, in their order, of constant speed between two of them.
+    """Return a smooth flight through views in their order, at constant speed between two of them.
 
     Positions follow a cubic spline; directions turn evenly, and intrinsics change evenly, from view to view.
 
@@ -66,7 +66,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     viewmats = np.stack([np.asarray(view.viewmat, np.float64) for view in views])
     rotations = Rotation.from_matrix(viewmats[:, :3, :3])
     centers = camera_centers(viewmats)
-    # As much time as the way and the turn take, so that one does not run through a view.
+    # Time grows with distance and turn, so that the flight does not rush through a view.
     ways = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
     steps = ways / max(ways.mean(), 1e-12) + turns / max(turns.mean(), 1e-12)
@@ -83,7 +83,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
 
 
 def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:
-    """An order of the cameras that goes to the nearest unvisited one, starting at an end of the set."""
+    """Return an order of the cameras that always goes to the nearest unvisited one, from an end of the set."""
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
     features = np.concatenate([centers / spread, TURN_WEIGHT * forwards], axis=1)
     start = int(np.linalg.norm(features - features.mean(axis=0), axis=1).argmax())
@@ -97,7 +97,7 @@ def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:
 
 
 def _smoothed(knots: np.ndarray, num_frames: int) -> np.ndarray:
-    """[num_frames, C] points at constant speed on a smoothed polyline through [n, C] knots (positions first)."""
+    """Return points [num_frames, C] at constant speed on a smoothed polyline through knots [n, C] (positions first)."""
     steps = np.linalg.norm(np.diff(knots[:, :3], axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])
     fine = max(20 * num_frames, 1000)
@@ -110,7 +110,7 @@ def _smoothed(knots: np.ndarray, num_frames: int) -> np.ndarray:
 
 
 def _look(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """World-to-camera matrix [4, 4] at `center`, z along `forward`, y as near to `down` as it can be."""
+    """Return the world-to-camera matrix [4, 4] at `center`, with z along `forward` and y closest to `down`."""
     z = forward / np.linalg.norm(forward)
     x = np.cross(down, z)
     x /= np.linalg.norm(x)
@@ -118,7 +118,7 @@ def _look(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarr
 
 
 def _viewmat(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """World-to-camera matrix [4, 4] of a camera's axes, as rows, and its place."""
+    """Return the world-to-camera matrix [4, 4] of a camera's axes, as rows, and its position."""
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
     return viewmat

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 
 SMALL = 1e-2
-"""Squared angle below which series are exact to 14 digits."""
+"""Squared angle below which the series are exact to 14 digits."""
 
 
 def rotation_exp(rotvec: Array) -> Array:
-    """R [3, 3] = I + (sin θ/θ)·W + ((1 − cos θ)/θ²)·W², exactly I for 0, with derivatives of any order there."""
+    """Return R [3, 3] = I + (sin θ/θ)·W + ((1 − cos θ)/θ²)·W², exactly I for 0, with derivatives of any order there."""
     squared = jnp.sum(rotvec * rotvec)
     is_small = squared < SMALL
     safe = jnp.where(is_small, 1.0, squared)
@@ -27,13 +27,13 @@ def rotation_exp(rotvec: Array) -> Array:
 
 
 def moved_viewmat(twist: Array, viewmat: Array) -> Array:
-    """World to camera [4, 4], and after it a twist [6] in the camera's own frame: it turns about its centre."""
+    """Return world to camera [4, 4] followed by a twist [6] in the camera's frame, about its centre."""
     rotation = rotation_exp(twist[:3])
     rows = jnp.sum(rotation[:, :, None] * viewmat[None, :3], axis=1)
     return viewmat.at[:3].set(rows.at[:, 3].add(twist[3:]))
 
 
 def _series(x: Array, *denominators: int) -> Array:
-    """1/a − x/b + x²/c − x³/d."""
+    """Return 1/a − x/b + x²/c − x³/d."""
     a, b, c, d = (1 / number for number in denominators)
     return a - x * (b - x * (c - x * d))

@@ -9,11 +9,11 @@ from jax import Array
 from a2tg_jax.core.numerics import normalize
 
 NUM_BASES = (1, 4, 9, 16)
-"""Of degrees 0 to the index."""
+"""Number of bases of degrees 0 to the index."""
 
 
 def sh_basis(directions: Array) -> Array:
-    """The 16 basis functions [..., 16] at unit directions [..., 3]."""
+    """Return the 16 basis functions [..., 16] at unit directions [..., 3]."""
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     xx, yy, zz = x * x, y * y, z * z
     return jnp.stack(
@@ -40,13 +40,13 @@ def sh_basis(directions: Array) -> Array:
 
 
 def degree_mask(degree) -> Array:
-    """[16] booleans: the bases up to `degree`, which may be traced."""
+    """Return a mask [16] of the bases up to `degree`, which may be traced."""
     degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
     return degrees <= jnp.asarray(degree, jnp.int32)
 
 
 def sh_sum(sh: Array, means: Array, center: Array, degree) -> Array:
-    """View-dependent sums [N, 3], Σ Y_l·sh_l; colours are max(sum + 0.5, 0).
+    """Return the view-dependent sums [N, 3], Σ Y_l·sh_l; colours are max(sum + 0.5, 0).
 
     Args:
       sh: [N, K, 3] coefficients, K being 1, 4, 9 or 16.

@@ -10,7 +10,7 @@ from a2tg_jax.core.checks import LARGEST_NUMBER
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Similarity:
-    """x' = scale·rotation·x + translation, from the original world to the normalised one (or back, `inverse`)."""
+    """Map x' = scale·rotation·x + translation, from the original world to the normalised one (or back, `inverse`)."""
 
     scale: float
     """Positive factor of lengths."""
@@ -20,11 +20,11 @@ class Similarity:
     """[3], in units of the new world."""
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Positions [..., 3] of the old world in the new one; `scale` multiplies lengths, `rotation` directions."""
+        """Return positions [..., 3] in the new world; `scale` multiplies lengths, `rotation` directions."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
     def apply_to_viewmat(self, viewmat: np.ndarray) -> np.ndarray:
-        """World-to-camera matrix [4, 4] of the new world for one of the old; again a rigid motion.
+        """Return the world-to-camera matrix [4, 4] of the new world for one of the old; again a rigid motion.
 
         The camera frame is scaled along with the world, which no pinhole camera notices:
         s·(Rc·x + t) = (Rc·Rᵀ)·x' + (s·t - Rc·Rᵀ·translation).
@@ -35,16 +35,16 @@ class Similarity:
         return moved
 
     def then(self, other: "Similarity") -> "Similarity":
-        """This similarity, and after it another."""
+        """Return this similarity followed by another."""
         return Similarity(self.scale * other.scale, other.rotation @ self.rotation, other.apply(self.translation))
 
     def inverse(self) -> "Similarity":
-        """The way back: brings results (points, lengths, directions, cameras) to the original world."""
+        """Return the inverse, which maps points, lengths, directions and cameras to the original world."""
         return Similarity(1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
 
 
 def check_similarity(similarity: Similarity, what: str) -> None:
-    """Raises ValueError, calling it `what`, unless its scale is positive, its rotation is one, and all is finite."""
+    """Raise ValueError, naming it `what`, unless scale is positive, rotation is a rotation, and all is finite."""
     scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
     if not (1 / LARGEST_NUMBER <= scale <= LARGEST_NUMBER and (np.abs(translation) <= LARGEST_NUMBER).all()):
         raise ValueError(
@@ -57,5 +57,5 @@ def check_similarity(similarity: Similarity, what: str) -> None:
 
 
 def camera_centers(viewmats: np.ndarray) -> np.ndarray:
-    """Positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
+    """Return the positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
     return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])

@@ -1,8 +1,7 @@
 """Gaussians carried from one world to another by a similarity x' = scale·R·x + translation.
 
 Real spherical harmonics of one degree turn among themselves, so their rotation is one small matrix per degree.
-It is found by evaluating the basis itself at fixed directions: it then agrees with the renderer's basis whatever
-the signs and the order in which that lists its functions.
+It is fitted to the basis itself at fixed directions, so that it agrees with the renderer's signs and order.
 """
 
 import jax
@@ -19,13 +18,13 @@ SH_DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
-    """The same Gaussians in the world that `similarity` leads to (host).
+    """Return the same Gaussians in the world that `similarity` leads to (host).
 
     A camera carried along sees the same image: means and scales follow the similarity, quaternions and SH its rotation.
 
     Args:
       gaussians: N Gaussians.
-      similarity: maps their world to the new one.
+      similarity: map from their world to the new one.
 
     Returns:
       N Gaussians of the same dtype; the quaternions are unit.
@@ -51,7 +50,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
 
 
 def sh_rotation(rotation: np.ndarray) -> np.ndarray:
-    """The matrix D [16, 16] with Σ_k Y_k(R d)·(D c)_k = Σ_k Y_k(d)·c_k for every direction d and coefficients c.
+    """Return the matrix D [16, 16] with Σ_k Y_k(R d)·(D c)_k = Σ_k Y_k(d)·c_k for every direction d and coefficients c.
 
     Args:
       rotation: R, [3, 3].
@@ -68,7 +67,7 @@ def sh_rotation(rotation: np.ndarray) -> np.ndarray:
 
 
 def _fixed_directions() -> np.ndarray:
-    """[NUM_DIRECTIONS, 3] unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
+    """Return unit vectors [NUM_DIRECTIONS, 3] spread evenly over the sphere (a Fibonacci lattice)."""
     index = np.arange(NUM_DIRECTIONS) + 0.5
     z, angle = 1 - 2 * index / NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * index
     radius = np.sqrt(1 - z * z)
@@ -76,6 +75,6 @@ def _fixed_directions() -> np.ndarray:
 
 
 def _basis(directions: np.ndarray) -> np.ndarray:
-    """The renderer's basis [P, 16] in float64."""
+    """Return the renderer's basis [P, 16] in float64."""
     with jax.enable_x64(True):
         return np.asarray(sh_basis(jnp.asarray(directions)))

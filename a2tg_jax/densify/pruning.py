@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Banded, GivenColors
+from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import jit
 from a2tg_jax.core.optim import AdamState
@@ -52,7 +52,7 @@ class Prune(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
-        if isinstance(model.appearance, Banded):
+        if model.appearance.has_degrees:
             raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
         num, left = model.num, self._num_left(model.num)
         order = np.argsort(-blending_weights(model, due.views)[:num], kind="stable")

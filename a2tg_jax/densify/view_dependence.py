@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Banded
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE, BandLayout, Bands, floats_of_band, reallocate_bands
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_of, event_budget, within_budget
 from a2tg_jax.core.numerics import normalize
@@ -93,17 +92,15 @@ class AdaptDegrees(HostEvent):
         return state.observe(model.gaussians.means, centers, seen.colors)
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: ViewDependence) -> Change:
-        if not isinstance(model.appearance, Banded):
+        if model.bands is None:
             raise ValueError(f"{type(model.appearance).__name__} has no degrees that could rise; Banded has")
-        bands, layout, num = model.params.bands, model.layout.bands, model.num
+        (bands, layout), num = model.bands, model.num
         degrees = without_idle(bands, layout, self.idle)
         used = model.num_bytes - saved_bytes(layout, degrees, num)
         budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
         degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget, self.highest)
         bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
-        model = dataclasses.replace(
-            model, params=model.params._replace(bands=bands), layout=model.layout._replace(bands=layout)
-        )
+        model = model.with_bands(bands, layout)
         return Change(model, moments, self.init(model))
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Banded, GivenColors, Plain, Textured
+from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import jit
 from a2tg_jax.core.optim import solve_cg
@@ -134,7 +134,7 @@ def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Ar
 
 def colors_of(model: Model) -> Colors:
     """Return the colours, in which a picture of the model is linear."""
-    bands = model.params.bands if isinstance(model.appearance, Banded) else ()
+    bands = () if model.bands is None else model.bands[0]
     buckets = model.textures[0].buckets if model.textures else ()
     return Colors(model.gaussians.sh, bands, tuple(bucket[..., :3] for bucket in buckets))
 
@@ -142,8 +142,9 @@ def colors_of(model: Model) -> Colors:
 def with_colors(model: Model, colors: Colors) -> Model:
     """Return the model with other colours; alpha textures stay."""
     gaussians = dataclasses.replace(model.gaussians, sh=colors.sh)
-    params = model.params._replace(bands=colors.bands) if isinstance(model.appearance, Banded) else model.params
-    model = dataclasses.replace(model, gaussians=gaussians, params=params)
+    model = dataclasses.replace(model, gaussians=gaussians)
+    if model.bands is not None:
+        model = model.with_bands(colors.bands, model.bands[1])
     if model.textures is None:
         return model
     textures, layout = model.textures
@@ -154,12 +155,11 @@ def with_colors(model: Model, colors: Colors) -> Model:
 def _check(model: Model, views: Sequence[View]) -> None:
     if not views:
         raise ValueError("views must hold at least one view; got none")
-    inner = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
-    is_linear = isinstance(inner, Plain) or (isinstance(inner, Textured) and inner.options.rgb == "signed")
-    if not is_linear:
+    if not model.appearance.is_linear:
+        kind = type(model.appearance.base).__name__
         raise ValueError(
-            f"a picture is not linear in what {type(inner).__name__} shows: Plain, Textured with signed RGB, or Banded "
-            "around one of these can be polished"
+            f"a picture is not linear in what {kind} shows: Plain, Textured with signed RGB, or Banded around one of "
+            "these can be polished"
         )
 
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Banded, Textured
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.jit import jit
@@ -66,11 +65,12 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
         raise ValueError("views must hold at least one view; got none")
     if not max_loss >= 0:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
-    inner = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
-    if type(inner) is not Textured or inner.options.rgb != "signed" or inner.options.alpha != "projected":
+    appearance = model.appearance
+    options = appearance.texture_options if appearance.is_portable else None
+    if options is None or options.rgb != "signed" or options.alpha != "projected":
         raise ValueError(
-            f"{type(inner).__name__} has no textures that can shrink: Textured with signed RGB and projected alpha, or "
-            "Banded around it, has"
+            f"{type(appearance.base).__name__} has no textures that can shrink: Textured with signed RGB and projected "
+            "alpha, or Banded around it, has"
         )
 
 

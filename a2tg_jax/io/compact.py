@@ -19,7 +19,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from a2tg_jax.appearance import Banded
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
@@ -216,7 +215,7 @@ def _decoded(data: bytes) -> Model:
     appearance = appearance_from_dict(header["appearance"], ())
     check_kind(appearance)
     reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
-    rows = _rows_of(reader, header, choices)
+    rows = _rows_of(reader, header, choices, appearance.has_degrees)
     origin = _origin_of(reader, header["origin"]) if "origin" in header else None
     reader.end()
     return model_of(rows, header["base_degree"], appearance, origin)
@@ -245,7 +244,7 @@ def _room(data: bytes) -> int:
     return FREE_ROOM + LARGEST_RATIO * len(data)
 
 
-def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices) -> Rows:
+def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices, has_degrees: bool) -> Rows:
     """Return the tables of a file, of no more rows than it can hold."""
     num, base, table = header["num"], header["base_degree"], header["degrees"]
     if type(num) is not int or num < 0 or type(base) is not int or not 0 <= base <= MAX_DEGREE:
@@ -254,8 +253,7 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices)
     log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
     quats = with_w(reader.numbers("quats", 3, num, choices.quats))
     opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
-    is_banded = header["appearance"]["name"] == Banded.__name__
-    highest = MAX_DEGREE if is_banded else base
+    highest = MAX_DEGREE if has_degrees else base
     if not set(table) <= set(range(base, highest + 1)):
         raise ValueError(f"degrees must lie in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]

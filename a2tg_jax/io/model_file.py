@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import appearance as built_in
-from a2tg_jax.appearance import Appearance, Plain, Textured
+from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Origin
@@ -97,7 +97,7 @@ def _model_of(
         appearance = appearance_from_dict(header["appearance"], appearances)
     else:
         shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
-        appearance = Textured() if shown else Plain()
+        appearance = appearance_for(TextureOptions(), has_textures=bool(shown))
     params, layout = appearance.from_arrays(shown)
     of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
     origin = origin_of(header["origin"], of_origin) if "origin" in header else None

@@ -18,7 +18,6 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, Banded
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
@@ -99,17 +98,11 @@ def save_ply(
 def _as_plain(model: Model) -> Gaussians:
     """Return the Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
     shown = model.gaussians, model.params, model.layout
-    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.appearance.sh(*shown)))
-    if has_own_opacities(model.appearance):
+    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
+    if model.appearance.has_own_opacities:
         return gaussians
     opacities = jnp.clip(model.appearance.opacities(*shown), LEAST_OPACITY, LARGEST_OPACITY)
     return dataclasses.replace(gaussians, logit_opacities=logit(opacities))
-
-
-def has_own_opacities(appearance: Appearance) -> bool:
-    """Return whether splats are as opaque as their Gaussians say."""
-    inner = appearance.inner if isinstance(appearance, Banded) else appearance
-    return type(inner).opacities is Appearance.opacities
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:

@@ -9,7 +9,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, Banded, Plain, Textured
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
@@ -45,15 +45,11 @@ class Rows:
 
 def check_kind(appearance: Appearance) -> None:
     """Raise ValueError unless a compact file can hold what splats show."""
-    if type(_inner(appearance)) not in (Plain, Textured) or type(appearance) not in (Plain, Textured, Banded):
+    if not appearance.is_portable:
         raise ValueError(
-            f"model shows {type(_inner(appearance)).__name__}: a compact file holds Plain, Textured and Banded of "
+            f"model shows {type(appearance.base).__name__}: a compact file holds Plain, Textured and Banded of "
             "these; save_model keeps any model"
         )
-
-
-def _inner(appearance: Appearance) -> Appearance:
-    return appearance.inner if isinstance(appearance, Banded) else appearance
 
 
 def rows_of(model: Model) -> Rows:
@@ -65,16 +61,15 @@ def rows_of(model: Model) -> Rows:
     for name, values in (*fields.items(), *shown.items()):
         if not np.isfinite(values).all():
             raise ValueError(f"model.{name} must be finite; some values are NaN or infinite")
-    sh = fields["sh"]
+    sh, prefix = fields["sh"], model.appearance.array_prefix
     bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
     degrees = np.full(gaussians.num, gaussians.sh_degree)
-    if isinstance(model.appearance, Banded):
+    if model.appearance.has_degrees:
         degrees = np.asarray(shown["degrees"], np.int64)
         bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
-        shown = {name.removeprefix("inner."): array for name, array in shown.items()}
     return Rows(
         fields["means"], fields["quats"], fields["log_scales"], fields["logit_opacities"], degrees, tuple(bands),
-        shown.get("sizes"), shown.get("texels"),
+        shown.get(prefix + "sizes"), shown.get(prefix + "texels"),
     )  # fmt: skip
 
 
@@ -134,9 +129,9 @@ def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origi
     )
     arrays: dict[str, np.ndarray] = {}
     if rows.sizes is not None and rows.texels is not None:
-        arrays = {"sizes": rows.sizes, "texels": np.asarray(rows.texels, np.float32)}
-    if isinstance(appearance, Banded):
-        arrays = {f"inner.{name}": array for name, array in arrays.items()}
+        prefix = appearance.array_prefix
+        arrays = {prefix + "sizes": rows.sizes, prefix + "texels": np.asarray(rows.texels, np.float32)}
+    if appearance.has_degrees:
         arrays |= {"degrees": rows.degrees, "base_degree": np.asarray(base_degree)}
         for degree, band in enumerate(rows.bands[base_degree + 1 :], base_degree + 1):
             arrays[f"band_{degree}"] = np.asarray(band, np.float32)

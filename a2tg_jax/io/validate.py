@@ -10,17 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, Banded
 from a2tg_jax.core.cameras import check_calibration
-from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_shape, dtype_of
-from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.checks import FLOATS, LARGEST_NUMBER, check_floats, check_shape, dtype_of
+from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import check_similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
-DTYPES = ("float32", "float64")
 LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
 
 
@@ -32,9 +29,9 @@ def check_model(model: Model) -> None:
     """
     gaussians = model.gaussians
     check_gaussians(gaussians)
-    if str(dtype_of(gaussians.means)) not in DTYPES:
-        raise ValueError(f"gaussians must be {' or '.join(DTYPES)}; got {dtype_of(gaussians.means)}")
-    check_rows(model.appearance, model.params, model.layout, gaussians)
+    if str(dtype_of(gaussians.means)) not in FLOATS:
+        raise ValueError(f"gaussians must be {' or '.join(FLOATS)}; got {dtype_of(gaussians.means)}")
+    model.appearance.check(model.params, model.layout, gaussians)
     check_bounded("gaussians", gaussians)
     check_bounded("params", model.params)
     if (largest := np.asarray(gaussians.log_scales).max(initial=-np.inf)) > LARGEST_LOG_SCALE:
@@ -46,42 +43,6 @@ def check_model(model: Model) -> None:
         check_count("num_live", model.num_live, gaussians.num)
     if model.origin is not None:
         check_origin(model.origin)
-
-
-def check_rows(appearance: Appearance, params: Any, layout: Any, gaussians: Gaussians) -> None:
-    """Raise ValueError unless floats are shown, by as many rows as there are Gaussians, with bands above their own."""
-    num, kind = gaussians.num, type(appearance).__name__
-    if isinstance(appearance, Banded):
-        own, base = gaussians.sh_degree, layout.bands.base_degree
-        if own != base:
-            raise ValueError(f"Banded has bands above degree {base}, but the Gaussians have degree {own}")
-        if layout.bands.num != num:
-            raise ValueError(f"Banded has {layout.bands.num} degrees, but there are {num} Gaussians")
-        check_rows(appearance.inner, params.inner, layout.inner, gaussians)
-        return
-    for leaf in jax.tree.leaves(params):
-        if str(leaf.dtype) not in DTYPES:
-            raise ValueError(f"the parameters of {kind} must be floats, {' or '.join(DTYPES)}; got {leaf.dtype}")
-    has_rows = not jax.tree.leaves(layout)
-    found = {leaf.shape[0] for leaf in jax.tree.leaves(params)} if has_rows else {getattr(layout, "num", num)}
-    if found - {num}:
-        raise ValueError(f"{kind} is of {min(found - {num})} rows, but there are {num} Gaussians")
-    if isinstance(params, Textures) and isinstance(layout, AtlasLayout):
-        check_textures(params, layout, num)
-        check_places(params, layout)
-
-
-def check_places(textures: Textures, layout: AtlasLayout) -> None:
-    """Raise ValueError unless each texture has a row of its own that its bucket has."""
-    bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
-    if bucket.size and not 0 <= bucket.min() <= bucket.max() < len(textures.buckets):
-        raise ValueError(f"layout.bucket must lie below {len(textures.buckets)}; got {bucket.min()}..{bucket.max()}")
-    capacities = np.asarray([len(texels) for texels in textures.buckets], np.int64)
-    if bucket.size and ((row < 0) | (row >= capacities[bucket])).any():
-        raise ValueError("layout.row must lie within the buckets; some do not")
-    starts = np.cumsum(capacities) - capacities
-    if bucket.size and np.bincount(starts[bucket] + row).max() > 1:
-        raise ValueError("layout must give each texture its own row; some share one")
 
 
 def check_origin(origin: Origin) -> None:

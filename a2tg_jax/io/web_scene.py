@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Textured, TextureOptions
+from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.gaussians import check_gaussians
@@ -57,18 +57,14 @@ class WebScene:
 
 def is_viewable(appearance: Appearance) -> bool:
     """Return whether browsers can show what splats show."""
-    inner = appearance.inner if isinstance(appearance, Banded) else appearance
-    return type(inner) in (Plain, Textured) and type(appearance) in (Plain, Textured, Banded)
+    return appearance.is_portable
 
 
 def check_viewable(appearance: Appearance) -> None:
     """Raise ValueError, naming what the splats show, unless a browser can show it."""
     if not is_viewable(appearance):
-        inner = appearance.inner if isinstance(appearance, Banded) else appearance
-        system = {Billboards: " of bbsplat", MovableKernels: " of supergaussians"}.get(type(inner), "")
-        raise ValueError(
-            f"the viewer cannot show {type(inner).__name__}{system}: it shows Gaussians with or without textures"
-        )
+        kind = type(appearance.base).__name__
+        raise ValueError(f"the viewer cannot show {kind}: it shows Gaussians with or without textures")
 
 
 def encode_web_scene(
@@ -145,15 +141,14 @@ def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
 
 def _as_shown(model: Model) -> Model:
     """Return the model with texels as they are seen; of their rule, only the lookup remains."""
-    textured = model.appearance.inner if isinstance(model.appearance, Banded) else model.appearance
-    if not isinstance(textured, Textured) or model.textures is None or not model.num:
+    options = model.appearance.texture_options
+    if options is None or model.textures is None or not model.num:
         return model
     textures, layout = model.textures
-    model = model.with_textures(shown_textures(textures, layout, textured.options), layout)
-    options = dataclasses.replace(textured.options, rgb="signed", alpha="projected")
-    seen: Appearance = dataclasses.replace(textured, options=options)
-    is_banded = isinstance(model.appearance, Banded)
-    return dataclasses.replace(model, appearance=Banded(seen) if is_banded else seen)
+    model = model.with_textures(shown_textures(textures, layout, options), layout)
+    seen = dataclasses.replace(options, rgb="signed", alpha="projected")
+    has_degrees = model.appearance.has_degrees
+    return dataclasses.replace(model, appearance=appearance_for(seen, has_textures=True, has_degrees=has_degrees))
 
 
 # The frame
@@ -215,11 +210,13 @@ def _check_counts(header: Any, num_coded: int) -> None:
 
 
 def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
-    inner = appearance.inner if isinstance(appearance, Banded) else appearance
-    options = inner.options if isinstance(inner, Textured) else TextureOptions()
-    max_alpha = inner.max_alpha if isinstance(inner, Plain) else options.max_alpha
-    banded = isinstance(appearance, Banded)
-    return {"banded": banded, "uv": options.uv, "outside": options.outside, "max_alpha": max_alpha}
+    options = appearance.texture_options or TextureOptions()
+    return {
+        "banded": appearance.has_degrees,
+        "uv": options.uv,
+        "outside": options.outside,
+        "max_alpha": appearance.max_alpha,
+    }
 
 
 def _appearance_of(header: Mapping[str, Any]) -> Appearance:
@@ -227,11 +224,10 @@ def _appearance_of(header: Mapping[str, Any]) -> Appearance:
     max_alpha = header["max_alpha"]
     if not isinstance(max_alpha, float) or not 0 < max_alpha < 1:
         raise ValueError(f"max_alpha must lie in (0, 1); got {max_alpha!r}")
-    inner: Appearance = Plain(max_alpha)
-    if header["num_texels"] is not None:
-        named = {"uv": header["uv"], "outside": header["outside"], "max_alpha": max_alpha}
-        inner = Textured(options=config_from_dict(TextureOptions, named, "options"))
-    return Banded(inner) if header["banded"] is True else inner
+    has_textures, has_degrees = header["num_texels"] is not None, header["banded"] is True
+    named = {"uv": header["uv"], "outside": header["outside"]} if has_textures else {}
+    options = config_from_dict(TextureOptions, {**named, "max_alpha": max_alpha}, "options")
+    return appearance_for(options, has_textures=has_textures, has_degrees=has_degrees)
 
 
 def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Plain, Textured
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Color
@@ -143,10 +142,9 @@ def _model_of(
         if textures is not None or layout is not None:
             raise ValueError("textures and layout are part of a model: give the model alone")
         return gaussians
-    appearance_of(gaussians, textures, layout, settings)
-    if textures is None:
-        return Model(gaussians, appearance=Plain(settings.texture.max_alpha))
-    return Model(gaussians, textures, layout, appearance=Textured(options=settings.texture))
+    appearance = appearance_of(gaussians, textures, layout, settings)
+    params, layout = ((), ()) if textures is None else (textures, layout)
+    return Model(gaussians, params, layout, appearance=appearance)
 
 
 def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:

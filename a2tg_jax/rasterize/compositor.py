@@ -1,7 +1,7 @@
 """Front-to-back compositing of tiles, given any appearance rule, with an exact gradient in constant memory.
 
-What happens at one pixel is `pixel`'s; a module of `kernels` does it for all of them: `native` on CPUs, `pallas` on
-GPUs, or `xla`. Each has a `forward` and a `backward` of the same arguments and results.
+`pixel` defines one pixel. A module of `kernels` computes all of them: `native` on CPUs, `pallas` on GPUs, or `xla`.
+Each has a `forward` and a `backward` with the same arguments and results.
 
 The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
 """
@@ -23,15 +23,15 @@ def composite(
     settings: CompositingSettings, splats: Splats, rule: AppearanceRule, cutoff: Array, lists: TileLists,
     jacobian: Array, probe: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Channels [D, H, W] and final transmittance [H, W]; D is red, green, blue(, depth, depth², normal x, y, z).
+    """Return channels [D, H, W] and final transmittance [H, W]; D is red, green, blue(, depth, depth², normal x, y, z).
 
     Args:
-      settings: static choices.
+      settings: static options.
       splats: N splats.
-      rule: what they show. Its texels are differentiated; of its other arrays none is read but the regions.
-      cutoff: [N] squared distance beyond which each splat need not be looked at.
-      lists: the splats of each tile.
-      jacobian: [3, 3] ∂M[:, 2]/∂μ = K·Rc, used by the statistic alone.
+      rule: appearance rule. Its texels are differentiated; its other arrays are not read, except the regions.
+      cutoff: [N] squared distance beyond which each splat is invisible.
+      lists: splats of each tile.
+      jacobian: [3, 3] ∂M[:, 2]/∂μ = K·Rc, used only by the statistic.
       probe: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
         `rasterize.pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
     """
@@ -42,7 +42,7 @@ def composite(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _composite_tiles(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
-    """Channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group, P pixels a tile."""
+    """Return channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group, P pixels a tile."""
     return _kernels(settings.compositor).forward(settings, rule, splats, texels, regions, cutoff, lists)
 
 
@@ -64,7 +64,7 @@ _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
 def _kernels(compositor: Compositor) -> ModuleType:
-    """The module that composites, imported where it is used: Pallas adds to JAX's settings when it is."""
+    """Return the compositing module, imported on first use, for Pallas changes JAX's settings on import."""
     if compositor == "native":
         from a2tg_jax.rasterize.kernels.native import composite as native
 
@@ -79,7 +79,7 @@ def _kernels(compositor: Compositor) -> ModuleType:
 
 
 def _assemble(tiles: Array, grid: TileGrid) -> Array:
-    """[groups, G, ..., P] tiles as one image [..., H, W]."""
+    """Assemble tiles [groups, G, ..., P] into one image [..., H, W]."""
     tiles = tiles.reshape(-1, *tiles.shape[2:])[: grid.num]
     inner = tiles.shape[1:-1]
     blocks = tiles.reshape(grid.rows, grid.columns, *inner, grid.tile_size, grid.tile_size)

@@ -1,11 +1,11 @@
-"""One splat at one pixel: where the ray meets it, what it shows there, how much light it lets through.
+"""One splat at one pixel: the hit of the ray, colour and alpha there, and the transmittance behind it.
 
-Every function here is element-wise: it takes scalars, or arrays that broadcast. It is the one definition of what is
-rendered: `kernels.xla` runs it over arrays, the other kernels compile it into loops, and all differentiate it by
+Every function here is element-wise: it takes scalars, or arrays that broadcast. This is the one definition of a
+rendered image: `kernels.xla` runs it over arrays, the other kernels compile it into loops, and all differentiate it by
 `jax.vjp`.
 
 M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of a splat, g the cotangent of the channels, B
-(`suffix_sum`) what the splats from here to the last one make of g.
+(`suffix_sum`) the sum over the splats from here to the last one of their products with g.
 """
 
 from typing import Literal, NamedTuple
@@ -23,66 +23,66 @@ MIN_TRANSMITTANCE = 1e-4
 
 Triple = tuple[Array, Array, Array]
 Statistic = Literal["position", "screen", "center"]
-"""What densification asks of the backward pass (`positional_gradient`)."""
+"""Statistics of densification, computed in the backward pass (`positional_gradient`)."""
 
 
 class Splat(NamedTuple):
-    """What is differentiated of a splat besides its appearance."""
+    """Differentiable numbers of a splat, without its texture."""
 
     M: tuple[Triple, Triple, Triple]
     """Rows of the homography from (u, v, 1) to pixels."""
     opacity: Array
     """Peak opacity, before the falloff."""
     color: Triple
-    """Red, green and blue of its spherical harmonics."""
+    """Red, green and blue of the spherical harmonics."""
     normal: Triple | None
-    """In the world, facing the camera; None where only colour is composited."""
+    """Normal in the world, facing the camera; None if only colour is composited."""
     numbers: tuple[Array, ...] = ()
-    """What else its appearance rule knows of it (`AppearanceRule.numbers`)."""
+    """Numbers of its appearance rule (`AppearanceRule.numbers`)."""
 
 
 class Planes(NamedTuple):
-    """A splat seen from a tile: p = k × l is linear in the pixel (x, y), counted from the tile's centre."""
+    """Splat seen from a tile: p = k × l is linear in the pixel (x, y), relative to the tile's centre."""
 
     p0: Triple
     """Coefficients of x, y and 1 in p₀, where u = p₀/p₂."""
     p1: Triple
-    """The same of p₁, where v = p₁/p₂."""
+    """Coefficients of p₁, where v = p₁/p₂."""
     p2: Triple
-    """The same of p₂."""
+    """Coefficients of p₂."""
     determinant: Array
     """det(M); over p₂ it is the depth of the hit."""
     center_x: Array
-    """The projected mean, in pixels from the tile's centre."""
+    """Horizontal coordinate of the projected mean, in pixels from the tile's centre."""
     center_y: Array
-    """Its other coordinate."""
+    """Vertical coordinate of the projected mean."""
     depth: Array
     """Depth of the mean."""
 
 
 class Hit(NamedTuple):
-    """Where the ray of a pixel meets a splat."""
+    """Hit of a pixel's ray with a splat."""
 
     u: Array
-    """Along the first axis, in standard deviations; 0 without a hit."""
+    """Coordinate along the first axis, in standard deviations; 0 without a hit."""
     v: Array
-    """Along the second axis."""
+    """Coordinate along the second axis."""
     rho: Array
-    """min(u² + v², 2·|(x, y) − c|²), the squared distance that the falloff sees. Without the low-pass filter u² + v²,
-    infinite without a hit."""
+    """Squared distance for the falloff, min(u² + v², 2·|(x, y) − c|²). Without the low-pass filter, u² + v², and
+    infinity without a hit."""
     depth: Array
-    """Depth of the hit; of the mean where the low-pass filter decides."""
+    """Depth of the hit, or of the mean if the low-pass filter decides."""
     is_ray: Array
     """Whether the hit decides ρ, not the low-pass filter."""
 
 
 class Shown(NamedTuple):
-    """What a splat shows at a pixel."""
+    """Alpha and channels of a splat at a pixel."""
 
     alpha: Array
-    """In [0, max_alpha]; 0 where it would be less than 1/255."""
+    """Alpha in [0, max_alpha]; 0 if it would be less than 1/255."""
     channels: tuple[Array, ...]
-    """Red, green, blue; and depth, depth², normal x, y, z where the splat has a normal."""
+    """Red, green, blue; and depth, depth², normal x, y, z if the splat has a normal."""
 
 
 def _cross(a: Triple, b: Triple) -> Triple:
@@ -90,7 +90,7 @@ def _cross(a: Triple, b: Triple) -> Triple:
 
 
 def planes_of(M: tuple[Triple, Triple, Triple], x: Array, y: Array) -> Planes:
-    """The planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1)."""
+    """Return the planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1)."""
     last = M[2]
     # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
     first = (M[0][0] - x * last[0], M[0][1] - x * last[1], M[0][2] - x * last[2])
@@ -108,13 +108,13 @@ def planes_of(M: tuple[Triple, Triple, Triple], x: Array, y: Array) -> Planes:
 
 
 def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pass: bool = True) -> Hit:
-    """The hit of a pixel's ray, or the low-pass filter where there is one and it is nearer (2DGS, equations 10, 11).
+    """Return the hit of a pixel's ray, or the low-pass filter's if that is nearer (2DGS, equations 10, 11).
 
-    The point is (p₀, p₁)/p₂ and its depth det(M)/p₂; depths below `near_plane` are no hit.
+    The hit is (p₀, p₁)/p₂ at depth det(M)/p₂; depths below `near_plane` are no hit.
     """
     p0, p1, p2 = (plane[0] * x + plane[1] * y + plane[2] for plane in planes[:3])
-    # Far out on a nearly parallel plane u² would overflow, and 1/p₂² for the tiniest splats: there the divisor is
-    # held, with a finite gradient.
+    # Far out on a nearly parallel plane u² would overflow, as would 1/p₂² for the tiniest splats: the divisor is
+    # clamped there, with a finite gradient.
     far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
     q0, q1, q2, determinant = jax.lax.stop_gradient((p0, p1, p2, planes.determinant))
     least = jnp.maximum(jnp.maximum(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
@@ -136,7 +136,7 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
 
 
 def values_at(rule: AppearanceRule, lookup: Lookup | None, hit: Hit, values: tuple[Array, ...]) -> tuple[Array, ...]:
-    """The values of a lookup, differentiable in themselves and in where the ray meets the splat."""
+    """Return the values of a lookup, differentiable in themselves and in the hit."""
     if lookup is None:
         return ()
     return follow(lookup.sample._replace(values=values), *rule.texel_position(lookup.region, hit.u, hit.v))
@@ -145,22 +145,22 @@ def values_at(rule: AppearanceRule, lookup: Lookup | None, hit: Hit, values: tup
 def show(
     rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_probe: Array | None = None
 ) -> Shown:
-    """α = min(rule.max_alpha, o·falloff(ρ)·T_A), nothing below 1/255, and the channels that it weighs.
+    """Return α = min(rule.max_alpha, o·falloff(ρ)·T_A), or 0 below 1/255, and the channels that it weighs.
 
     Args:
       rule: the appearance rule.
-      splat: its homography is not read.
-      hit: where the ray meets the splat.
-      values: what the splat's texture shows there.
-      rho_probe: zero, added to what the falloff is given, to read the gradient there; or None.
+      splat: the splat; its homography is not read.
+      hit: hit of the ray with the splat.
+      values: interpolated values of the splat's texture.
+      rho_probe: zero, added to ρ of the falloff to read the gradient there; or None.
     """
     residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
-    # No falloff is asked for its slope at infinity, which need not be a number.
+    # The slope of a falloff at infinity need not be a number.
     rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
     rho = rho if rho_probe is None else rho + rho_probe
     a = splat.opacity * rule.falloff(splat.numbers, rho)
     a = a if factor is None else a * factor
-    # What is not a number stays so, here and in `absorb`: it must not vanish.
+    # NaN must stay NaN, here and in `absorb`.
     is_hidden = a < MIN_ALPHA if rule.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
     alpha = jnp.where(is_hidden, 0.0, jnp.where(a >= rule.max_alpha, rule.max_alpha, a))
     channels: tuple[Array, ...] = splat.color
@@ -172,17 +172,19 @@ def show(
 
 
 def absorb(alpha: Array, transmittance: Array, is_live: Array) -> Triple:
-    """Weight α·T of a splat, and transmittance and liveness behind it; a pixel stops before the splat that would
-    leave less than 10⁻⁴."""
+    """Return the weight α·T of a splat, and transmittance and liveness behind it.
+
+    A pixel stops before the splat that would leave a transmittance below 10⁻⁴.
+    """
     is_live = is_live & ~(transmittance * (1 - alpha) < MIN_TRANSMITTANCE)
     weight = jnp.where(is_live, alpha * transmittance, 0.0)
     return weight, transmittance - weight, is_live
 
 
 def absorb_vjp(alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, shown: Array):
-    """`absorb`, and ∂L/∂α, walking front to back.
+    """Return the results of `absorb` and ∂L/∂α, walking front to back.
 
-    With B = Σ g·c·α·T over the splats behind + g_T·T_final, all of which is linear in what this splat lets through,
+    B = Σ g·c·α·T over the splats behind + g_T·T_final is linear in 1 − α of this splat, so that
     ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never reaches 1.
 
     Args:
@@ -200,7 +202,7 @@ def absorb_vjp(alpha: Array, transmittance: Array, is_live: Array, suffix_sum: A
 
 
 class Cotangents(NamedTuple):
-    """What one splat at one pixel adds to the gradient."""
+    """Contribution of one splat at one pixel to the gradient."""
 
     planes: Planes
     opacity: Array
@@ -208,13 +210,13 @@ class Cotangents(NamedTuple):
     normal: Triple | None
     numbers: tuple[Array, ...]
     values: tuple[Array, ...]
-    """Of what the splat's texture shows."""
+    """Cotangents of the values of the splat's texture."""
     rho: Array | None
-    """∂L/∂ρ through the falloff, where asked for."""
+    """∂L/∂ρ through the falloff, if requested."""
 
 
 def blend(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, transmittance, is_live):
-    """One splat at one pixel, forward: what it adds to the channels, and transmittance and liveness behind it."""
+    """Return the contribution of one splat at one pixel to the channels, and transmittance and liveness behind it."""
     shown = show(rule, splat, intersect(planes, x, y, near_plane, rule.has_low_pass), values)
     weight, transmittance, is_live = absorb(shown.alpha, transmittance, is_live)
     return tuple(weight * channel for channel in shown.channels), transmittance, is_live
@@ -224,11 +226,11 @@ def blend_vjp(
     rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x, y,
     transmittance, is_live, suffix_sum, g, has_rho: bool,
 ):  # fmt: skip
-    """One splat at one pixel, backward; `suffix_sum` and `g` as in `absorb_vjp`, g channel by channel.
+    """Differentiate `blend`; `suffix_sum` and `g` are those of `absorb_vjp`, g channel by channel.
 
     Returns:
-      (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents, which mean something only
-      where the weight is positive: elsewhere they may not even be finite.
+      (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents. These are valid only if the
+      weight is positive; elsewhere they may not even be finite.
     """
 
     def of_floats(planes, opacity, color, normal, numbers, values, rho_probe):
@@ -251,15 +253,15 @@ def positional_gradient(
     statistic: Statistic, M, x: Array, y: Array, tile_x, tile_y, d_rho: Array, jacobian, near_plane: float,
     has_low_pass: bool,
 ) -> Triple:  # fmt: skip
-    """What a pixel adds to a statistic of densification, through the falloff only; zero where `d_rho` is.
+    """Return a pixel's contribution to a statistic of densification, through the falloff only; zero where `d_rho` is.
 
     "position": |∂L/∂μ| per world component (A²TG).
-    "screen": |∂L/∂c| per pixel axis of the projected mean c, where the low-pass filter decides, and 0 (gsplat's
-    `absgrad` of 2D Gaussians).
-    "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, where the hit decides, and 0 (2DGS).
+    "screen": |∂L/∂c| per pixel axis of the projected mean c if the low-pass filter decides, else 0 (gsplat's `absgrad`
+    of 2D Gaussians).
+    "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, if the hit decides, else 0 (2DGS).
 
     Args:
-      statistic: which.
+      statistic: kind of statistic.
       M: rows of the homography.
       x, y: the pixel, from the tile's centre (tile_x, tile_y).
       d_rho: ∂L/∂ρ through the falloff.
@@ -279,7 +281,7 @@ def positional_gradient(
     if statistic == "position":
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
-    # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c where the low-pass filter decides.
+    # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c if the low-pass filter decides.
     on_screen = d_mean[0] * mean[2], d_mean[1] * mean[2]
     if statistic == "center":
         along_x, along_y = (jnp.where(is_ray, number, 0.0) for number in on_screen)

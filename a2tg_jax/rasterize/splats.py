@@ -1,6 +1,6 @@
-"""What compositors are given: the splats of a view, projected from Gaussians, and the static choices of a pass.
+"""Input of the compositors: the splats of a view, projected from Gaussians, and the static options of a pass.
 
-It stands below the kernels, so that `compositor` and all of them speak of the same two types.
+`compositor` and all kernels share these two types.
 """
 
 import functools
@@ -22,60 +22,61 @@ Compositor = Literal["native", "pallas", "xla"]
 
 
 class Splats(NamedTuple):
-    """What the compositor needs of N splats; each differentiable."""
+    """N splats for the compositor; all fields are differentiable."""
 
     M: Array
     """[N, 3, 3] homographies from (u, v, 1) to pixels."""
     colors: Array
-    """[N, 3] of their spherical harmonics."""
+    """[N, 3] colours of the spherical harmonics."""
     opacities: Array
     """[N] peak opacities."""
     normals: Array
-    """[N, 3] in the world, facing the camera."""
+    """[N, 3] normals in the world, facing the camera."""
     numbers: Array
-    """[N, K] what else the appearance rule knows of them."""
+    """[N, K] numbers of the appearance rule (`AppearanceRule.numbers`)."""
 
 
 class CompositingSettings(NamedTuple):
-    """The static choices of a compositing pass."""
+    """Static options of a compositing pass."""
 
     grid: TileGrid
-    """The tiles of the image."""
+    """Tiles of the image."""
     near_plane: float
-    """Hits nearer than this do not show."""
+    """Least depth of visible hits."""
     has_geometry: bool
-    """Depth, squared depth and normals are composited beside the colour."""
+    """Whether depth, squared depth and normals are composited beside the colour."""
     statistic: Statistic | None
-    """What densification asks of the backward pass, if anything."""
+    """Statistic that densification reads from the backward pass, if any."""
     compositor: Compositor
     """Native loops, Pallas kernels, or XLA."""
     tile_batch: int
-    """Tiles composited at once by XLA; 1 with the others."""
+    """Number of tiles that XLA composites at once; 1 with the others."""
 
     @property
     def num_channels(self) -> int:
-        """D: colour, and with geometry depth, depth² and normal."""
+        """Number D of channels: colour, and with geometry depth, depth² and normal."""
         return 8 if self.has_geometry else 3
 
     @property
     def num_groups(self) -> int:
-        """Batches of tiles in the image."""
+        """Number of batches of tiles in the image."""
         return -(-self.grid.num // self.tile_batch)
 
 
 def project_gaussians(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, near_plane: float, sh_degree: Any, num_live: Any = None
 ) -> tuple[Splats, Array]:
-    """The N splats, and [N] the squared distance within which each shows: not positive where it shows nowhere, NaN
-    where it would show, but a number of it is not finite.
+    """Return the N splats, and the squared distances [N] within which they are visible.
+
+    The distance is not positive if the splat is invisible, and NaN if a visible splat has a number that is not finite.
 
     Args:
       gaussians: N Gaussians.
       camera: the view.
-      rule: what they show.
-      near_plane: splats nearer than this do not show.
+      rule: appearance rule.
+      near_plane: least depth of visible splats.
       sh_degree: highest degree of spherical harmonics used; may be traced.
-      num_live: only the first so many rows show; may be traced.
+      num_live: number of rows that exist; may be traced.
 
     Raises:
       ValueError: if the rule gives opacities or numbers of another shape, or a `max_alpha` outside (0, 1).
@@ -84,7 +85,7 @@ def project_gaussians(
     opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
     _check_rule(rule, opacities, numbers, gaussians.num)
     colors = rule.own_colors(gaussians, camera, sh_degree)
-    # Not >=: a depth that is no number is not behind the camera.
+    # Not >=: a NaN depth counts as drawn, so that it is reported.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
@@ -92,7 +93,7 @@ def project_gaussians(
     is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)
     is_shown = (cutoff > 0)[:, None]
-    # Rows that show nowhere may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
+    # Invisible rows may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
     M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
     colors, normals, numbers = (jnp.where(is_shown, x, 0.0) for x in (colors, normals, numbers))
     return Splats(M, colors, opacities, normals, numbers), cutoff
@@ -109,6 +110,6 @@ def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, num: int
 
 
 def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:
-    """[N] whether all numbers of a splat are."""
+    """Return whether all numbers of each splat are finite [N]."""
     columns = [*(M[:, i, k] for i in range(3) for k in range(3)), *colors.T, *numbers.T]
     return functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))

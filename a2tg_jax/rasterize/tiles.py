@@ -1,7 +1,7 @@
-"""Which splats touch which tile, in depth order, at a fixed capacity.
+"""Lists of the splats that touch each tile, in depth order, at a fixed capacity.
 
 A pair is one splat in one tile. Pairs are emitted splat by splat in depth order, and those whose outline misses the
-tile are dropped. Here one stable sort by tile makes the lists; `kernels.native` makes the same ones by counting. Tiles
+tile are dropped. One stable sort by tile makes the lists here; `kernels.native` makes the same ones by counting. Tiles
 of P = tile_size² pixels are numbered row by row.
 """
 
@@ -15,7 +15,7 @@ from a2tg_jax.core.geometry import Outline, ScreenBounds, screen_bounds
 
 
 class TileGrid(NamedTuple):
-    """The tiles that cover an image of width × height pixels; all static."""
+    """Tiles that cover an image of width × height pixels; all static."""
 
     width: int
     height: int
@@ -35,20 +35,20 @@ class TileGrid(NamedTuple):
 
 
 class TileLists(NamedTuple):
-    """The splats of each tile, front to back."""
+    """Splats of each tile, front to back."""
 
     ids: Array
     """[capacity] splat indices, tile after tile."""
     starts: Array
-    """[tiles + 1] where the list of each tile begins in `ids`."""
+    """[tiles + 1] start of each tile's list in `ids`."""
     num_pairs: Array
-    """Float: pairs before the outline test, which the capacity must hold."""
+    """Number of pairs before the outline test, as a float; the capacity must hold it."""
     overflow: Array
-    """Boolean: the pairs did not fit; the lists are then empty."""
+    """Whether the pairs did not fit; the lists are then empty."""
 
 
 class Rectangles(NamedTuple):
-    """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + rows of each splat, and how many these are."""
+    """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + rows of each splat, and their number."""
 
     x0: Array
     y0: Array
@@ -57,7 +57,7 @@ class Rectangles(NamedTuple):
 
 
 def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
-    """The tiles that each splat's box covers."""
+    """Return the tiles that each splat's box covers."""
     x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
     y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
     columns = jnp.where(rows > 0, columns, jnp.int32(0))
@@ -65,35 +65,37 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
 
 
 def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
-    """First tile along an axis with a pixel centre in [low, high], and how many tiles there are."""
+    """Return the first tile along an axis with a pixel centre in [low, high], and the number of such tiles."""
     as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
     nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
     first = jnp.maximum(as_pixels(jnp.ceil(low - 0.5)), nothing)
     last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), last_pixel)
-    # Not //, which does more for negative numbers; there are none but a `last` of -1, less than `first`.
+    # Not //, which is slower for the sake of negative numbers; only `last` can be one, -1, less than `first`.
     begin, end = jax.lax.div(first, side), jax.lax.div(last, side) + 1
     return begin, jnp.where(last < first, nothing, end - begin)
 
 
 def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
-    """Pairs before the outline test, as a float (it cannot wrap): what the capacity must hold."""
+    """Return the number of pairs before the outline test, as a float, which cannot wrap."""
     return total_pairs(tile_rectangles(bounds, grid).counts)
 
 
 def total_pairs(counts: Array) -> Array:
-    """The sum of counts [N] as a float32, to a few units in the last place: blocks are summed as integers first, so
-    that no small count is lost beside a large sum."""
+    """Return the sum of counts [N] as a float32, to a few units in the last place.
+
+    Blocks are summed as integers first, so that no small count is lost beside a large sum.
+    """
     blocks = jnp.pad(counts, (0, -counts.shape[0] % 256)).reshape(-1, 256)
     return jnp.sum(jnp.sum(blocks, axis=1, dtype=jnp.int32).astype(jnp.float32))
 
 
 def exceeds(total: Array, capacity: int) -> Array:
-    """Whether so many pairs, known to about 2⁻²⁰ of their number, may be more than there is room for."""
+    """Return whether a number of pairs, known to about 2⁻²⁰ of itself, may exceed the capacity."""
     return total + jnp.floor(total * 2.0**-20) > capacity
 
 
 def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:
-    """Whether an outline reaches a pixel centre of the tile whose first pixel is (x0, y0); element-wise."""
+    """Return whether an outline reaches a pixel centre of the tile with first pixel (x0, y0); element-wise."""
 
     def distance_to_box(origin_x, origin_y):
         left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
@@ -149,9 +151,9 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
 
 
 def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:
-    """Splat indices sorted by tile, then by depth rank; and the start of each tile's list.
+    """Return splat indices sorted by tile, then by depth rank, and the start of each tile's list.
 
-    Where both fit 32 bits they are packed into one key: sorting keys alone is several times faster than pairs.
+    If both fit 32 bits they are packed into one key: sorting keys is several times faster than sorting pairs.
     """
     num = order.shape[0]
     rank_bits = max(1, (num - 1).bit_length())

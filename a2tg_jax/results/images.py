@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from matplotlib import colormaps
@@ -158,11 +157,6 @@ def colored_by_resolution(model: Model) -> Model:
 
 def with_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
     """Return a model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
-    sh = np.where(is_chosen[:, None, None], 0, model.appearance.sh(model.gaussians, model.params, model.layout))
+    sh = np.where(is_chosen[:, None, None], 0, model.sh)
     sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
-    own = jnp.asarray(sh[:, : model.gaussians.sh.shape[1]], model.gaussians.sh.dtype)
-    return dataclasses.replace(
-        model,
-        gaussians=dataclasses.replace(model.gaussians, sh=own),
-        params=model.appearance.with_sh(sh, model.params, model.layout),
-    )
+    return model.with_sh(sh)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax.appearance import Banded
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
@@ -64,8 +63,8 @@ def _describe_stage(run: RunFolder, name: str, measured: dict[str, float] | None
         return _progress(run.checkpoints(name))
     model = load_model(run.model(name))
     parts = [f"{model.num:,} Gaussians", f"{model.num_bytes / 1e6:.2f} MB"]
-    if isinstance(model.appearance, Banded):
-        counts = np.bincount(model.layout.bands.degrees)
+    if model.bands is not None:
+        counts = np.bincount(model.bands[1].degrees)
         parts.append("degrees " + ", ".join(f"{degree}: {n:,}" for degree, n in enumerate(counts)))
     if model.textures is not None:
         sizes, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)

@@ -5,7 +5,6 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from a2tg_jax.appearance import Billboards
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.host.atomic import replacing
@@ -78,7 +77,7 @@ def evaluate_run(
         write_corrections(run, name, model)
     main = models[result.main]
     _write_curves(run, plan, list(models))
-    if main.textures is not None and not isinstance(main.appearance, Billboards):
+    if main.appearance.texture_options is not None:
         _write_texture_figures(run, main, plan[result.main].system, scene)
     save_ply(run.own(run.point_cloud), main)
     _write_surface(run, main, plan[result.main].system, scene)

@@ -16,7 +16,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.io.model_file import LONGEST_REASON
-from a2tg_jax.io.validate import check_count, check_rows
+from a2tg_jax.io.validate import check_count
 from a2tg_jax.model import Model
 from a2tg_jax.training.options import System
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
@@ -170,7 +170,7 @@ def _checkpoint_of(
     shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
     params, layout = stage.appearance.from_arrays(shown)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
-    check_rows(stage.appearance, params, layout, gaussians)
+    stage.appearance.check(params, layout, gaussians)
     wanted = _wanted(stage, gaussians, params, layout, is_ahead)
     kept = _rest(wanted), {field.name: 0 for field in dataclasses.fields(History)}
     _, (rest, columns) = _filled((gaussians, kept), arrays)

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Billboards
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.origin import WHITE
@@ -207,7 +206,7 @@ def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:
     """Return the number of splats by texture size, "2x4" being two rows (v) and four columns (u); empty without."""
-    if model.textures is None or isinstance(model.appearance, Billboards):
+    if model.textures is None or model.appearance.texture_options is None:
         return {}
     pairs, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
     return {f"{rows}x{columns}": int(count) for (rows, columns), count in zip(pairs, counts, strict=True)}

@@ -1,0 +1,83 @@
+"""What files ask of an appearance: named arrays, and whether Gaussians, degrees and textures say all that it shows."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.checks import FLOATS
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.texture import AtlasLayout, Textures, check_places, check_textures
+
+
+class StoredArrays:
+    """Parameters and layout as named arrays. The defaults suit parameters with one row per Gaussian and no layout."""
+
+    array_prefix: str = ""
+    """Beginning of the names of the arrays of `Appearance.base`."""
+    max_alpha: float = 0.99
+    """Upper limit of a splat's alpha."""
+
+    @property
+    def is_portable(self) -> bool:
+        """Whether Gaussians, degrees, textures and `max_alpha` say all that splats show.
+
+        Compact files, web scenes and `shrink_textures` need this. A subclass of a portable class is not portable.
+        """
+        return False
+
+    def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:
+        """Return named arrays from which `from_arrays` makes parameters and layout again, without padding (host)."""
+        leaves = jax.tree_util.tree_flatten_with_path(params)[0]
+        return {_name(path): np.asarray(leaf) for path, leaf in leaves}
+
+    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Any, Any]:
+        """Return the parameters and layout of `arrays` (host).
+
+        Raises:
+          ValueError: if an array is missing or of another shape than its neighbours.
+        """
+        shapes, layout = parameter_shapes(self)
+        leaves, treedef = jax.tree_util.tree_flatten_with_path(shapes)
+        names = [_name(path) for path, _ in leaves]
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise ValueError(f"the array {missing[0]} of {type(self).__name__} is missing")
+        for name, (_, leaf) in zip(names, leaves, strict=True):
+            if arrays[name].shape[1:] != leaf.shape[1:]:
+                raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {arrays[name].shape}")
+        return jax.tree.unflatten(treedef, [jnp.asarray(arrays[name]) for name in names]), layout
+
+    def first_rows(self, params: Any, layout: Any, num: int) -> tuple[Any, Any]:
+        """Return parameters, or moments of them, and layout of the first `num` rows (host).
+
+        Buffers have the sizes that `from_arrays` gives them.
+        """
+        return jax.tree.map(lambda x: x[:num], params), layout
+
+    def check(self, params: Any, layout: Any, gaussians: Gaussians) -> None:
+        """Raise ValueError unless parameters and layout fit the Gaussians (host)."""
+        num, kind = gaussians.num, type(self).__name__
+        for leaf in jax.tree.leaves(params):
+            if str(leaf.dtype) not in FLOATS:
+                raise ValueError(f"the parameters of {kind} must be floats, {' or '.join(FLOATS)}; got {leaf.dtype}")
+        has_rows = not jax.tree.leaves(layout)
+        found = {leaf.shape[0] for leaf in jax.tree.leaves(params)} if has_rows else {getattr(layout, "num", num)}
+        if found - {num}:
+            raise ValueError(f"{kind} is of {min(found - {num})} rows, but there are {num} Gaussians")
+        if isinstance(params, Textures) and isinstance(layout, AtlasLayout):
+            check_textures(params, layout, num)
+            check_places(params, layout)
+
+
+def parameter_shapes(appearance: Any) -> tuple[Any, Any]:
+    """Return the shapes of the parameters, and the layout, that an appearance allocates for one Gaussian."""
+    row = lambda *shape: jax.ShapeDtypeStruct((1, *shape), jnp.float32)  # noqa: E731
+    gaussians: Any = Gaussians(row(3), row(4), row(2), row(), row(16, 3))  # type: ignore[arg-type]
+    return jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
+
+
+def _name(path: tuple[Any, ...]) -> str:
+    """Return a leaf's name in a file, such as "kernels.centers"."""
+    return jax.tree_util.keystr(path, simple=True, separator=".")
