@@ -143,8 +143,9 @@ def _model_of(
             raise ValueError("textures and layout are part of a model: give the model alone")
         return gaussians
     appearance = appearance_of(gaussians, textures, layout, settings)
-    params, layout = ((), ()) if textures is None else (textures, layout)
-    return Model(gaussians, params, layout, appearance=appearance)
+    if textures is None:
+        return Model(gaussians, appearance=appearance)
+    return Model(gaussians, textures, layout, appearance=appearance)
 
 
 def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:

@@ -1,0 +1,68 @@
+"""What training starts from: dense points, whose splats are smaller than a pixel."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import a2tg_jax as a2tg
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.training.start import fainter_where_dense, initial_model
+
+FOCAL, DEPTH = 100.0, 2.0
+
+
+def camera_at(depth: float, focal: float = FOCAL) -> a2tg.Camera:
+    """A camera that looks at the origin along z."""
+    viewmat = jnp.eye(4).at[2, 3].set(depth)
+    return a2tg.Camera(viewmat, jnp.asarray([[focal, 0, 16], [0, focal, 12], [0, 0, 1]]), 32, 24)
+
+
+def splats(sides_in_pixels, opacity: float) -> Gaussians:
+    """Splats at the origin that have these standard deviations, in pixels of `camera_at(DEPTH)`."""
+    scales = np.asarray(sides_in_pixels) * DEPTH / FOCAL
+    gaussians = a2tg.init_from_points(
+        np.random.default_rng(0).normal(size=(len(scales), 3)), np.zeros((len(scales), 3))
+    )
+    log_scales = jnp.asarray(np.log(np.stack([scales, 3 * scales], axis=1)), jnp.float32)
+    logits = jnp.full(len(scales), np.log(opacity / (1 - opacity)), jnp.float32)
+    return dataclasses.replace(
+        gaussians, means=jnp.zeros_like(gaussians.means), log_scales=log_scales, logit_opacities=logits
+    )
+
+
+def test_layers_of_small_splats_have_the_opacity_of_one():
+    """k splats under one pixel of the filter: 1 − (1 − o')^k = o, by hand for k = 1, 2 and 4."""
+    sides = np.sqrt([0.5, 0.5 / 2, 0.5 / 4])
+    fainter = fainter_where_dense(splats(sides, 0.5), [camera_at(DEPTH)])
+    opacities = np.asarray(fainter.opacities, np.float64)
+    np.testing.assert_allclose(1 - (1 - opacities) ** [1, 2, 4], 0.5, rtol=1e-4)
+
+
+def test_splats_of_a_pixel_stay_bit_for_bit():
+    given = splats([0.71, 1.0, 30.0], 0.5)
+    np.testing.assert_array_equal(fainter_where_dense(given, [camera_at(DEPTH)]).logit_opacities, given.logit_opacities)
+
+
+def test_the_camera_that_sees_a_splat_largest_decides():
+    given = splats([0.5, 0.5], 0.5)
+    near, far, behind = camera_at(DEPTH / 2), camera_at(4 * DEPTH), camera_at(-DEPTH, 10 * FOCAL)
+    np.testing.assert_array_equal(fainter_where_dense(given, [far, near]).logit_opacities, given.logit_opacities)
+    one = fainter_where_dense(given, [far]).opacities
+    np.testing.assert_array_equal(fainter_where_dense(given, [far, behind]).opacities, one)
+    assert (np.asarray(one) < 0.5).all()
+
+
+@pytest.mark.parametrize(("opacity", "least"), [(0.5, 0.1), (0.1, 0.1), (0.04, 0.04)])
+def test_no_splat_becomes_fainter_than_3dgs_begins(opacity, least):
+    opacities = fainter_where_dense(splats([1e-2, 1e-3], opacity), [camera_at(DEPTH)]).opacities
+    np.testing.assert_allclose(opacities, least, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("num_points", "least", "most"), [(300, 0.0, 0.1), (9_000, 0.5, 1.0)])
+def test_dense_points_start_fainter_and_sparse_ones_as_asked(num_points, least, most):
+    scene = a2tg.synthetic_scene(num_views=6, num_points=num_points, width=32, height=24)
+    opacities = np.asarray(initial_model(scene, a2tg.Gaussians2dMcmc.preset("quick")).gaussians.opacities)
+    assert least <= (opacities < 0.499).mean() <= most
+    assert opacities.max() == pytest.approx(0.5)
