@@ -145,7 +145,7 @@ def test_a_stage_stopped_under_one_system_goes_on_under_another(tmp_path):
 
 @dataclasses.dataclass(frozen=True)
 class FakeJob:
-    """What the queue asks of a job."""
+    """Needs of a job, as the queue sees them."""
 
     key: str
     start: "FakeJob | None" = None
@@ -422,7 +422,7 @@ def test_a_mean_counts_each_scene_once_however_many_seeds_it_has():
 
 
 def test_an_interval_over_scenes_is_that_of_students_t():
-    """Of four values the half-width is 3.182 standard errors, as tables of t say."""
+    """The half-width of four values is 3.182 standard errors, as tables of t say."""
     found = tables.over_scenes([1.0, 2.0, 3.0, 6.0])
     error = np.sqrt(14 / 3 / 4)
     assert found.mean == 3.0 and found.half_width == pytest.approx(3.18245 * error, rel=1e-5)

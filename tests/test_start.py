@@ -1,4 +1,4 @@
-"""What training starts from: dense points, whose splats are smaller than a pixel."""
+"""Start of training from dense points, whose splats are smaller than a pixel."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What a splat shows: the renderer draws by an `AppearanceRule`, which an `Appearance` makes of its parameters.
+"""Appearances of splats: the renderer draws by an `AppearanceRule`, which an `Appearance` makes of its parameters.
 
 `rule` and `base` are these two interfaces. `base` is made of two small ones: `rows`, which densification calls, and
 `stored`, which files call. `plain`, `textured`, `movable_kernels` and `billboards` implement all of them. `banded` adds

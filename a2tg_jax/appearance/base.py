@@ -25,7 +25,7 @@ from a2tg_jax.texture import AtlasLayout, Textures
 
 @dataclasses.dataclass(frozen=True)
 class Appearance(MovableRows, StoredArrays):
-    """What splats show. The defaults suit an appearance whose parameters have one row per Gaussian and no layout.
+    """Appearance of splats. The defaults suit an appearance whose parameters have one row per Gaussian and no layout.
 
     A subclass overrides `allocate` and `rule`, and whatever else differs. Callers ask for capabilities (`is_linear`,
     `texture_options`, `has_degrees`, …), never for a class: each defaults to no.

@@ -1,4 +1,4 @@
-"""What densification asks of an appearance: its rows change places, share what they show, or fade."""
+"""Rows of an appearance, as densification sees them: they change places, share what they show, or fade."""
 
 import dataclasses
 from typing import Any

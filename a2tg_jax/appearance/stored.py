@@ -1,4 +1,4 @@
-"""What files ask of an appearance: named arrays, and whether Gaussians, degrees and textures say all that it shows."""
+"""Appearances as files see them: named arrays, and whether Gaussians, degrees and textures say all that it shows."""
 
 from typing import Any
 

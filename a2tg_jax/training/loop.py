@@ -125,7 +125,7 @@ class StageRun:
 
     @property
     def history(self) -> History:
-        """What has been logged so far."""
+        """Logged figures so far."""
         return self._logged.history
 
     @property

@@ -103,7 +103,7 @@ def backward(
 
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
-    """As `rasterize.tiles.tile_lists`."""
+    """List the splats of each tile; arguments and result are those of `rasterize.tiles.tile_lists`."""
     from a2tg_jax.rasterize.kernels.native.lists import list_loops
 
     key = str(M.dtype), grid.tile_size, near_plane

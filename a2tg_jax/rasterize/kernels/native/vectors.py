@@ -188,7 +188,7 @@ def _orders_by_compare(value: ir.Value, sign_of_zero: float) -> bool:
 
 
 class Translator(Vectors):
-    """What the translation of a primitive may ask for: operations on vectors, and the code of a further jaxpr."""
+    """Tools for the translation of a primitive: operations on vectors, and the code of a further jaxpr."""
 
     taking_part: ir.Value | None = None
     """The lanes whose values will be used; None: all. Loops go on for them only."""
