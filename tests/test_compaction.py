@@ -106,7 +106,7 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("model", "words"),
     [
-        (Model(some_gaussians()), "does not know where it was trained"),
+        (Model(some_gaussians()), "the model has no cameras to measure a loss with"),
         (None, "no such"),
     ],
 )

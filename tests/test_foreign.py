@@ -13,7 +13,7 @@ from a2tg_jax.rasterize.kernels.native import ffi
 SCRIPT = """
 import os, signal, sys, threading, time
 import jax, jax.numpy as jnp
-from a2tg_jax.kernels import ffi, threads
+from a2tg_jax.rasterize.kernels.native import ffi, threads
 
 # A program that a shell runs in the background ignores Ctrl-C, and so do those that it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -106,7 +106,7 @@ def test_results_are_views_of_the_buffers():
 ENDING = """
 import threading, time
 import jax, jax.numpy as jnp
-from a2tg_jax.kernels import ffi
+from a2tg_jax.rasterize.kernels.native import ffi
 
 def handler(arguments, results):
     if arguments[0][0] > 0:

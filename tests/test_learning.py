@@ -33,27 +33,27 @@ def test_flat_psnr_is_that_of_the_mean_colour():
 def frozen(scene, **changes):
     """A system that cannot learn from bad initial colours."""
     black = dataclasses.replace(scene, colors=np.zeros_like(scene.colors))
-    numbers = {"stage1_iterations": 110, "initial_opacity": 0.9, "densify": a2tg.McmcConfig(is_enabled=False)}
+    numbers = {"stage1_iterations": 210, "initial_opacity": 0.9, "densify": a2tg.McmcConfig(is_enabled=False)}
     return black, a2tg.Gaussians2dMcmc(**{**numbers, "rates": NO_RATES, **changes})
 
 
 def test_training_that_does_not_learn_is_told(scene):
     black, system = frozen(scene)
-    with pytest.warns(UserWarning, match=r"does not learn: [\d.]+ dB .* after 100 iterations, .* flat colour .* try "):
+    with pytest.warns(UserWarning, match=r"does not learn: [\d.]+ dB .* after 200 iterations, .* flat colour .* try "):
         a2tg.fit(black, system, progress=False)
 
 
 def test_training_that_learns_is_left_alone(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=110, initial_opacity=0.5), progress=False)
+        a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=210, initial_opacity=0.5), progress=False)
 
 
 def test_short_and_later_stages_are_not_judged(scene):
     order = BatchOrder(scene.train, 1, 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for iterations, is_first in ((99, True), (600, False)):
+        for iterations, is_first in ((199, True), (600, False)):
             check = LearningCheck(scene.train, order, iterations, "black", is_first=is_first)
             for iteration in range(1, iterations + 1):
                 check.observe(iteration, 0.0)
@@ -72,10 +72,10 @@ def test_the_check_comes_after_a_fifth_and_once(scene):
 
 def test_photographs_of_one_colour_prove_nothing(scene):
     views = tuple(dataclasses.replace(view, picture=np.full((18, 24, 3), 90, np.uint8)) for view in scene.train)
-    check = LearningCheck(views, BatchOrder(views, 1, 0), 100, "black", is_first=True)
+    check = LearningCheck(views, BatchOrder(views, 1, 0), 200, "black", is_first=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for iteration in range(1, 101):
+        for iteration in range(1, 201):
             check.observe(iteration, 20.0)
 
 

@@ -125,7 +125,7 @@ def test_systems_that_cannot_be_shown_are_said_to_be():
     live = LiveView(SCENE, "scene")
     live(run, never)
     encoded(live)
-    assert "bbsplat" in status(live)["message"] and status(live)["version"] == 0
+    assert "cannot show Billboards" in status(live)["message"] and status(live)["version"] == 0
 
 
 def test_a_training_that_is_looked_at_gives_the_same_bits():

@@ -35,7 +35,7 @@ for check_vma in (True, False):
     gradient = jax.jit(jax.grad(loss), static_argnums=2)(gaussians, viewmats, check_vma)
     np.testing.assert_allclose(gradient.means, wanted.means, rtol=1e-3, atol=1e-4)
 
-from a2tg_jax.losses import mean_ssim
+from a2tg_jax.training.losses import mean_ssim
 
 photo = jnp.linspace(0, 1, 32 * 32 * 3).reshape(32, 32, 3)
 photos = jnp.stack([photo**2, photo**3])

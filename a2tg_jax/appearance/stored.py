@@ -65,7 +65,7 @@ class StoredArrays:
         has_rows = not jax.tree.leaves(layout)
         found = {leaf.shape[0] for leaf in jax.tree.leaves(params)} if has_rows else {getattr(layout, "num", num)}
         if found - {num}:
-            raise ValueError(f"{kind} is of {min(found - {num})} rows, but there are {num} Gaussians")
+            raise ValueError(f"{kind} has {min(found - {num})} rows, but there are {num} Gaussians")
         if isinstance(params, Textures) and isinstance(layout, AtlasLayout):
             check_textures(params, layout, num)
             check_places(params, layout)

@@ -53,7 +53,11 @@ def check_picture(path: str | os.PathLike[str]) -> tuple[int, int]:
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     """Open an image within the block; every decoding error becomes one ValueError."""
-    with open_regular(path, MOST_BYTES) as file:
+    try:
+        opened = open_regular(path, MOST_BYTES)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    with opened as file:
         yield from _decoded(path, file)
 
 
@@ -67,8 +71,12 @@ def _decoded(path: str | os.PathLike[str], file: BufferedReader) -> Iterator[Ima
     except PictureRefused:
         raise
     except Exception as error:  # what a damaged picture raises goes from SyntaxError to RuntimeError and struct.error
-        reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
-        raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: str | os.PathLike[str], error: Exception) -> ValueError:
+    reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
+    return ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it")
 
 
 def _check_size(path: str | os.PathLike[str], image: Image.Image) -> None:

@@ -14,7 +14,7 @@ from a2tg_jax.training.stage import Background
 
 CHECKED_AFTER = 0.2
 """Share of the first stage after which training must have learned something."""
-LEAST_ITERATIONS = 100
+LEAST_ITERATIONS = 200
 """Training is not judged earlier than this."""
 NUM_COMPARED = 16
 """Iterations before the check whose PSNR is averaged."""
