@@ -217,7 +217,7 @@ def head(**values) -> str:
         (changed("appearance/sizes", lambda x: x.ravel()), "sizes must be integers"),
         (
             edit(lambda _, a: a.update({"appearance/sizes": np.ones((2, 2), int), "appearance/texels": np.eye(2, 4)})),
-            "of 2 rows, but there are 7 Gaussians",
+            "has 2 rows, but there are 7 Gaussians",
         ),
         (edit(lambda header, _: header["appearance"].update(name="Curtains")), "Curtains.*not known here"),
         (edit(lambda header, _: header["appearance"].update(name="jax.numpy")), "not known here"),
