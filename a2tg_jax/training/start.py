@@ -13,6 +13,7 @@ from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
+from a2tg_jax.render import RenderSettings
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -23,7 +24,7 @@ FILTER_VARIANCE = 0.5
 """Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
 LEAST_OPACITY = INITIAL_OPACITY
 """Opacity below which dense Gaussians are not made fainter: the one that 3DGS begins with."""
-NEAR = 0.2
+NEAR = RenderSettings.near_plane
 """Depth from which splats are drawn."""
 SMALLEST_SIDE = 1e-6
 
