@@ -96,11 +96,13 @@ class Banded(AppearanceAround):
 
     def gather(self, params: BandedParams, layout: BandedLayout, rows: Array) -> BandedParams:
         bands = gather_bands(params.bands, layout.bands, rows)
-        return super().gather(params, layout, rows)._replace(bands=bands)
+        gathered: BandedParams = super().gather(params, layout, rows)._replace(bands=bands)
+        return gathered
 
     def clear(self, params: BandedParams, layout: BandedLayout, is_cleared: Array) -> BandedParams:
         bands = clear_bands(params.bands, layout.bands, is_cleared)
-        return super().clear(params, layout, is_cleared)._replace(bands=bands)
+        cleared: BandedParams = super().clear(params, layout, is_cleared)._replace(bands=bands)
+        return cleared
 
     def first_rows(self, params: BandedParams, layout: BandedLayout, num: int) -> tuple[BandedParams, BandedLayout]:
         bands, owners = first_bands(params.bands, layout.bands, num)

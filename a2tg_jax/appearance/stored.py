@@ -73,9 +73,13 @@ class StoredArrays:
 
 def parameter_shapes(appearance: Any) -> tuple[Any, Any]:
     """Return the shapes of the parameters, and the layout, that an appearance allocates for one Gaussian."""
-    row = lambda *shape: jax.ShapeDtypeStruct((1, *shape), jnp.float32)  # noqa: E731
+
+    def row(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, *shape), jnp.float32)
+
     gaussians: Any = Gaussians(row(3), row(4), row(2), row(), row(16, 3))  # type: ignore[arg-type]
-    return jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
+    shapes: tuple[Any, Any] = jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
+    return shapes
 
 
 def _name(path: tuple[Any, ...]) -> str:

@@ -98,7 +98,7 @@ def _is_deep(image: Image.Image) -> bool:
     decides."""
     arguments = [tile[-1] for tile in getattr(image, "tile", ())]
     if image.format == "TIFF":
-        return max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8  # type: ignore[attr-defined]
+        return bool(max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8)  # type: ignore[attr-defined]
     if image.format == "PPM":
         return any(isinstance(args, tuple) and args[-1] > 255 for args in arguments)
     return image.format == "PNG" and any(";16" in str(args) for args in arguments)

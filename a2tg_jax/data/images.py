@@ -95,7 +95,8 @@ def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> Non
 
 def scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int]) -> np.ndarray:
     """Return K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
-    return np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
+    scaled: np.ndarray = np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
+    return scaled
 
 
 def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

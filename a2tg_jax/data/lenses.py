@@ -149,4 +149,5 @@ def _straight(planes: np.ndarray) -> np.ndarray:
     """Return uint8 pixels with straight alpha, the inverse of `_premultiplied`."""
     if planes.shape[2] == 4:
         planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
-    return np.clip(np.rint(planes), 0, 255).astype(np.uint8)
+    pixels: np.ndarray = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
+    return pixels

@@ -38,7 +38,8 @@ def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.rando
     coarse = coarse + LAMP_LIGHT * _lamp_light(shapes, points, normals, rng)
     factors = colors.shape[0] / rows, colors.shape[1] / columns
     fine = zoom(coarse.reshape(rows, columns), factors, order=1, grid_mode=True, mode="nearest")
-    return np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+    pixels: np.ndarray = np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+    return pixels
 
 
 def _lamp_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:

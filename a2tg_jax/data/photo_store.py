@@ -7,9 +7,10 @@ import weakref
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.host.memory import memory_limit
@@ -29,7 +30,7 @@ class Picture:
     """The pixels; not to be written to."""
     is_held: bool = False
     """Whether they are in memory."""
-    dtype: Any = np.uint8
+    dtype: DTypeLike = np.uint8
 
     @staticmethod
     def of(pixels: "np.ndarray | Picture") -> "Picture":

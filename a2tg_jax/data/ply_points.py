@@ -59,4 +59,5 @@ def _colors(columns: Mapping[str, np.ndarray], header: VertexHeader) -> np.ndarr
     colors = np.stack([columns[name] for name in COLORS], axis=-1)
     if header.fields["red"].startswith("f"):
         colors = np.rint(np.clip(np.nan_to_num(colors), 0, 1) * 255)
-    return np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
+    pixels: np.ndarray = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
+    return pixels

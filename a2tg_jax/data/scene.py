@@ -141,7 +141,8 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
     if not view.has_alpha:
         return color
     alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
-    return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
+    composed: np.ndarray = alpha * color + (1 - alpha) * np.asarray(background, np.float32)
+    return composed
 
 
 def assemble_scene(
@@ -269,7 +270,8 @@ def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud
 
 def _are_somewhere(points: np.ndarray) -> np.ndarray:
     """Return [P] whether all coordinates of a point are within bounds."""
-    return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+    are_within: np.ndarray = (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+    return are_within
 
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:

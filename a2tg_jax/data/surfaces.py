@@ -199,7 +199,8 @@ def look_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     rows, columns = image.shape[:2]
     row = np.clip((v * rows).astype(np.int32), 0, rows - 1)
     column = np.clip((u * columns).astype(np.int32), 0, columns - 1)
-    return np.take(image.reshape(-1, 3), row * columns + column, axis=0)
+    texels: np.ndarray = np.take(image.reshape(-1, 3), row * columns + column, axis=0)
+    return texels
 
 
 def column(vector: Vector) -> np.ndarray:
@@ -209,7 +210,8 @@ def column(vector: Vector) -> np.ndarray:
 
 def squares(*components: np.ndarray) -> np.ndarray:
     """Return the sum of their squares."""
-    return sum(component * component for component in components)
+    total: np.ndarray = sum(component * component for component in components)
+    return total
 
 
 def quadratic_roots(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -150,7 +150,8 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
 
 def _center(viewmat: np.ndarray) -> np.ndarray:
     """Return [3, 1] float32 position of a camera."""
-    return (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
+    center: np.ndarray = (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
+    return center
 
 
 def _directions(viewmat: np.ndarray, K: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -51,7 +51,8 @@ def _nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
     projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projections.mean(axis=0)
     if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
-        return centers.mean(axis=0)
+        mean: np.ndarray = centers.mean(axis=0)
+        return mean
     return np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", projections, centers) / len(centers))
 
 
@@ -63,4 +64,5 @@ def _rotation_to_z(up: np.ndarray) -> np.ndarray:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = np.linalg.norm(axis)
     axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
-    return Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
+    rotation: np.ndarray = Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
+    return rotation

@@ -57,7 +57,8 @@ class Trial:
     @property
     def precision(self) -> Precision:
         """Of its group."""
-        return getattr(self.choices, self.group)
+        chosen: Precision = getattr(self.choices, self.group)
+        return chosen
 
 
 def loss_on_views(
@@ -102,7 +103,9 @@ def loss_beside_renders(
     return loss
 
 
-def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings):
+def _drawing(
+    model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings
+) -> Callable[[Model], Iterator[np.ndarray]]:
     """Draw models like the given one for cameras, clipped to [0, 1]; compiled once as long as the room suffices."""
     if not cameras:
         raise ValueError("there are no views to measure a loss on")

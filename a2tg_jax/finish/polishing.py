@@ -8,13 +8,14 @@ draws a change of colours and its transpose is the backward pass.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
@@ -80,16 +81,23 @@ def _jitted() -> jit:
     return jit(_solve, static_argnums=(3, 4))
 
 
-def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):
+def _solve(
+    model: Model,
+    groups: list[Photographs],
+    background: Array,
+    settings: RenderSettings,
+    num_steps: int,
+    ridge: ArrayLike,
+) -> Colors:
     """Return the changes of the colours."""
 
-    def over_views(function):
+    def over_views(function: Callable[[Camera, Photographs], Colors]) -> Colors:
         """Return the sum over all views of what a function of camera and photograph gives."""
-        total = jax.tree.map(jnp.zeros_like, colors_of(model))
+        total: Colors = jax.tree.map(jnp.zeros_like, colors_of(model))
         for group in groups:
             height, width = group.images.shape[1:3]
 
-            def step(total, view, height=height, width=width):
+            def step(total: Colors, view: Photographs, height: int = height, width: int = width) -> tuple[Colors, None]:
                 camera = Camera(view.viewmats, view.Ks, width, height)
                 return jax.tree.map(jnp.add, total, function(camera, view)), None
 
@@ -106,7 +114,8 @@ def _solve(model: Model, groups: list[Photographs], background: Array, settings:
 
         return over_views(of_view)
 
-    return solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
+    changes: Colors = solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
+    return changes
 
 
 def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSettings) -> Array:
@@ -129,7 +138,8 @@ def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Ar
     """Return the transpose of `draw_change`, of an image."""
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
     _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
-    return back(image)[0]
+    transposed: Colors = back(image)[0]
+    return transposed
 
 
 def colors_of(model: Model) -> Colors:

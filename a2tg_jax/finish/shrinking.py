@@ -216,7 +216,7 @@ def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textu
     assert model.textures is not None
     settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
     background = jnp.asarray(background, model.gaussians.means.dtype)
-    total = jax.tree.map(jnp.zeros_like, model.textures[0])
+    total: Textures = jax.tree.map(jnp.zeros_like, model.textures[0])
     for index, view in enumerate(views):
         total = jax.tree.map(jnp.add, total, _jitted()(model, view.camera, background, jax.random.key(index), settings))
     return total
@@ -238,4 +238,5 @@ def _weights_in(model: Model, camera: Camera, background: Array, key: Array, set
 
     color, back = jax.vjp(draw, textures)
     (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
-    return jax.tree.map(jnp.square, slopes)
+    squares: Textures = jax.tree.map(jnp.square, slopes)
+    return squares

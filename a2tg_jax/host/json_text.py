@@ -94,7 +94,8 @@ def _outside_strings(data: bytes) -> np.ndarray:
     """Return the brackets of a JSON text, and whatever else stands outside its strings, as bytes."""
     letters = np.frombuffer(data.replace(b"\\\\", b"").replace(b'\\"', b""), np.uint8)
     num_quotes = np.cumsum(letters == ord('"'), dtype=np.uint8)  # Wraps, which keeps it even or odd.
-    return letters[num_quotes % 2 == 0]
+    outside: np.ndarray = letters[num_quotes % 2 == 0]
+    return outside
 
 
 def _check_brackets(outside: np.ndarray) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host.cores import VARIABLE, num_threads
 from a2tg_jax.host.startup import processor_key
@@ -41,4 +42,4 @@ def this_machine() -> Machine:
     """Return the machine of this process. This starts JAX's devices."""
     device = jax.devices()[0]
     kind = f"{device.platform} {device.device_kind}"
-    return Machine(jax.__version__, jax.lib.__version__, kind, processor_key(), num_threads())
+    return Machine(jax.__version__, jaxlib_version, kind, processor_key(), num_threads())

@@ -6,6 +6,7 @@ import platform
 from pathlib import Path
 
 import jax
+from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host import cores
 
@@ -84,7 +85,7 @@ def compilation_cache_folder() -> Path:
 
     It lies in `cache_folder()` and may be deleted at any time.
     """
-    return cache_folder() / f"jaxlib-{jax.lib.__version__}-{processor_key()}"
+    return cache_folder() / f"jaxlib-{jaxlib_version}-{processor_key()}"
 
 
 def processor_key() -> str:

@@ -165,7 +165,7 @@ def _checkpoint_of(
     options.check()
     stage = find_stage(options, header["stage"])
     is_ahead = check_is_ahead(header["is_ahead"], stage)
-    (gaussians,) = _filled((Gaussians(*range(5)),), arrays)  # type: ignore[arg-type]
+    (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
     shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
     params, layout = stage.appearance.from_arrays(shown)
@@ -220,6 +220,6 @@ def _filled(template: Any, arrays: dict[str, np.ndarray]) -> Any:
 def _wanted(stage: Stage, gaussians: Gaussians, params: Any, layout: Any, is_ahead: Sequence[bool]) -> TrainState:
     """Shapes and dtypes of a state of a stage, of which some events may be past."""
     model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
-    state = jax.eval_shape(lambda: initial_state(stage, model, [""]))
+    state: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
     events = (event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
     return dataclasses.replace(state, events=tuple(events))

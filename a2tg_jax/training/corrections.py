@@ -136,7 +136,7 @@ def _known_row(correction: Correction, name: str, origin: Origin | None) -> np.n
     rows = None if origin is None else origin.corrections.get(correction.name)
     if origin is None or rows is None or name not in origin.names:
         return correction.neutral
-    row = rows[origin.names.index(name)]
+    row: np.ndarray = rows[origin.names.index(name)]
     if row.shape != correction.neutral.shape:
         shapes = f"{list(correction.neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
         raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")

@@ -172,7 +172,8 @@ def _back_project(depth: Array, camera: Camera) -> Array:
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
     rotation = camera.viewmat[:3, :3]
-    return (rays @ rotation) * depth[..., None] + camera.center[None, None]
+    points: Array = (rays @ rotation) * depth[..., None] + camera.center[None, None]
+    return points
 
 
 @jax.custom_vjp
@@ -202,4 +203,5 @@ def _blur(x: Array, axis: int) -> Array:
     for tap in range(SSIM_RADIUS):
         blurred = blurred + (shifted[tap] + shifted[-1 - tap]) * SSIM_TAPS[tap]
     # Without the barrier XLA fuses the two passes into one of 121 taps.
-    return jax.lax.optimization_barrier(blurred)
+    kept: Array = jax.lax.optimization_barrier(blurred)
+    return kept

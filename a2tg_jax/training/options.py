@@ -279,7 +279,8 @@ def like(kind: type[System] | System, other: System) -> System:
       kind: class or instance that gives all other options.
       other: the other system.
     """
-    return _like(kind() if isinstance(kind, type) else kind, other)
+    changed: System = _like(kind() if isinstance(kind, type) else kind, other)
+    return changed
 
 
 def _like(value: Any, other: Any) -> Any:

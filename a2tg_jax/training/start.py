@@ -136,7 +136,8 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
     if num == 0:
         return gaussians
     empty = no_rows(num, gaussians.sh.shape[1], gaussians.means.dtype)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
+    filled: Gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
+    return filled
 
 
 def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:

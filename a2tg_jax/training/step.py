@@ -227,7 +227,8 @@ def _gradients(
         return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
 
     pictures = batch.images, batch.alphas, batch.masks
-    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
+    gradients: BatchGradients = jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
+    return gradients
 
 
 def _over(image: Array, alpha: Array | None, background: Array) -> Array:
@@ -317,7 +318,9 @@ def _at_its_times(
     def wait(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
         return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
 
-    return jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
+    changed: tuple[Model, AdamState, Any, EventInfo]
+    changed = jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
+    return changed
 
 
 def _status(clock: Clock, tried: Attempt) -> Array:
