@@ -1,4 +1,4 @@
-"""Parsed-line arguments parsed into a dataclass by tyro, with every error on one line."""
+"""Command-line arguments parsed into a dataclass by tyro, with every error on one line."""
 
 import contextlib
 import io
