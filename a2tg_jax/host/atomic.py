@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from a2tg_jax.host.operating_system import flush_folder
+
 PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 """Name pattern of a partial file: the name of the final file, and the process."""
 
@@ -35,19 +37,6 @@ def left_over(folder: Path) -> dict[Path, Path]:
         return {}
     names = {entry: PARTIAL.fullmatch(entry.name) for entry in folder.iterdir()}
     return {entry: folder / match[1] for entry, match in names.items() if match}
-
-
-def flush_folder(folder: Path) -> None:
-    """Flush the names of a folder's files to disk, if the operating system can flush folders."""
-    if os.name == "nt":
-        return
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        # Some file systems of networks refuse it; they keep names in another way.
-        with contextlib.suppress(OSError):
-            os.fsync(number)
-    finally:
-        os.close(number)
 
 
 def _flush(path: Path) -> None:

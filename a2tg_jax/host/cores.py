@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from a2tg_jax.host.control_groups import group_folders
+from a2tg_jax.host.operating_system import has_control_groups, num_cores
 
 VARIABLE = "A2TG_NUM_THREADS"
 
@@ -49,14 +50,12 @@ def num_threads() -> int:
 
 def _usable_cores() -> int:
     """Return the cores that the process may run on, or fewer where a control group (a container) gives it less time."""
-    has_affinity = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, _own_quota())))
+    return max(1, math.ceil(min(num_cores(), _own_quota())))
 
 
 @functools.cache
 def _own_quota() -> float:
-    return cpu_quota(Path("/"))
+    return cpu_quota(Path("/")) if has_control_groups() else math.inf
 
 
 def cpu_quota(root: Path) -> float:

@@ -6,8 +6,10 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from a2tg_jax.host.operating_system import ending_signals
+
 CTRL_C = signal.SIGINT
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+ENDING = ending_signals()
 
 
 class Stopped(KeyboardInterrupt):

@@ -9,6 +9,7 @@ import jax
 from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host import cores
+from a2tg_jax.host.operating_system import processor_features
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
 """Versions known to have the flags below; an unknown flag would end the process."""
@@ -38,7 +39,7 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
     if num_threads is not None:
         cores.set_num_threads(num_threads)
     cores.num_threads()
-    features = _processor_features()
+    features = processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
     if use_cache and jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(compilation_cache_folder()))
@@ -90,14 +91,5 @@ def compilation_cache_folder() -> Path:
 
 def processor_key() -> str:
     """Return a short text shared by processors that run the same compiled code."""
-    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
+    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(processor_features()))}"
     return hashlib.sha256(processor.encode()).hexdigest()[:12]
-
-
-def _processor_features() -> frozenset[str]:
-    """Return the processor's features as Linux lists them; empty elsewhere."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return frozenset()
-    return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))
