@@ -87,8 +87,8 @@ def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product:
 def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera) -> Array:
     """2DGS's normal consistency: the mean over pixels of Σ_i ω_i·(1 - n_i·n_depth) = alpha - normal·n_depth.
 
-    n_depth is the normal of the rendered depth. The image border, and pixels beside one where nothing was
-    rendered, have no such normal and count as 0.
+    n_depth is the normal of the rendered depth. Pixels at the image border, or beside an empty pixel, have no such
+    normal and count as 0.
 
     Args:
       normal: [H, W, 3] rendered normals Σ n·α·T in the world, facing the camera, not divided by alpha.
@@ -116,7 +116,7 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
 
     Args:
       depth: [H, W] depth along the camera's z axis.
-      is_valid: [H, W], where the depth means something.
+      is_valid: [H, W] bool, pixels with a depth.
       camera: the view.
 
     Returns:
