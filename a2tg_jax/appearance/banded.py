@@ -1,4 +1,4 @@
-"""Spherical harmonics of a degree per Gaussian, on top of any other appearance."""
+"""Spherical harmonics with a degree per Gaussian, on top of any other appearance."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from a2tg_jax.core.gaussians import Gaussians
 
 
 class BandedParams(NamedTuple):
-    """Coefficients beyond those that all Gaussians have, and the parameters of the inner appearance."""
+    """Coefficients beyond the base degree, and the parameters of the inner appearance."""
 
     bands: Bands
     inner: Any
@@ -66,7 +66,7 @@ class BandedRule(RuleAround):
 
 @dataclasses.dataclass(frozen=True)
 class Banded(AppearanceAround):
-    """Another appearance, and view dependence of a degree per Gaussian."""
+    """Appearance with view dependence of a degree per Gaussian on top of another one."""
 
     inner: Appearance = dataclasses.field(default_factory=Plain)
 

@@ -1,4 +1,4 @@
-"""Spherical harmonics of a degree per Gaussian, as they are stored and trained: one padded table for each band.
+"""Spherical harmonics with a degree per Gaussian, stored and trained as one padded table for each band.
 
 Band l holds the 2l + 1 coefficients of degree l. All Gaussians have those of `Gaussians.sh`; one of a higher degree
 owns a row in the table of every band between. A Gaussian without a row in a table takes no bytes there. `Bands` holds

@@ -1,4 +1,4 @@
-"""The appearance of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
+"""Appearance of A²TG: each splat has its own texture, looked up bilinearly at (u, v).
 
 This module defines where (u, v) lies in a texture, and how its RGB and alpha change the splat. `texture` stores
 textures, `core.bilinear` interpolates them, `appearance.rule` is the interface. The renderer sees all textures one

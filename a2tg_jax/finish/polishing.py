@@ -1,9 +1,9 @@
-"""The best colours for given shapes: least squares over all that a picture is linear in.
+"""Best colours for given shapes: least squares over the parameters in which a picture is linear.
 
 A picture is linear in the RGB texels, and in the spherical harmonics of those Gaussians whose colour is not cut off at
-0. With positions, rotations, scales, opacities and alpha textures held, the squared error over all views is therefore
-quadratic in them, and a few steps of conjugate gradients come near its least: of J d = photograph − picture, where J
-draws a change of colours and its transpose is the backward pass.
+0. With positions, rotations, scales, opacities and alpha textures fixed, the squared error over all views is quadratic
+in them. A few steps of conjugate gradients on J d = photograph − picture come near its minimum: J draws a change of
+colours, and its transpose is the backward pass.
 """
 
 import dataclasses
@@ -48,24 +48,24 @@ class Photographs(NamedTuple):
     images: Array
     """[V, H, W, 3] over the background."""
     weights: Array
-    """[V, H, W, 1]: 1 where a pixel counts, else 0; or [V, 1, 1, 1] where all of them do."""
+    """[V, H, W, 1]: 1 where a pixel counts, else 0; [V, 1, 1, 1] if all do."""
 
 
 def polish(
     model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: Any = None
 ) -> Model:
-    """Return the model with colours nearer to the least squared error over the views (host).
+    """Return the model with colours that lower the squared error over the views (host).
 
     Args:
       model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
-      views: those it was trained on.
-      num_steps: of conjugate gradients, each of which draws every view forwards and backwards. Few steps are a
-        regularisation: many fit the training views at the price of others.
-      ridge: what the squares of the changes weigh beside the squared error, summed over pixels.
+      views: training views.
+      num_steps: number of steps of conjugate gradients; each draws every view forwards and backwards. Few steps
+        regularise, many overfit the training views.
+      ridge: weight of the squared changes beside the squared error, summed over pixels.
       background: [3] colour; None is the model's own.
 
     Raises:
-      ValueError: if there is no view, or the model shows something that is not linear in its parameters.
+      ValueError: if there is no view, or a picture is not linear in the appearance parameters.
     """
     _check(model, views)
     model = model.live
@@ -92,7 +92,7 @@ def _solve(
     """Return the changes of the colours."""
 
     def over_views(function: Callable[[Camera, Photographs], Colors]) -> Colors:
-        """Return the sum over all views of what a function of camera and photograph gives."""
+        """Return the sum over all views of a function of camera and photograph."""
         total: Colors = jax.tree.map(jnp.zeros_like, colors_of(model))
         for group in groups:
             height, width = group.images.shape[1:3]
@@ -124,7 +124,7 @@ def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSett
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
-    """Return the change [H, W, 3] of a picture by a change of the colours; linear in it."""
+    """Return the change [H, W, 3] of a picture by a change of the colours, a linear function."""
     is_shown = model.rule.own_color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
     sums = changed.rule.own_color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
