@@ -1,7 +1,7 @@
 """Procedural colours for the synthetic scene: float32 images [rows, columns, 3] in [0, 1], made by numpy alone.
 
-Sizes are in texels. The palette is soft and the details are even on purpose: they are finer than a Gaussian but not
-finer than its texels, so that a short training shows what textures add.
+Sizes are in texels. The palette is soft and the details are even on purpose. They are finer than a Gaussian but not
+finer than its texels, so that a short training shows the benefit of textures.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Surfaces that rays can hit and that carry an image: what the synthetic scene is made of.
+"""Surfaces of the synthetic scene: shapes that rays can hit, with an image on them.
 
-Vectors have their components first, [3, P] (numpy is several times faster so), float32. Rays are
-origin + t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along
-the columns and rows of a surface's image.
+Vectors are float32 with their components first, [3, P], which makes numpy several times faster. Rays are origin +
+t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along the columns and
+rows of a surface's image.
 """
 
 import dataclasses
@@ -174,7 +174,7 @@ def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.nd
 
 
 def trace(surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours and places of what rays from one point see.
+    """Return the colours and positions of the hits of rays from one point.
 
     Args:
       surfaces: the scene.

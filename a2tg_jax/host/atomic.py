@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and are on the disk before they take the place of others."""
+"""Atomic writes: files appear whole or not at all, and reach the disk before they replace others."""
 
 import contextlib
 import os
@@ -16,8 +16,8 @@ PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
 
-    A run killed while it writes, or a machine that loses its power, leaves the old file, or none, never half of one.
-    Missing parent folders are made.
+    If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
+    folders are made.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -16,10 +16,10 @@ _chosen: int | None = None
 def set_num_threads(num_threads: int | None) -> None:
     """Set the number of threads of native loops, from their next call on; XLA's own threads are not affected.
 
-    Results depend on it in the last bits of gradients only; on nothing else, such as timing.
+    Only the last bits of gradients depend on it.
 
     Args:
-      num_threads: at least 1; None: the environment's A2TG_NUM_THREADS, or else as many as the process may use.
+      num_threads: at least 1; None: A2TG_NUM_THREADS of the environment, or else all cores that the process may use.
 
     Raises:
       ValueError: if the number is not a positive integer.
@@ -33,7 +33,7 @@ def set_num_threads(num_threads: int | None) -> None:
 
 
 def num_threads() -> int:
-    """Return the number of threads: the one that was set, the environment's, or one per available core.
+    """Return the number of threads: the one set, that of the environment, or one per available core.
 
     Raises:
       ValueError: if the environment's is not a positive integer.
@@ -49,7 +49,7 @@ def num_threads() -> int:
 
 
 def _usable_cores() -> int:
-    """Return the cores that the process may run on, or fewer where a control group (a container) gives it less time."""
+    """Return the number of usable cores, which the quota of a control group (a container) may reduce."""
     return max(1, math.ceil(min(num_cores(), _own_quota())))
 
 
@@ -59,10 +59,10 @@ def _own_quota() -> float:
 
 
 def cpu_quota(root: Path) -> float:
-    """Return the processors' time per time that control groups leave to this process; inf without a limit.
+    """Return the number of processors that control groups grant this process; inf without a limit.
 
     Args:
-      root: of the file system, as for `host.control_groups.group_folders`.
+      root: root of the file system, as for `host.control_groups.group_folders`.
     """
     return min([math.inf, *map(_folder_quota, group_folders(root, "cpu"))])
 

@@ -1,4 +1,4 @@
-"""Dependencies of a run's last bits besides its options: versions, processor, device, threads."""
+"""Machine of a run. Beside the options it decides the last bits: versions, processor, device, threads."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ class Machine:
     """Number of threads of native loops, which divide sums among them."""
 
     def differences(self, now: "Machine") -> list[str]:
-        """Return what differs on another machine and changes the last bits, with a remedy if there is one."""
+        """Return the differences to another machine that change the last bits, with a remedy if there is one."""
         told = [
             f"{name} is {getattr(now, name)} and was {getattr(self, name)}"
             for name in ("jax", "jaxlib", "device", "processor")

@@ -1,4 +1,4 @@
-"""Memory that a process has and may have, and what compiled programs leave behind in it."""
+"""Memory of the process: its use, its limit, and the leftovers of compiled programs."""
 
 from pathlib import Path
 
@@ -14,9 +14,9 @@ LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.us
 
 
 def memory_limit(root: Path = Path("/")) -> int:
-    """Return bytes of memory that this process may have in all: what it has and what is free, now (host).
+    """Return the bytes of memory that this process may use in all: its own and the free memory, now (host).
 
-    Limits of control groups count. What a group keeps of files that can be read again is free.
+    Limits of control groups count. A group's cache of files counts as free.
 
     Args:
       root: of the file system. Without Linux's /proc the answer is the machine's memory.
@@ -30,12 +30,12 @@ def memory_limit(root: Path = Path("/")) -> int:
 
 
 def memory_peak(root: Path = Path("/")) -> int:
-    """Return bytes of memory that this process had at its peak; 0 if the system does not report it (host)."""
+    """Return the peak memory of this process in bytes; 0 if the system does not report it (host)."""
     return memory_numbers(root / "proc/self/status").get("VmHWM", 0)
 
 
 def _left_in(folder: Path) -> int | None:
-    """Return bytes that a control group still has room for; None without a limit."""
+    """Return the free bytes of a control group; None without a limit."""
     for limit, usage in LIMITS:
         try:
             room = int((folder / limit).read_text()) - int((folder / usage).read_text())
@@ -53,10 +53,10 @@ def tidy_memory() -> None:
 
 
 def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
-    """Drop all compiled programs of JAX if the process is about to run out of memory mappings for further ones.
+    """Drop all compiled programs of JAX if the process is about to run out of memory mappings.
 
-    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Where it gets
-    none it waits for ever. What is still needed is compiled again.
+    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Without one it
+    waits for ever. Programs in use are compiled again.
 
     Args:
       processes: /proc; on systems without one nothing happens.

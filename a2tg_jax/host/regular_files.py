@@ -1,7 +1,7 @@
-"""Files of strangers: only regular ones are opened, and none that is larger than its kind can be.
+"""Untrusted files: only regular files up to a largest size are opened.
 
-Links are followed, as their owner makes them on purpose. What they lead to must be a regular file: a device never ends,
-and a pipe waits for someone who writes.
+Links are followed, because their owner makes them on purpose. Their target must be a regular file: a device never ends,
+and a pipe waits for a writer.
 """
 
 import os
@@ -16,7 +16,7 @@ MOST_ARRAY_BYTES = 1 << 34
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:
-    """Return whether there is a regular file; False for nothing, or a folder.
+    """Return whether a path is a regular file; False if it is missing or a folder.
 
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.

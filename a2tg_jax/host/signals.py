@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: how a program ends when it is asked to."""
+"""Ctrl-C, SIGTERM and SIGHUP: orderly ends of a program."""
 
 import contextlib
 import signal
@@ -18,7 +18,7 @@ class Stopped(KeyboardInterrupt):
     def __init__(self, number: int, advice: str = ""):
         """Args:
         number: of the signal.
-        advice: how to go on with what was stopped.
+        advice: how to go on with the stopped work.
         """
         super().__init__(signal.Signals(number).name)
         self.number, self.advice = int(number), advice
@@ -44,7 +44,7 @@ def raised() -> Iterator[None]:
 def noted() -> Iterator[Callable[[], bool]]:
     """Note the first signal within the block, and raise `Stopped` at the second.
 
-    Yields a function that tells whether there was one. In the end any becomes a `Stopped`.
+    Yield a function that returns whether there was one. At the end of the block a noted signal raises `Stopped`.
     """
     numbers: list[int] = []
 

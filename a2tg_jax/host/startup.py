@@ -1,4 +1,4 @@
-"""Settings of JAX to be made before its first computation. The library itself never makes them."""
+"""Settings of JAX before its first computation. The library itself never changes them."""
 
 import hashlib
 import os
@@ -22,15 +22,14 @@ WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> None:
     """Make JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
-    Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS, of which the user's own settings have
-    precedence: while-loops are compiled whole, which compositing by XLA gains from, and vectors are 512 bits wide where
-    the processor has AVX-512. Native compositing needs neither. A GPU is not affected.
-    The command line calls this; programs and notebooks may.
+    Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS unless you have set them: while-loops are
+    compiled whole, which speeds up compositing by XLA, and vectors are 512 bits wide on processors with AVX-512. Native
+    compositing needs neither. GPUs are not affected. The command line calls this; programs and notebooks may.
 
     Args:
       use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
-        unless JAX has a cache already. Where XLA would print pages for every program it reads, its log is reduced to
-        fatal errors (`silence_xla`).
+        unless JAX has a cache already. If XLA would print pages for every cached program, its log is reduced to fatal
+        errors (`silence_xla`).
       num_threads: of native loops (`set_num_threads`); None leaves what is set.
 
     Raises:
@@ -49,18 +48,18 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
 
 
 def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the XLA flags that help on a processor with these features, as far as this JAX is known to have them."""
+    """Return the XLA flags that help on a processor with these features; none for an unknown version of JAX."""
     if jax_version not in CHECKED_JAX_VERSIONS:
         return ()
     return (WHOLE_LOOPS_FLAG, WIDE_VECTORS_FLAG) if "avx512f" in features else (WHOLE_LOOPS_FLAG,)
 
 
 def silence_xla() -> None:
-    """Let XLA's C++ code log fatal errors only; what it raises is not affected, nor what JAX itself logs.
+    """Let XLA's C++ code log fatal errors only. Exceptions and JAX's own log are not affected.
 
-    With AVX-512, XLA finds two tuning hints of its own missing from the processor's features whenever it reads a
-    program from a cache, and says at length that it may crash; it does not (openxla/xla#44565). A user who has asked
-    for XLA's log, by jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, gets it all.
+    With AVX-512, XLA warns at length of crashes whenever it reads a program from a cache, because two of its own tuning
+    hints are missing from the processor's features. It does not crash (openxla/xla#44565). If you ask for XLA's log by
+    jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, you get all of it.
     """
     asked = jax.config.values["jax_logging_level"]
     if asked in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "0":
@@ -70,7 +69,7 @@ def silence_xla() -> None:
 
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:
-    """Append flags to the environment's XLA_FLAGS, except those that the user has set already."""
+    """Append flags to XLA_FLAGS of the environment, except those that are set already."""
     own = os.environ.get("XLA_FLAGS", "").split()
     taken = {flag.split("=", 1)[0] for flag in own}
     os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
