@@ -10,9 +10,9 @@ from a2tg_jax.host.memory import (
     keep_room_for_programs,
     memory_limit,
     memory_peak,
-    return_free_memory,
     tidy_memory,
 )
+from a2tg_jax.host.operating_system import trim_heap
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.step import jitted_step
@@ -38,7 +38,7 @@ def test_programs_are_dropped_before_there_is_no_room_for_more(tmp_path, count, 
 
 def test_without_such_a_system_nothing_happens(tmp_path):
     assert not keep_room_for_programs(tmp_path / "nowhere")
-    return_free_memory()
+    trim_heap()
 
 
 @pytest.mark.parametrize("session", [None, Session(tidy_memory)])

@@ -1,4 +1,4 @@
-"""Appearances around another one: the one place where a wrapper forwards to what it wraps."""
+"""Wrappers around an appearance, and the one place where they forward to it."""
 
 import dataclasses
 from typing import Any
@@ -17,7 +17,7 @@ INNER = "inner."
 
 @dataclasses.dataclass(frozen=True)
 class AppearanceAround(Appearance):
-    """Shows what another appearance shows; a subclass adds to it.
+    """Wrapper that shows another appearance; a subclass adds to it.
 
     Parameters and layout are named tuples with a field `inner`, which belongs to the wrapped appearance. Every method
     changes that field only. A subclass calls these methods and changes its own fields; it provides `allocate`,

@@ -1,4 +1,4 @@
-"""Spherical harmonics of a degree per Gaussian, on top of any other appearance."""
+"""Spherical harmonics with a degree per Gaussian, on top of any other appearance."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from a2tg_jax.core.gaussians import Gaussians
 
 
 class BandedParams(NamedTuple):
-    """Coefficients beyond those that all Gaussians have, and the parameters of the inner appearance."""
+    """Coefficients beyond the base degree, and the parameters of the inner appearance."""
 
     bands: Bands
     inner: Any
@@ -66,7 +66,7 @@ class BandedRule(RuleAround):
 
 @dataclasses.dataclass(frozen=True)
 class Banded(AppearanceAround):
-    """Another appearance, and view dependence of a degree per Gaussian."""
+    """Appearance with view dependence of a degree per Gaussian on top of another one."""
 
     inner: Appearance = dataclasses.field(default_factory=Plain)
 
@@ -96,11 +96,13 @@ class Banded(AppearanceAround):
 
     def gather(self, params: BandedParams, layout: BandedLayout, rows: Array) -> BandedParams:
         bands = gather_bands(params.bands, layout.bands, rows)
-        return super().gather(params, layout, rows)._replace(bands=bands)
+        gathered: BandedParams = super().gather(params, layout, rows)._replace(bands=bands)
+        return gathered
 
     def clear(self, params: BandedParams, layout: BandedLayout, is_cleared: Array) -> BandedParams:
         bands = clear_bands(params.bands, layout.bands, is_cleared)
-        return super().clear(params, layout, is_cleared)._replace(bands=bands)
+        cleared: BandedParams = super().clear(params, layout, is_cleared)._replace(bands=bands)
+        return cleared
 
     def first_rows(self, params: BandedParams, layout: BandedLayout, num: int) -> tuple[BandedParams, BandedLayout]:
         bands, owners = first_bands(params.bands, layout.bands, num)

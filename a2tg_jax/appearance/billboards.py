@@ -80,7 +80,8 @@ class BillboardRule(AppearanceRule):
         return (u + 1) * ((self.side - 1) / 2)
 
     def _inside(self, u: Array) -> Array:
-        """Return 1 up to the outer texels and 0 from one texel beyond: clamped lookups become those among zeros."""
+        """Return the factor that makes a clamped lookup one among zeros: 1 up to the outer texels, 0 from one texel
+        beyond."""
         x = self._place(u)
         return jnp.clip(1 - jnp.maximum(-x, x - (self.side - 1.0)), 0.0, 1.0)
 
@@ -145,7 +146,7 @@ class Billboards(Bucketed):
     def share(
         self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, num_shares: Array
     ) -> tuple[Gaussians, Textures]:
-        """Return texels such that n over each other are as opaque as one was; scales stay unchanged."""
+        """Return texels such that n coincident pictures are as opaque as one was; scales stay unchanged."""
         (bucket,) = self.only(params)
         num_shares = jnp.pad(num_shares, (0, bucket.shape[0] - gaussians.num), constant_values=1)
         exponents = (1 / num_shares.astype(bucket.dtype))[:, None, None]

@@ -66,4 +66,5 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
 
     # A loop over nodes, not an axis of nodes: the memory stays that of one value per row.
     half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
-    return half * (2 * spacing / math.sqrt(math.pi))
+    whole: Array = half * (2 * spacing / math.sqrt(math.pi))
+    return whole

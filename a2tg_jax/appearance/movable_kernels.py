@@ -93,7 +93,7 @@ class MovableKernels(Appearance):
     """Upper limit of alpha."""
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[MovableKernelParams, tuple[()]]:
-        """Return colourless kernels around the mean, where they are together as opaque as the Gaussian, up to 0.82."""
+        """Return colourless kernels around the mean. Together they are as opaque there as the Gaussian, up to 0.82."""
         num, dtype = gaussians.num, gaussians.means.dtype
         centers = jnp.asarray(INITIAL_CENTERS, dtype)
         weight_at_mean = float(np.exp(-2 * INITIAL_SHARPNESS)) + LEAST_WEIGHT

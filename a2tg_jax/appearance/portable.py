@@ -1,4 +1,4 @@
-"""The appearance of Gaussians with or without textures and degrees, from what a file or a call says of them."""
+"""Appearance of Gaussians with or without textures and degrees, from the contents of a file."""
 
 from a2tg_jax.appearance.banded import Banded
 from a2tg_jax.appearance.base import Appearance

@@ -1,4 +1,4 @@
-"""Rows of an appearance, as densification sees them: they change places, share what they show, or fade."""
+"""Rows of an appearance for densification: they change places, share their opacity, or fade."""
 
 import dataclasses
 from typing import Any

@@ -8,8 +8,8 @@ K numbers it computes a colour residual and an alpha factor (`shade`):
     α = min(max_alpha, opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
 
 `texel_position`, `shade` and `falloff` are element-wise, on scalars or on arrays that broadcast. They see the rule
-without its arrays (`StaticRule`): put whatever is differentiated, or differs between splats, in the texels or in the
-numbers. XLA computes all else for the N splats at once, from any field.
+without its arrays (`StaticRule`): put differentiated values, and values that differ between splats, in the texels or in
+the numbers. XLA computes all else for the N splats at once, from any field.
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ class AppearanceRule:
     """[N] places of the splats' textures among the texels; None without textures."""
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
-        """Return the numbers [N, K] of `shade` and `falloff`, differentiable; they may depend on the view.
+        """Return the differentiable numbers [N, K] of `shade` and `falloff`, which may depend on the view.
 
         The renderer calls it once per view, and JAX differentiates it. Gradients of invisible rows are zero.
         """
@@ -191,7 +191,7 @@ class StaticRule:
 
 
 class _LeftOut:
-    """Stand-in for an array of a rule; every use raises an error that says what to do instead."""
+    """Stand-in for an array of a rule. Every use raises an error with a remedy."""
 
     def __init__(self, name: str):
         self._name = name

@@ -1,4 +1,4 @@
-"""Spherical harmonics of a degree per Gaussian, as they are stored and trained: one padded table for each band.
+"""Spherical harmonics with a degree per Gaussian, stored and trained as one padded table for each band.
 
 Band l holds the 2l + 1 coefficients of degree l. All Gaussians have those of `Gaussians.sh`; one of a higher degree
 owns a row in the table of every band between. A Gaussian without a row in a table takes no bytes there. `Bands` holds
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_shape, short_repr
 from a2tg_jax.core.numerics import normalize
@@ -76,7 +77,7 @@ def floats_of_band(degree: int) -> int:
     return 3 * (2 * degree + 1)
 
 
-def allocate_bands(degrees, base_degree: int, dtype=jnp.float32) -> tuple[Bands, BandLayout]:
+def allocate_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.float32) -> tuple[Bands, BandLayout]:
     """Return tables of zeros for Gaussians of the given degrees (host).
 
     Args:
@@ -100,7 +101,9 @@ def allocate_bands(degrees, base_degree: int, dtype=jnp.float32) -> tuple[Bands,
     return Bands(tuple(tables)), BandLayout(tuple(all_owners), len(degrees))
 
 
-def reallocate_bands(bands: Bands, layout: BandLayout, degrees, moments: Any = None) -> tuple[Bands, BandLayout, Any]:
+def reallocate_bands(
+    bands: Bands, layout: BandLayout, degrees: np.ndarray, moments: Any = None
+) -> tuple[Bands, BandLayout, Any]:
     """Return tables for other degrees (host): kept coefficients stay unchanged, new ones are 0.
 
     Args:
@@ -114,7 +117,9 @@ def reallocate_bands(bands: Bands, layout: BandLayout, degrees, moments: Any = N
     def rebuilt(old: Bands) -> tuple[Bands, BandLayout]:
         return _packed(_dense_tables(old, layout), degrees, layout.base_degree)
 
-    is_bands = lambda x: isinstance(x, Bands)  # noqa: E731
+    def is_bands(node: Any) -> bool:
+        return isinstance(node, Bands)
+
     moments = jax.tree.map(lambda leaf: rebuilt(leaf)[0] if is_bands(leaf) else leaf, moments, is_leaf=is_bands)
     return *rebuilt(bands), moments
 
@@ -196,7 +201,7 @@ def _dense_tables(bands: Bands, layout: BandLayout) -> list[np.ndarray]:
     return tables
 
 
-def _packed(dense: Sequence[np.ndarray], degrees, base_degree: int) -> tuple[Bands, BandLayout]:
+def _packed(dense: Sequence[np.ndarray], degrees: ArrayLike, base_degree: int) -> tuple[Bands, BandLayout]:
     """Pack dense tables for Gaussians of these degrees; tables of bands without owners may lack columns."""
     empty, layout = allocate_bands(degrees, base_degree)
     tables = []

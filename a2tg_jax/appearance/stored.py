@@ -1,4 +1,4 @@
-"""Appearances as files see them: named arrays, and whether Gaussians, degrees and textures say all that it shows."""
+"""Appearances in files: named arrays, and whether the portable formats can hold them."""
 
 from typing import Any
 
@@ -15,20 +15,20 @@ class StoredArrays:
     """Parameters and layout as named arrays. The defaults suit parameters with one row per Gaussian and no layout."""
 
     array_prefix: str = ""
-    """Beginning of the names of the arrays of `Appearance.base`."""
+    """Prefix of the array names of `Appearance.base`."""
     max_alpha: float = 0.99
     """Upper limit of a splat's alpha."""
 
     @property
     def is_portable(self) -> bool:
-        """Whether Gaussians, degrees, textures and `max_alpha` say all that splats show.
+        """Whether Gaussians, degrees, textures and `max_alpha` define the appearance completely.
 
         Compact files, web scenes and `shrink_textures` need this. A subclass of a portable class is not portable.
         """
         return False
 
     def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:
-        """Return named arrays from which `from_arrays` makes parameters and layout again, without padding (host)."""
+        """Return named arrays without padding, which `from_arrays` turns into parameters and layout (host)."""
         leaves = jax.tree_util.tree_flatten_with_path(params)[0]
         return {_name(path): np.asarray(leaf) for path, leaf in leaves}
 
@@ -36,7 +36,7 @@ class StoredArrays:
         """Return the parameters and layout of `arrays` (host).
 
         Raises:
-          ValueError: if an array is missing or of another shape than its neighbours.
+          ValueError: if an array is missing or its shape does not fit the others.
         """
         shapes, layout = parameter_shapes(self)
         leaves, treedef = jax.tree_util.tree_flatten_with_path(shapes)
@@ -73,9 +73,13 @@ class StoredArrays:
 
 def parameter_shapes(appearance: Any) -> tuple[Any, Any]:
     """Return the shapes of the parameters, and the layout, that an appearance allocates for one Gaussian."""
-    row = lambda *shape: jax.ShapeDtypeStruct((1, *shape), jnp.float32)  # noqa: E731
+
+    def row(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, *shape), jnp.float32)
+
     gaussians: Any = Gaussians(row(3), row(4), row(2), row(), row(16, 3))  # type: ignore[arg-type]
-    return jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
+    shapes: tuple[Any, Any] = jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
+    return shapes
 
 
 def _name(path: tuple[Any, ...]) -> str:

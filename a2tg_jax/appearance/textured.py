@@ -1,4 +1,4 @@
-"""The appearance of A²TG: a texture of its own for each splat, looked up bilinearly at (u, v).
+"""Appearance of A²TG: each splat has its own texture, looked up bilinearly at (u, v).
 
 This module defines where (u, v) lies in a texture, and how its RGB and alpha change the splat. `texture` stores
 textures, `core.bilinear` interpolates them, `appearance.rule` is the interface. The renderer sees all textures one
@@ -100,7 +100,8 @@ def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOpti
         alpha = alpha if divisor is None else jnp.clip(alpha / divisor, 0.0, 1.0)
         return jnp.concatenate([rgb, alpha], axis=-1)
 
-    return jax.tree.map(shown, textures)
+    result: Textures = jax.tree.map(shown, textures)
+    return result
 
 
 def _largest_alpha(textures: Textures, layout: AtlasLayout) -> Array:
@@ -194,4 +195,7 @@ def project_texels(textures: Textures, options: TextureOptions) -> Textures:
     if options.alpha == "global-maximum":
         return textures
     is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
-    return jax.tree.map(lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures)
+    projected: Textures = jax.tree.map(
+        lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures
+    )
+    return projected

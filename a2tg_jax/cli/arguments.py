@@ -5,15 +5,17 @@ import io
 import os
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
+
+Parsed = TypeVar("Parsed")
 
 WIDE = "1000"
 """Terminal width at which no error message is wrapped."""
 
 
-def parse(kind: type, program: str, arguments: Sequence[str], **options: Any) -> Any:
+def parse(kind: type[Parsed], program: str, arguments: Sequence[str], **options: Any) -> Parsed:
     """Parse arguments into an instance of `kind`. Help is printed and ends in SystemExit.
 
     Args:
@@ -29,7 +31,8 @@ def parse(kind: type, program: str, arguments: Sequence[str], **options: Any) ->
     width = contextlib.nullcontext() if {"-h", "--help"} & set(arguments) else _columns(WIDE)
     try:
         with width, contextlib.redirect_stderr(errors):
-            return tyro.cli(kind, prog=program, args=arguments, **options)
+            parsed: Parsed = tyro.cli(kind, prog=program, args=arguments, **options)
+            return parsed
     except SystemExit as end:
         if not end.code:
             raise

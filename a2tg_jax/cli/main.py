@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 from tyro.conf import Positional, arg
 
@@ -233,5 +233,12 @@ def _parse(name: str, arguments: list[str]) -> Command:
     return parse(kind, f"a2tg {name}", arguments, **options)
 
 
-def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     print(f"a2tg: warning: {' '.join(str(message).split())}", file=sys.stderr)

@@ -1,8 +1,6 @@
 """The commands that show scenes in a browser: `a2tg view`, `a2tg export`, and the view of a training."""
 
 import dataclasses
-import os
-import sys
 import webbrowser
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.data import Scene
+from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.live import shown_live
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
@@ -88,7 +87,6 @@ def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
 
 
 def _open(address: str) -> None:
-    """Open a browser if there is a display; on Linux, an X or Wayland display."""
-    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    if has_display or sys.platform in ("win32", "darwin"):
+    """Open a browser if there is a display."""
+    if has_display():
         webbrowser.open(address)

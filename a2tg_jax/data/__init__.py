@@ -1,6 +1,6 @@
 """Readers that turn input into a Scene: COLMAP, transforms.json, plain photographs, the built-in scene.
 
-Names are imported at their first use: a program that reads no photographs loads neither Pillow nor a COLMAP reader.
+Names are imported at their first use. A program without photographs loads neither Pillow nor a COLMAP reader.
 """
 
 import importlib
@@ -29,7 +29,7 @@ _NAMES = {
     "a2tg_jax.data.sfm": ("SfmSummary", "run_sfm"),
     "a2tg_jax.data.synthetic": ("synthetic_scene",),
 }
-"""Public names by the module that defines them: the imports above, once more."""
+"""Module of each public name; the imports above repeat them for type checkers."""
 
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_MODULE_OF)

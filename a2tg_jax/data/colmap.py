@@ -1,4 +1,4 @@
-"""Scenes that COLMAP reconstructed: a sparse model (.bin or .txt) beside a folder of images."""
+"""COLMAP scenes: a sparse model (.bin or .txt) beside a folder of images."""
 
 import logging
 import tempfile
@@ -38,14 +38,14 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     """Read a COLMAP scene: every registered image as a pinhole view, and the sparse points.
 
     Args:
-      path: the scene folder, or the folder of the model itself. Its folder `images` (or `images_k`) may be
-        there, beside the model, or up to two folders above that.
+      path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
+        beside the model, or up to two folders above.
       downscale, test_every, room: as in `load_scene`.
 
     Raises:
       FileNotFoundError: if there is no model, no folder of images, or an image of the model is missing.
-      ValueError: if the model or an image cannot be read, an image has another aspect than its camera, a camera is no
-        pinhole and cannot be made one, or no scene can be made of the views (`assemble_scene`).
+      ValueError: if the model or an image cannot be read, the aspects of an image and its camera differ, a camera
+        cannot be undistorted, or the views make no scene (`assemble_scene`).
     """
     model = find_model(path)
     if model is None:
@@ -135,7 +135,7 @@ def _with_points_file(model: Path, suffix: str) -> Iterator[Path]:
 
 
 def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
-    """Return the folder `images` (it need not exist where `images_k` does) of the scene that the model belongs to."""
+    """Return the folder `images` of the model's scene; it need not exist if `images_k` does."""
     model = model.resolve()
     for base in (path.resolve(), model, *model.parents[:2]):
         if (base / "images").is_dir() or (downscale > 1 and (base / f"images_{downscale}").is_dir()):
@@ -144,7 +144,7 @@ def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
 
 
 def _log_unregistered(images_folder: Path, num_registered: int) -> None:
-    """Tell how many files beside the registered images are left aside."""
+    """Log the number of files that are not registered images."""
     if images_folder.is_dir():
         others = sum(file.is_file() for file in images_folder.rglob("*")) - num_registered
         if others > 0:

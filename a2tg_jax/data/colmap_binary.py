@@ -1,7 +1,7 @@
-"""Whether COLMAP's binary files are whole: counts and lengths against the bytes that there are.
+"""Completeness of COLMAP's binary files: counts and lengths against the size of the file.
 
-pycolmap never looks for the end of a file. Cut off, one makes it hang and eat memory, or load wrong numbers in silence,
-so that each file is walked through here first. Nothing is copied. The formats, little-endian, after a uint64 count:
+pycolmap never checks for the end of a file. A truncated file makes it hang and use up memory, or load wrong numbers in
+silence. So each file is checked here first, without copies. The formats, little-endian, after a uint64 count:
 
     cameras   uint32 id, int32 model, uint64 width and height, the model's parameters as float64
     images    uint32 id, 7 float64 of the pose, uint32 camera, the name, a zero, uint64 count of (2 float64, uint64)
@@ -58,10 +58,10 @@ class _Cursor:
 
 
 def check_binary(path: Path) -> None:
-    """Refuse a binary file of a model, one that `RECORDS` knows, unless it ends where its counts say.
+    """Refuse a binary file of a kind in `RECORDS` unless it ends where its counts say.
 
     Raises:
-      ValueError: naming the file, and what of it is wrong.
+      ValueError: naming the file and the error.
     """
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size == 0:  # Nothing can be mapped.

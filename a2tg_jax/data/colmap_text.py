@@ -1,6 +1,6 @@
-"""Whether COLMAP's text files are whole: every line has as many words as it must have.
+"""Completeness of COLMAP's text files: every line has the right number of words.
 
-pycolmap takes the word before where one is missing, and counts on without end where a count is wrong.
+pycolmap repeats the word before a missing one, and counts without end after a wrong count.
 """
 
 import itertools
@@ -22,9 +22,9 @@ ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
 
 
 def check_text(path: Path) -> None:
-    """Refuse a text file of a model, one that `LINES` knows, unless all its lines are such.
+    """Refuse a text file of a kind in `LINES` unless all its lines are valid.
 
-    Warns where a comment counts other than the file: it may end too early, but other programs copy comments.
+    Warn if the count in a comment is another: the file may be truncated, but other programs copy comments.
 
     Raises:
       ValueError: naming the file and the line.
@@ -47,7 +47,7 @@ def check_text(path: Path) -> None:
 
 
 def _lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Yield the lines of a file, none of which takes more memory than a line can."""
+    """Yield the lines of a file, each of bounded length."""
     while line := file.readline(LONGEST_LINE + 1):
         if len(line) > LONGEST_LINE:
             raise ValueError(f"{path}: has a line of more than {LONGEST_LINE:,} bytes; export the model again")

@@ -1,7 +1,7 @@
 """Decoding of photographs that may be broken or malicious.
 
-Only formats of photographs are tried (Pillow knows others, of which one starts a program), and nothing is decoded
-before its size and its bits are known. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
+Only formats of photographs are tried, because Pillow knows others, one of which starts a program. Size and bits are
+checked before decoding. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
 """
 
 import os
@@ -20,17 +20,17 @@ BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
 LONGEST_REASON = 200
 MOST_BYTES = 1 << 30
-"""Largest file of a picture: as many pixels, not compressed."""
+"""Largest size of an image file: that of the largest uncompressed picture."""
 MAX_PIXELS = 128_000_000
-"""Width × height of the largest picture that is decoded, which takes up to 1 GB."""
+"""Largest width × height of a decoded picture, which takes up to 1 GB."""
 
 
 class PictureRefused(ValueError):
-    """Error for an intact picture that is refused."""
+    """Error for a refused but intact picture."""
 
 
 def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the pixels of an image file as stored: no EXIF rotation is applied, as cameras are estimated without it.
+    """Return the pixels of an image file as stored, without EXIF rotation, because cameras are estimated without it.
 
     Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
 
@@ -98,7 +98,7 @@ def _is_deep(image: Image.Image) -> bool:
     decides."""
     arguments = [tile[-1] for tile in getattr(image, "tile", ())]
     if image.format == "TIFF":
-        return max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8  # type: ignore[attr-defined]
+        return bool(max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8)  # type: ignore[attr-defined]
     if image.format == "PPM":
         return any(isinstance(args, tuple) and args[-1] > 255 for args in arguments)
     return image.format == "PNG" and any(";16" in str(args) for args in arguments)

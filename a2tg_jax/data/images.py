@@ -15,7 +15,7 @@ from a2tg_jax.host.text import shortened
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 """Suffixes tried, in order, for image paths without one."""
 LONGEST_NAME = 1000
-"""Largest number of letters of an image's path below its folder."""
+"""Largest number of letters in an image's path below its folder."""
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
 
@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 
 def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
-    """Return the file of one image and the factor by which it is still to be downscaled.
+    """Return the file of one image and the remaining factor of downscaling.
 
     Args:
       folder: the folder of the full images; with downscale k, its sibling `<folder>_k` is preferred if it exists.
@@ -49,7 +49,7 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
 
 
 def check_inside(folder: Path, name: str) -> None:
-    """Refuse a name, found in a file of the scene, that leads out of the scene's folder. Links may lead anywhere.
+    """Refuse a name in a file of the scene that leads out of the scene's folder. Links may lead anywhere.
 
     Raises:
       ValueError: naming both, if it is absolute, climbs by "..", or is no name.
@@ -66,7 +66,7 @@ def check_inside(folder: Path, name: str) -> None:
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Return the image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too).
 
-    Pillow's box filter would take whole pixels only and so shift details where the ratio is no whole number.
+    Pillow's box filter uses whole pixels only, which shifts details at fractional ratios.
     """
     if pixels.shape[:2] == (height, width):
         return pixels
@@ -79,7 +79,7 @@ def downscaled_size(width: int, height: int, downscale: int) -> tuple[int, int]:
 
 
 def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> None:
-    """Raise ValueError if the image cannot be the camera's width × height at another size.
+    """Raise ValueError if the image's aspect differs from that of the camera.
 
     Raises:
       ValueError: naming the file and both sizes.
@@ -95,11 +95,11 @@ def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> Non
 
 def scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int]) -> np.ndarray:
     """Return K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
-    return np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
+    scaled: np.ndarray = np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
+    return scaled
 
 
 def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return [function(item) for item in items], several at a time; decoding and resizing images leave Python's
-    lock."""
+    """Return [function(item) for item in items], in several threads; decoding and resizing release Python's lock."""
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         return list(pool.map(function, items))

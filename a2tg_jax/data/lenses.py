@@ -12,11 +12,11 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsics
 
 PINHOLE_TOLERANCE = 1e-3
-"""Pixels by which a camera may differ from a pinhole, anywhere in its image, and still be taken for one."""
+"""Largest deviation in pixels of a camera that still counts as a pinhole."""
 LARGEST_DISTORTION = 1e6
 """Largest absolute value of one parameter. Telephoto lenses, with small angles, have large ones."""
 GRID, MARGIN = 9, 0.1
-"""Points along an axis at which an undistorted image is looked at, and how far outside the photograph they may lie."""
+"""Number of test points along an axis of an undistorted image, and their largest distance outside the photograph."""
 ROWS_AT_ONCE = 128
 """Number of rows undistorted at a time, which bounds the memory."""
 
@@ -61,10 +61,9 @@ class Lens:
         return K, size
 
     def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
-        """Return whether the middle half of what a pinhole K sees lies in the photograph, nearly, and is not turned
-        over.
+        """Return whether the middle half of a pinhole image lies nearly in the photograph and is not mirrored.
 
-        Corners may fold: real calibrations say little about where they saw no feature.
+        Corners may fold, because calibrations are arbitrary where they saw no feature.
         """
         x, y = (side * np.linspace(0.25, 0.75, GRID) for side in (width, height))
         rays = _homogeneous(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)) @ np.linalg.inv(K).T
@@ -78,7 +77,7 @@ class Lens:
 
         Args:
           pixels: [h, w, C] uint8, of the calibrated size or that size scaled.
-          downscale: k >= 1; the image is undistorted first, so that it stays as sharp as it can.
+          downscale: k >= 1; the image is undistorted first, which keeps it sharp.
 
         Returns:
           (pixels [h', w', C] uint8, K [3, 3] for them).
@@ -94,7 +93,7 @@ class Lens:
         return resize_pixels(pixels, *new_size), scaled_intrinsics(K, size, new_size)
 
     def _warp(self, pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Sample the photograph (bilinear) where the pixels of a pinhole image K of the given size see it."""
+        """Return a pinhole image with intrinsics K of the given size, sampled bilinearly from the photograph."""
         width, height = size
         planes = _premultiplied(pixels)
         warped = np.empty((height, width, planes.shape[2]), np.float32)
@@ -115,10 +114,10 @@ class Lens:
 
 
 def checked_lens(camera: Any, what: str) -> Lens:
-    """Return the lens of a pycolmap.Camera whose numbers a camera can have.
+    """Return the lens of a pycolmap.Camera after checking its numbers.
 
     Raises:
-      ValueError: calling it `what`, if a number is NaN, infinite, or beyond the bounds of `check_intrinsics` and
+      ValueError: naming it `what`, if a number is NaN, infinite, or beyond the bounds of `check_intrinsics` and
         `LARGEST_DISTORTION`.
     """
     params = np.asarray(camera.params, np.float64)
@@ -149,4 +148,5 @@ def _straight(planes: np.ndarray) -> np.ndarray:
     """Return uint8 pixels with straight alpha, the inverse of `_premultiplied`."""
     if planes.shape[2] == 4:
         planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
-    return np.clip(np.rint(planes), 0, 255).astype(np.uint8)
+    pixels: np.ndarray = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
+    return pixels

@@ -1,4 +1,4 @@
-"""Light for the synthetic scene, multiplied into the images of its surfaces once, so that every view sees the same."""
+"""Light of the synthetic scene, multiplied once into the images of its surfaces, so that every view sees the same."""
 
 import numpy as np
 from scipy.ndimage import zoom
@@ -17,7 +17,7 @@ TEXELS_PER_SAMPLE = 8
 
 
 def light(colored: list[tuple[Shape, np.ndarray]], rng: np.random.Generator) -> list[Surface]:
-    """Return surfaces whose images show the given colours lit by a lamp with soft shadows and by the sky.
+    """Return surfaces with images of the given colours, lit by a lamp with soft shadows and by the sky.
 
     Args:
       colored: shapes with their own colours [rows, columns, 3] float32 in [0, 1].
@@ -28,8 +28,7 @@ def light(colored: list[tuple[Shape, np.ndarray]], rng: np.random.Generator) -> 
 
 
 def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.random.Generator) -> np.ndarray:
-    """Return the image [rows, columns, 3] uint8 of one shape: its colours times the light that falls on it, at most
-    1."""
+    """Return the image [rows, columns, 3] uint8 of one shape: its colours times its light, clipped at 1."""
     rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     points, normals = (x.astype(np.float32) for x in shape.place(u.ravel(), v.ravel()))
@@ -38,7 +37,8 @@ def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.rando
     coarse = coarse + LAMP_LIGHT * _lamp_light(shapes, points, normals, rng)
     factors = colors.shape[0] / rows, colors.shape[1] / columns
     fine = zoom(coarse.reshape(rows, columns), factors, order=1, grid_mode=True, mode="nearest")
-    return np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+    pixels: np.ndarray = np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+    return pixels
 
 
 def _lamp_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -19,15 +19,15 @@ from a2tg_jax.host.regular_files import is_regular
 FOLDER = "masks"
 """Folder of masks, beside the folder of images."""
 AlphaMeaning = Literal["transparency", "mask"]
-"""Meaning of the alpha channel of photographs: transparency before a background, or a mask."""
+"""Meaning of the alpha channel of photographs: transparency over a background, or a mask."""
 
 
 def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
-    """Return the mask of an image and the factor by which it is still to be downscaled; None without a mask.
+    """Return the mask of an image and the remaining factor of downscaling; None without a mask.
 
     Args:
       images: the folder of the full images; masks lie in its sibling `masks`, or `masks_k` for a downscale of k.
-      name: path of the image below the folder; its mask is NAME.EXT.png, as COLMAP has it, NAME.png, or of its name.
+      name: path of the image below the folder; its mask is NAME.EXT.png, as in COLMAP, NAME.png, or has the same name.
       downscale: k >= 1.
     """
     folder = images.with_name(FOLDER)
@@ -42,7 +42,7 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
     """Read a mask that a scene names, as `find_mask` does.
 
     Raises:
-      FileNotFoundError: if it is not there.
+      FileNotFoundError: if it is missing.
     """
     found = _at_scale(path.parent, path.name, downscale)
     if found is None:
@@ -53,16 +53,16 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
 def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray) -> Mask | None:
     """Return the mask of a view, undistorted and downscaled as its photograph was; None for None.
 
-    A pixel counts if every pixel it is made of counts.
+    A pixel counts if all its source pixels count.
 
     Args:
-      found: file and factor, of `find_mask`.
+      found: file and factor from `find_mask`.
       lens: the photograph's camera.
       photograph: as stored.
       pixels: [H, W, ...] as the view has it.
 
     Raises:
-      ValueError: naming the file, if it is no image, or neither of the photograph's size nor of its camera's.
+      ValueError: naming the file, if it is no image, or its size is neither the photograph's nor its camera's.
     """
     if found is None:
         return None
@@ -82,8 +82,8 @@ def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) 
 
     Args:
       shots: all of the scene.
-      source: the input, as messages name it.
-      folder: where masks were looked for; a warning where it is there, but holds none for any photograph.
+      source: name of the input in messages.
+      folder: folder of masks. If it exists but has no mask of any photograph, a warning says so.
 
     Raises:
       ValueError: naming the photograph.
@@ -103,10 +103,10 @@ def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) 
 
 
 def alpha_as_mask(scene: Scene, source: str) -> Scene:
-    """Return the scene with the alpha of its photographs as masks: what is not opaque does not count.
+    """Return the scene with the alpha of its photographs as masks. Only opaque pixels count.
 
     Raises:
-      ValueError: naming a photograph of which nothing is left.
+      ValueError: naming a photograph without opaque pixels.
     """
 
     def masked(view: View) -> View:

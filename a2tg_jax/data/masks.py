@@ -1,4 +1,4 @@
-"""Masks: which pixels of a photograph count, kept small in memory."""
+"""Masks: pixels of a photograph that count, compressed in memory."""
 
 import dataclasses
 import zlib
@@ -8,7 +8,8 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Mask:
-    """[H, W] bool, True where a pixel counts, as compressed bits: those of a scene take less than one photograph."""
+    """[H, W] bool, True where a pixel counts, as compressed bits. All masks of a scene take less than one
+    photograph."""
 
     shape: tuple[int, int]
     """(H, W)."""
@@ -18,7 +19,7 @@ class Mask:
 
     @staticmethod
     def of(counts: "np.ndarray | Mask") -> "Mask":
-        """Return the mask of an array [H, W]; a mask is returned as it is.
+        """Return the mask of an array [H, W]; a mask is returned unchanged.
 
         Raises:
           ValueError: unless it is bool, [H, W].

@@ -1,7 +1,7 @@
 """Procedural colours for the synthetic scene: float32 images [rows, columns, 3] in [0, 1], made by numpy alone.
 
-Sizes are in texels. The palette is soft and the details are even on purpose: they are finer than a Gaussian but not
-finer than its texels, so that a short training shows what textures add.
+Sizes are in texels. The palette is soft and the details are even on purpose. They are finer than a Gaussian but not
+finer than its texels, so that a short training shows the benefit of textures.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,8 @@ def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 
 def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return (1 - weight)·first + weight·second, [rows, columns, 3]."""
-    return first + weight[..., None].astype(np.float32) * (second - first)
+    mixed: np.ndarray = first + weight[..., None].astype(np.float32) * (second - first)
+    return mixed
 
 
 def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 2) -> np.ndarray:
@@ -86,7 +87,8 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
     to_edge = np.minimum(radius - index, index + 1 - radius) * ring
     along_edge = np.minimum(along - stone, stone + 1 - along) * (2 * np.pi * radius * ring / sectors)
     grout = np.clip(np.minimum(to_edge, along_edge) - 0.6, 0, 1)[..., None]
-    return palette[kind] * shade[..., None] * grout + GROUT * (1 - grout)
+    paving: np.ndarray = palette[kind] * shade[..., None] * grout + GROUT * (1 - grout)
+    return paving
 
 
 def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:

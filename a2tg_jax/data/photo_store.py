@@ -1,4 +1,4 @@
-"""Storage of photographs: in memory while there is room, beyond that on disk, read when needed."""
+"""Storage of photographs: in memory while there is room, otherwise on disk and read on demand."""
 
 import dataclasses
 import tempfile
@@ -7,9 +7,10 @@ import weakref
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.host.memory import memory_limit
@@ -21,7 +22,7 @@ SHARE_OF_MEMORY = 0.25
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Picture:
-    """Pixels, in memory or on disk. What `read` returns is the same every time, wherever they are kept."""
+    """Pixels, in memory or on disk. `read` always returns the same."""
 
     shape: tuple[int, ...]
     """[H, W, 3] or, with straight alpha, [H, W, 4]."""
@@ -29,7 +30,7 @@ class Picture:
     """The pixels; not to be written to."""
     is_held: bool = False
     """Whether they are in memory."""
-    dtype: Any = np.uint8
+    dtype: DTypeLike = np.uint8
 
     @staticmethod
     def of(pixels: "np.ndarray | Picture") -> "Picture":
@@ -48,16 +49,16 @@ class Picture:
 
 
 class Shelf:
-    """Keeps the pictures of one scene; several threads may use it.
+    """Store of the pictures of one scene; safe to use from several threads.
 
-    Pixels that no longer fit into memory are forgotten where a file holds just them, for decoding it again takes less
-    time than a training step of that size. Pixels that were undistorted or resized, which takes longer, go to a file
-    without a name in `cache_folder()`, which disappears with the process, however that ends.
+    Beyond the memory limit, pixels of an unchanged image file are dropped: decoding it again takes less time than a
+    training step of that size. Undistorted or resized pixels go to an unnamed file in `cache_folder()`, which
+    disappears with the process, however that ends.
     """
 
     def __init__(self, room: int | None = None):
         """Args:
-        room: bytes that the pictures may take in memory; None: `SHARE_OF_MEMORY` of what the process may have.
+        room: memory limit of the pictures in bytes; None: `SHARE_OF_MEMORY` of the memory of the process.
         """
         self._room = int(SHARE_OF_MEMORY * memory_limit()) if room is None else room
         self._lock = threading.Lock()
@@ -69,10 +70,10 @@ class Shelf:
 
         Args:
           pixels: of any shape, uint8.
-          source: an image file whose pixels these are as they stand there; None if they were made from it.
+          source: image file with exactly these pixels; None if they were undistorted or resized.
 
         Raises:
-          OSError: if there is no room on disk; it says what to do.
+          OSError: with a remedy, if there is no room on disk.
         """
         with self._lock:
             self._room -= pixels.nbytes
@@ -110,7 +111,7 @@ class Shelf:
 
 
 def _decoded_again(source: Path, pixels: np.ndarray) -> Picture:
-    """Return the picture in an image file, which must stay as it is."""
+    """Return the picture in an image file, which must not change."""
     checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
 
     def read() -> np.ndarray:

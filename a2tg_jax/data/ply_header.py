@@ -1,4 +1,4 @@
-"""The header of PLY files, and the room that their vertices and other elements take."""
+"""Headers of PLY files, and the sizes of their elements."""
 
 import dataclasses
 import os
@@ -42,13 +42,13 @@ class VertexHeader:
             raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
 
     def read_binary(self, file: BinaryIO) -> np.ndarray:
-        """Return the vertices [count] of a binary file, structured. ValueError: it is cut off."""
+        """Return the structured vertices [count] of a binary file. Raise ValueError if it is truncated."""
         dtype = self.dtype
         self.check_room(file, dtype.itemsize)
         return np.frombuffer(file.read(self.count * dtype.itemsize), dtype, self.count)
 
     def check_room(self, file: BinaryIO, num_bytes: int) -> None:
-        """Raise ValueError if the rest of a file is less than that many bytes for each vertex."""
+        """Raise ValueError if the rest of a file is too short for this number of bytes per vertex."""
         left = os.fstat(file.fileno()).st_size - file.tell()
         if self.count * num_bytes > left:
             raise ValueError(
@@ -86,7 +86,7 @@ def read_vertex_header(file: BinaryIO, path: Path) -> VertexHeader:
 
 
 def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
-    """Return the headers of all elements of a PLY, by their names, with the file left at the first of the first.
+    """Return the headers of all elements of a PLY by name, with the file left at the first row.
 
     Raises:
       ValueError: naming the file, if it is no PLY, its header does not end, or a property cannot be read.

@@ -1,4 +1,4 @@
-"""Points with colours from PLY files, ASCII or binary, as nerfstudio and point-cloud programs write them."""
+"""Points with colours from ASCII or binary PLY files, as from nerfstudio and point-cloud programs."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,14 +16,14 @@ LEAST_BYTES = 2
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """Return the points of a PLY file whose first element is `vertex` with x, y, z; mid-grey where it has no red,
-    green, blue.
+    """Return the points of a PLY file whose first element is `vertex` with x, y, z. Points without colours are
+    mid-grey.
 
     Colours are whole numbers in 0..255, or floats in [0, 1]; those beyond are clipped.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: naming the file, if it is no such PLY or is cut off.
+      ValueError: naming the file, if it is no such PLY or is truncated.
     """
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such point file, but transforms.json names it; correct ply_file_path")
@@ -40,7 +40,7 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def _read_ascii(file: BinaryIO, header: VertexHeader) -> np.ndarray:
-    """Return [count, properties] of the vertices, one a line."""
+    """Return [count, properties] of the vertices, one per line."""
     num = len(header.fields)
     header.check_room(file, LEAST_BYTES * num - 1)
     rows = np.empty((header.count, num))
@@ -59,4 +59,5 @@ def _colors(columns: Mapping[str, np.ndarray], header: VertexHeader) -> np.ndarr
     colors = np.stack([columns[name] for name in COLORS], axis=-1)
     if header.fields["red"].startswith("f"):
         colors = np.rint(np.clip(np.nan_to_num(colors), 0, 1) * 255)
-    return np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
+    pixels: np.ndarray = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
+    return pixels

@@ -1,4 +1,4 @@
-"""Scenes as loaders return them: photographs with exact pinhole cameras, and points, in the normalised world."""
+"""Scenes: photographs with exact pinhole cameras, and points, in the normalised world."""
 
 import dataclasses
 import itertools
@@ -111,7 +111,7 @@ def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
 
 
 def views_by_size(views: Sequence[View]) -> list[list[View]]:
-    """Return the views of each image size, sizes and views in the order in which they come."""
+    """Return the views of each image size, both in order of appearance."""
     groups: dict[tuple[int, int], list[View]] = {}
     for view in views:
         groups.setdefault(view.picture.size, []).append(view)
@@ -119,7 +119,7 @@ def views_by_size(views: Sequence[View]) -> list[list[View]]:
 
 
 def counted_pixels(views: Sequence[View]) -> np.ndarray:
-    """Return [V, H, W, 1] bool, which pixels of views of one size count; [V, 1, 1, 1] if all do."""
+    """Return [V, H, W, 1] bool, True at pixels that count, for views of one size; [V, 1, 1, 1] if all do."""
     if all(view.mask is None for view in views):
         return np.ones((len(views), 1, 1, 1), bool)
     masks = [np.ones(view.picture.size, bool) if view.mask is None else view.mask.read() for view in views]
@@ -141,7 +141,8 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
     if not view.has_alpha:
         return color
     alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
-    return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
+    composed: np.ndarray = alpha * color + (1 - alpha) * np.asarray(background, np.float32)
+    return composed
 
 
 def assemble_scene(
@@ -153,13 +154,13 @@ def assemble_scene(
       name: of the scene.
       train: shots to train on, any order.
       test: shots to test on; may be empty.
-      cloud: surface points; None or fewer than two are replaced, with a warning, by random points in the cube around
-        the cameras and the point they look at.
-      source: the input, as error messages name it.
+      cloud: surface points. With fewer than two, random points in a cube around the cameras and their target are used,
+        with a warning.
+      source: name of the input in messages.
 
     Raises:
-      ValueError: if there are fewer than two shots or none to train on, two have one name, a pose is not finite or not
-        rigid, or all the cameras stand at one place.
+      ValueError: if there are fewer than two shots or no training shot, two shots share a name, a pose is not a rigid
+        motion, or all cameras stand at one place.
     """
     shots = sorted([*train, *test], key=lambda shot: shot.name)
     _check_shots(shots, len(train), source)
@@ -199,7 +200,7 @@ def check_test_every(test_every: int) -> None:
 
 
 def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
-    """Return (train, test): shots 0, k, 2k, … of the name-sorted ones are the test; k = 0 keeps none for it."""
+    """Return (train, test): test shots are 0, k, 2k, … in order of names; none for k = 0."""
     ordered = sorted(shots, key=lambda shot: shot.name)
     is_test = [test_every > 0 and index % test_every == 0 for index in range(len(ordered))]
     train = [shot for shot, test in zip(ordered, is_test, strict=True) if not test]
@@ -213,7 +214,7 @@ def random_points(center: np.ndarray, half_side: float, seed: int = 0) -> tuple[
 
 
 def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
-    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], as poses rounded to a few digits are.
+    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], such as a rounded pose.
 
     Raises:
       ValueError: naming `what`, if the matrix is not finite or its rotation is not one.
@@ -232,7 +233,7 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
 
 
 def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
-    """Raise ValueError if no scene can be made of the shots, which are sorted by name."""
+    """Raise ValueError if the shots, sorted by name, make no scene."""
     if len(shots) < 2:
         raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
     if num_train < 1:
@@ -245,7 +246,7 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
 
 
 def _check_distances(shots: Sequence[Shot], source: str) -> None:
-    """Raise if a camera lies so far out that it would move the origin."""
+    """Raise ValueError if a camera is so far away that it would move the origin."""
     centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     farthest = int(np.argmax(distances))
@@ -257,7 +258,7 @@ def _check_distances(shots: Sequence[Shot], source: str) -> None:
 
 
 def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
-    """Return the finite points; others are left out with a warning."""
+    """Return the points within bounds; leave out others with a warning."""
     is_usable = _are_somewhere(cloud.points)
     is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
     if is_usable.all():
@@ -269,7 +270,8 @@ def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud
 
 def _are_somewhere(points: np.ndarray) -> np.ndarray:
     """Return [P] whether all coordinates of a point are within bounds."""
-    return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+    are_within: np.ndarray = (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+    return are_within
 
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:

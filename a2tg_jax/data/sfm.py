@@ -17,7 +17,7 @@ from a2tg_jax.data.images import map_in_threads
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_EXHAUSTIVE = 200
-"""Number of photographs beyond which only neighbours in name order are matched."""
+"""Largest number of photographs of which every pair is matched; beyond it, only neighbours by name."""
 MIN_REGISTERED = 3
 
 
@@ -41,12 +41,12 @@ def run_sfm(
     """Estimate poses and points, and write a scene folder that `load_scene` reads.
 
     Every pair of photographs is matched, or neighbours by name if there are more than 200. Photographs of one size
-    share one camera. The largest model found is kept and undistorted. Runs on the CPU and uses the seed wherever COLMAP
-    takes one; the mapping is done in one thread, so that a second run gives the same.
+    share one camera. The largest model found is kept and undistorted. It runs on the CPU with the seed wherever COLMAP
+    takes one, and maps in one thread, so that runs reproduce.
 
     Args:
       photos: folder of photographs of one scene; subfolders are searched.
-      out: folder to make; gets `images` and `sparse/0`.
+      out: new folder for `images` and `sparse/0`.
       seed: of COLMAP's random choices, at least 0.
       camera_model: COLMAP's name of the camera model to estimate.
       progress: show a progress bar.
@@ -153,10 +153,10 @@ def _write_scene(model: Any, photos: Path, work: Path, out: Path) -> None:
 
 
 def _have_one_size(photos: Path, names: list[str]) -> bool:
-    """Return whether all photographs have the same width and height, as those of one camera have.
+    """Return whether all photographs have the same size, as those of one camera have.
 
     Raises:
-      ValueError: naming the first that this program would not read: COLMAP's own reader knows no bounds.
+      ValueError: naming the first unreadable or too large photograph, because COLMAP's own reader has no bounds.
     """
     return len(set(map_in_threads(lambda name: check_picture(photos / name), names))) == 1
 

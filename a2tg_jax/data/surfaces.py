@@ -1,8 +1,8 @@
-"""Surfaces that rays can hit and that carry an image: what the synthetic scene is made of.
+"""Surfaces of the synthetic scene: shapes that rays can hit, with an image on them.
 
-Vectors have their components first, [3, P] (numpy is several times faster so), float32. Rays are
-origin + t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along
-the columns and rows of a surface's image.
+Vectors are float32 with their components first, [3, P], which makes numpy several times faster. Rays are origin +
+t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along the columns and
+rows of a surface's image.
 """
 
 import dataclasses
@@ -174,7 +174,7 @@ def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.nd
 
 
 def trace(surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours and places of what rays from one point see.
+    """Return the colours and positions of the hits of rays from one point.
 
     Args:
       surfaces: the scene.
@@ -199,7 +199,8 @@ def look_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     rows, columns = image.shape[:2]
     row = np.clip((v * rows).astype(np.int32), 0, rows - 1)
     column = np.clip((u * columns).astype(np.int32), 0, columns - 1)
-    return np.take(image.reshape(-1, 3), row * columns + column, axis=0)
+    texels: np.ndarray = np.take(image.reshape(-1, 3), row * columns + column, axis=0)
+    return texels
 
 
 def column(vector: Vector) -> np.ndarray:
@@ -209,7 +210,8 @@ def column(vector: Vector) -> np.ndarray:
 
 def squares(*components: np.ndarray) -> np.ndarray:
     """Return the sum of their squares."""
-    return sum(component * component for component in components)
+    total: np.ndarray = sum(component * component for component in components)
+    return total
 
 
 def quadratic_roots(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

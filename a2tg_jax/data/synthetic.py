@@ -1,6 +1,6 @@
 """The built-in scene: a still life in a round brick room, ray-traced by numpy at exact cameras.
 
-Its patterns carry details of some 4 to 10 pixels: finer than a thousand or two Gaussians can show without textures.
+Its patterns have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show without textures.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ def synthetic_scene(
       num_views: at least 2.
       width, height: size of the images in pixels, before `downscale`.
       num_points: points sampled evenly over the images, in place of a sparse reconstruction; at least 2.
-      downscale: k >= 1: images of 1/k of the size, as if made from the full ones.
+      downscale: k >= 1; images have 1/k of the size.
       test_every: every k-th view is a test view; 0 keeps none.
 
     Returns:
@@ -150,7 +150,8 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
 
 def _center(viewmat: np.ndarray) -> np.ndarray:
     """Return [3, 1] float32 position of a camera."""
-    return (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
+    center: np.ndarray = (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
+    return center
 
 
 def _directions(viewmat: np.ndarray, K: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Scenes described by a transforms.json: nerfstudio's and instant-ngp's, and Blender's with one file per split.
+"""Scenes with a transforms.json, of nerfstudio or instant-ngp, or of Blender with one file per split.
 
-Poses are camera-to-world in OpenGL's camera frame (x right, y up, z backward). nerfstudio's `applied_transform` tells
-what was done to COLMAP's world before the file was written; poses and `ply_file_path` points have both gone through
-it, so both are in the file's own world, which is the original world here.
+Poses are camera-to-world in OpenGL's camera frame (x right, y up, z backward). nerfstudio's `applied_transform` is the
+change of COLMAP's world before the file was written. Poses and points of `ply_file_path` have both gone through it, so
+both are in the file's own world, which is the original world here.
 """
 
 import logging
@@ -49,7 +49,7 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
 
     Raises:
       FileNotFoundError: if an image or the point file is missing.
-      ValueError: if the JSON, a frame, an image or a pose is unusable, or no scene can be made (`assemble_scene`).
+      ValueError: if the JSON, a frame, an image or a pose is invalid, or the views make no scene (`assemble_scene`).
     """
     meta = _read_json(file)
     shots = _read_shots(file, meta, downscale, Shelf(room))
@@ -66,7 +66,7 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
 
 
 def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
-    """Read a Blender scene as NeRF's are: transforms_train.json and transforms_test.json, images with alpha.
+    """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
     Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
     test_every-th training view is a test view.
@@ -92,8 +92,7 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file, which has a non-empty list `frames` of objects, and texts where files are
-    named."""
+    """Return the JSON object in a file. It has a non-empty list `frames` of objects, and file names that are texts."""
     data = read_regular(file, MOST_BYTES)
     try:
         meta = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
@@ -110,7 +109,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _check_texts(file: Path, values: dict[str, Any]) -> None:
-    """Raise ValueError unless what names files within the scene is text, or a list of texts."""
+    """Raise ValueError unless file names are texts, or lists of texts."""
     for key in FILE_KEYS:
         name = values.get(key)
         if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
@@ -134,7 +133,7 @@ def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) 
 
 
 def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Shot:
-    """Return one frame; `frame` holds the file's global values too, under the frame's own."""
+    """Return one frame; `frame` also holds the file's global values, which the frame's own override."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
     path = file.parent / frame["file_path"]
@@ -155,7 +154,7 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Sh
 
 
 def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
-    """Return the mask that a frame names, or else that of its image in a folder `masks` beside the folder `images`."""
+    """Return the mask that a frame names, or else that of its image in the folder `masks` beside `images`."""
     if frame.get("mask_path"):
         return named_mask(file.parent / frame["mask_path"], downscale)
     images = file.parent / "images"
@@ -185,7 +184,7 @@ def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str) -> Lens:
 
 
 def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float:
-    """Return a number of a frame. ValueError: there is something else."""
+    """Return a number of a frame. Raise ValueError for anything else."""
     value = frame.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{what}: {key} must be a number; got {shortened(value)}")
@@ -215,8 +214,7 @@ def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) ->
 
 
 def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
-    """Return COLMAP's camera model and its distortion parameters, which mean the same as nerfstudio's of these
-    names."""
+    """Return COLMAP's camera model and its distortion parameters; nerfstudio's have the same names and meaning."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
     values = {key: _number(frame, key, 0.0, what) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if model == "OPENCV_FISHEYE":

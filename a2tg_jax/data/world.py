@@ -1,4 +1,4 @@
-"""The normalised world: every scene is brought to the same origin, orientation and size before training.
+"""Normalised world: every scene gets the same origin, orientation and size before training.
 
 c is a camera centre, d its optical axis (unit), R a rotation, s a scale; all of it in float64 on the host.
 """
@@ -19,15 +19,15 @@ ZERO_SPREAD = 1e-9
 def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     """Return the similarity to the normalised world.
 
-    The origin goes to the point nearest, in least squares, to all optical axes (to the mean camera centre if the
-    axes are nearly parallel), the mean camera-up to +z (unchanged if the ups cancel), and the median distance
-    of the cameras from the origin becomes 1.
+    The origin is the point nearest to all optical axes in least squares, or the mean camera centre if the axes are
+    nearly parallel. The mean camera-up becomes +z, unless the ups cancel. The median distance of the cameras from the
+    origin becomes 1.
 
     Args:
       viewmats: [V, 4, 4] rigid world-to-camera matrices (OpenCV: x right, y down, z forward).
 
     Raises:
-      ValueError: if all the cameras, or the most of them, stand at one place, so that there is no size to normalise.
+      ValueError: if all or most cameras stand at one place, so that there is no size to normalise.
     """
     centers = camera_centers(viewmats)
     origin = _nearest_point(centers, viewmats[:, 2, :3])
@@ -51,7 +51,8 @@ def _nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
     projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projections.mean(axis=0)
     if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
-        return centers.mean(axis=0)
+        mean: np.ndarray = centers.mean(axis=0)
+        return mean
     return np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", projections, centers) / len(centers))
 
 
@@ -63,4 +64,5 @@ def _rotation_to_z(up: np.ndarray) -> np.ndarray:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = np.linalg.norm(axis)
     axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
-    return Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
+    rotation: np.ndarray = Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
+    return rotation

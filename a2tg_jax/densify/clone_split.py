@@ -1,7 +1,7 @@
 """Adaptive density control (3DGS, Kerbl et al., 2023; 2DGS, Huang et al., 2024): clone, split, prune, reset opacities.
 
-Arrays hold N rows, of which the first `num_live` exist. All of it happens inside the step at fixed shapes: what is
-pruned leaves its row, the rows behind it move up, and copies are appended while there is room.
+Arrays hold N rows, of which the first `num_live` exist. All edits happen inside the step at fixed shapes: later rows
+move up over pruned ones, and copies are appended while there is room.
 """
 
 import dataclasses
@@ -37,11 +37,11 @@ SPLIT_SHRINK = 1.6
 """Factor by which the halves of a split Gaussian are smaller."""
 LEAST_BETWEEN_RESETS = 500
 RECOVERY = 100
-"""Iterations after a reset in which nothing is pruned for being faint: Adam needs them to raise an opacity again."""
+"""Number of iterations after a reset without pruning of faint Gaussians: Adam needs them to raise an opacity again."""
 
 
 class Edit(NamedTuple):
-    """Rows that stay, and rows that are doubled; [N] booleans."""
+    """Kept rows and doubled rows; [N] booleans."""
 
     is_kept: Array
     is_cloned: Array
@@ -50,14 +50,14 @@ class Edit(NamedTuple):
 
 @event
 class CloneSplitPrune(StepEvent):
-    """Clones small Gaussians and splits large ones where the gradient is large; prunes what is faint or too large.
+    """Event that clones small Gaussians and splits large ones with large gradients, and prunes faint or too large ones.
 
     It happens every max(10, n/300) of n iterations, from n/60 to n/2. The programs of 3DGS and 2DGS also have a largest
-    radius on the screen, but set the radii back to 0 just before they look at them: it has no effect, and is left out.
+    radius on the screen. They reset the radii to 0 just before reading them, so it has no effect and is left out.
     """
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians. If more are wanted, the largest gradients are served and the others counted."""
+    """Largest number of Gaussians. Beyond it the largest gradients go first and the others are counted."""
     threshold: float = 2e-4
     """Smallest average gradient that is densified, by the position on the screen in units of half an image."""
     dense_share: float = 0.01
@@ -117,17 +117,17 @@ class CloneSplitPrune(StepEvent):
         return is_faint | (is_late & (_sizes(model) > self.largest_share * now.scene_scale))
 
     def _edit(self, now: Now, model: Model, is_kept: Array, is_doubled: Array) -> Edit:
-        """Doubled rows are split where they are large, and cloned where they are not."""
+        """Split large doubled rows and clone small ones."""
         is_large = _sizes(model) > self.dense_share * now.scene_scale
         return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large)
 
 
 @event
 class FillingDensity(CloneSplitPrune):
-    """Variant of `CloneSplitPrune` that grows by as much in each event as it takes to end at the cap.
+    """Variant of `CloneSplitPrune` whose growth in each event is chosen to end at the cap.
 
-    The largest gradients are doubled, whether above the threshold or not. Pruning goes on while enough Gaussians are
-    left; if too many would go, the most opaque stay.
+    It doubles the largest gradients regardless of the threshold. If pruning would leave too few Gaussians, the most
+    opaque stay.
     """
 
     def num_rows(self, num: int, num_iterations: int) -> int:
@@ -167,17 +167,17 @@ def _sizes(model: Model) -> Array:
 
 
 def _ranks(values: Array, is_ranked: Array) -> Array:
-    """Return [N] int32 places in descending order of value, equal ones in the order of rows, those not ranked last."""
+    """Return [N] int32 ranks in descending order of value. Ties keep the order of rows; unranked rows come last."""
     num = values.shape[0]
     order = jnp.argsort(jnp.where(is_ranked, -values, jnp.inf), stable=True)
     return jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
 
 
 def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tuple[Model, AdamState]:
-    """Kept rows move up, in order, and the copies of doubled ones follow; what is new starts with zero moments.
+    """Move kept rows up, in order, and append the copies of doubled ones. New rows start with zero moments.
 
-    Both halves of a split Gaussian are drawn from it, each a Gaussian 1.6 times smaller. A clone lies where it came
-    from, which keeps its moments.
+    Both halves of a split Gaussian are drawn from it, each a Gaussian 1.6 times smaller. A clone has the place of its
+    original, which keeps its moments.
     """
     num = model.gaussians.num
     index = jnp.arange(num, dtype=jnp.int32)
@@ -196,7 +196,7 @@ def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tupl
 
 
 def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
-    """Marked rows [N] moved to a point drawn from their Gaussian, and made 1.6 times smaller."""
+    """Return marked rows [N] at a point drawn from their Gaussian, 1.6 times smaller."""
     drawn = jax.random.normal(key, gaussians.scales.shape, gaussians.means.dtype) * gaussians.scales
     axes = rotation_matrices(gaussians.quats)[:, :, :2]
     means = gaussians.means + jnp.sum(axes * drawn[:, None, :], axis=2)
@@ -214,7 +214,7 @@ def reset_interval(num_iterations: Any) -> Array:
 
 @event
 class OpacityReset(StepEvent):
-    """Reset of opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2."""
+    """Event that resets opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2."""
 
     most: float = 0.01
     """Largest opacity after a reset."""

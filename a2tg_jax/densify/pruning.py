@@ -1,8 +1,8 @@
-"""Pruning of the Gaussians that show least: their bytes are spent where they show more.
+"""Pruning of the Gaussians that show least, so that others can use their bytes.
 
-What a Gaussian shows is the sum of its blending weights w = α·T over the pixels of the training views that count: how
-much of the pictures is its colour. Many that densification leaves are hidden, or too faint to matter. This event
-renders, where others take statistics of the steps: a weight is no gradient of the loss.
+The measure of a Gaussian is the sum of its blending weights w = α·T over the counted pixels of the training views: the
+share of its colour in the pictures. Densification leaves many Gaussians that are hidden or too faint to matter. Other
+events use statistics of the steps; this one renders, because a weight is no gradient of the loss.
 """
 
 import dataclasses
@@ -28,9 +28,9 @@ from a2tg_jax.render import RenderSettings, plan_render, render_traced
 
 @event
 class Prune(HostEvent):
-    """Pruning of the Gaussians whose blending weights, summed over the training views, are least.
+    """Event that prunes the Gaussians with the smallest blending weights, summed over the training views.
 
-    The views are seen from the cameras that the scene gives, not from refined ones.
+    It uses the cameras of the scene, not refined ones.
     """
 
     share: float = 0.1
@@ -76,8 +76,8 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
     """Return [N] Σ α·T of each Gaussian over the pixels of all views that count, in pixels (host).
 
     Args:
-      model: N rows; those that do not exist have weight 0.
-      views: at least one; their photographs are not looked at, their masks are.
+      model: N rows; spare rows have weight 0.
+      views: at least one; only their cameras and masks are used.
 
     Raises:
       ValueError: if there is no view.
@@ -104,7 +104,8 @@ def _jitted() -> jit:
 
 
 def _weights(model: Model, cameras: Camera, counted: Array, settings: RenderSettings) -> Array:
-    """Return the sums over views of one size: the backward pass of ones, for a picture is linear in the colours."""
+    """Return the sums over views of one size. A picture is linear in the colours, so this is a backward pass of
+    ones."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
     def of_view(total: Array, view: tuple[Camera, Array]) -> tuple[Array, None]:

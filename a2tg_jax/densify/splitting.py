@@ -1,12 +1,11 @@
-"""Densification that splits where the image is wrong: the schedule of MCMC, hosts by gradient, halves for shares.
+"""Densification that splits where the image is wrong: the schedule of MCMC, with hosts by gradient and halves.
 
-3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies where the host is, which look like it together: they part
-slowly, and not where detail is missing. Here hosts are drawn by how much a move by its own size would change the loss,
-and host and copies become halves of it, each at a point drawn from it and 1.6 times smaller, as in adaptive density
-control (`densify`).
+3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies at the place of the host. They separate slowly, and not where
+detail is missing. Here the weight of a host is the change of the loss by a move of its own size. Host and copies become
+halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`densify`).
 
-Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its gradient times its size is
-thousands of times that of others: drawn with replacement it would be the host of nearly all new Gaussians.
+Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its weight is thousands of
+times that of others: with replacement it would be the host of nearly all new Gaussians.
 """
 
 import dataclasses
@@ -30,7 +29,8 @@ LEAST_WEIGHT = 1e-12
 
 @event
 class SplitByGradient(FillingMcmc):
-    """Moves dead Gaussians, and adds new ones up to the cap, where the average gradient times the size is largest."""
+    """Event that moves dead Gaussians and adds new ones up to the cap, where the average gradient times the size is
+    largest."""
 
     @property
     def statistic(self) -> Statistic:
@@ -60,13 +60,13 @@ class SplitByGradient(FillingMcmc):
 
 
 def draw_weights(model: Model, state: GradientStatistics) -> Array:
-    """Return [N] weights of drawing a host: average gradient by position, times the size."""
+    """Return [N] weights of hosts: average gradient by position, times the size."""
     size = jnp.exp(jnp.mean(model.gaussians.log_scales, axis=1))
     return state.average() * size + LEAST_WEIGHT
 
 
 def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: Array) -> Array:
-    """Draw a host for every target with probability ∝ weight, none twice before all have been drawn once.
+    """Draw a host for every target with probability ∝ weight, none twice before each was drawn once.
 
     The order of log-weights plus Gumbel noise is that of successive draws without replacement (Yellott, 1977).
 
@@ -77,7 +77,7 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
       is_target: [N], the rows that need a host.
 
     Returns:
-      [N] int32 rows for which `is_host` holds, if there are any; entries of rows that are no targets have no meaning.
+      [N] int32 rows of hosts, if there are any. Only entries of targets have a meaning.
     """
     noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
     order = jnp.argsort(jnp.where(is_host, -noisy, jnp.inf)).astype(jnp.int32)
@@ -88,7 +88,7 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
 def split_rows(
     key: Array, moves: Moves, model: Model, moments: AdamState, state: GradientStatistics
 ) -> tuple[Model, AdamState, GradientStatistics]:
-    """Copy rows from their hosts; hosts and copies are halved, lose Adam's moments and share the statistic."""
+    """Copy rows from their hosts. Hosts and copies are halved, lose Adam's moments and share the statistic."""
     is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
     total = state.total / moves.num_shares.astype(state.total.dtype)
     state = GradientStatistics(total[moves.rows], state.views[moves.rows])

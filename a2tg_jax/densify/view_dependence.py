@@ -1,8 +1,7 @@
-"""Adaptive spherical harmonics: a degree per Gaussian, raised where the gradient asks for it, lowered where it is idle.
+"""Adaptive spherical harmonics: a degree per Gaussian, raised where the gradient is large, lowered where it is idle.
 
-The image is linear in the coefficients, so that the gradient at a coefficient which a Gaussian does not have yet is
-known: Σ over views of ∂L/∂colour · Y(direction). What residuals of many views have in common adds up in it, what they
-have not cancels.
+The image is linear in the coefficients. So the gradient of a coefficient that a Gaussian does not have yet is known: Σ
+over views of ∂L/∂colour · Y(direction). Residuals that many views share add up in it, others cancel.
 """
 
 import dataclasses
@@ -62,9 +61,9 @@ BAND_SLICES = tuple(slice(NUM_BASES[degree - 1], NUM_BASES[degree]) for degree i
 
 @event
 class AdaptDegrees(HostEvent):
-    """Lowers degrees that are idle, and raises others by one where the gradient per byte is largest, within a budget.
+    """Event that lowers idle degrees and raises others by one where the gradient per byte is largest, within a budget.
 
-    Wants `appearance.Banded`.
+    It needs `appearance.Banded`.
     """
 
     budget_mb: float = 0.0
@@ -107,8 +106,8 @@ class AdaptDegrees(HostEvent):
 def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:
     """Return [N] degrees, one less if the highest band changes the colour by less than `idle` (host).
 
-    Spherical harmonics are orthonormal, so that the mean square of what a band adds, over all directions and three
-    channels, is the sum of its squared coefficients by 12π.
+    Spherical harmonics are orthonormal. So the mean square of a band, over all directions and three channels, is the
+    sum of its squared coefficients divided by 12π.
     """
     degrees = layout.degrees
     highest = degrees.copy()
@@ -139,4 +138,5 @@ def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: i
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]
     strength = np.take_along_axis(strengths, following[:, None], axis=1)[:, 0]
     is_candidate = (degrees < highest) & (strength > 0)
-    return degrees + within_budget(strength, is_candidate, cost, budget)
+    raised: np.ndarray = degrees + within_budget(strength, is_candidate, cost, budget)
+    return raised

@@ -1,7 +1,7 @@
-"""Smallest file of a model: what each choice of bits costs in dB, and the smallest file within a loss.
+"""Smallest file of a model within a loss, from the cost in dB of each choice of bits.
 
-A loss is a function of a model: how many dB it is below the one that it was made from. It is measured on photographs,
-or, where there are none, guessed from how far renders are from that model's.
+A loss is a function of a model: its distance in dB below the original model. It is measured on photographs or, without
+them, estimated from the difference of the renders.
 """
 
 import dataclasses
@@ -35,11 +35,11 @@ LADDER: Ladder = MappingProxyType(
         "texels": (3, 4, 5, 6, 7, 8, 10),
     }
 )
-"""Precisions that are tried, for each group from coarse to fine."""
+"""Candidate precisions of each group, from coarse to fine."""
 ASSUMED_PSNR = 30.0
-"""Assumed PSNR of a model on photographs that are not there, in dB."""
+"""Assumed PSNR in dB of a model on missing photographs."""
 LEAST_LOSS = 1e-4
-"""Differences in dB below it are taken for this one: they are noise."""
+"""Difference in dB below which losses are noise and count as this one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,12 +52,13 @@ class Trial:
     losses: tuple[float, ...]
     """dB, by each measure of loss."""
     group: str = ""
-    """Group that is kept more coarsely than the rest, if one is."""
+    """Group that is coarser than the rest, if any."""
 
     @property
     def precision(self) -> Precision:
-        """Of its group."""
-        return getattr(self.choices, self.group)
+        """Precision of its group."""
+        chosen: Precision = getattr(self.choices, self.group)
+        return chosen
 
 
 def loss_on_views(
@@ -86,10 +87,10 @@ def loss_beside_renders(
     assumed_psnr: float = ASSUMED_PSNR,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
-    """Return the PSNR that models would lose on photographs that the given one renders with `assumed_psnr`.
+    """Return the estimated loss of PSNR of models, if the given one has `assumed_psnr`.
 
-    10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR stands for. Errors
-    that have nothing to do with each other add up so.
+    10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR stands for.
+    Uncorrelated errors add up this way.
     """
     draw = _drawing(model, cameras, model.background, settings)
     renders = list(draw(model))
@@ -102,8 +103,10 @@ def loss_beside_renders(
     return loss
 
 
-def _drawing(model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings):
-    """Draw models like the given one for cameras, clipped to [0, 1]; compiled once as long as the room suffices."""
+def _drawing(
+    model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings
+) -> Callable[[Model], Iterator[np.ndarray]]:
+    """Draw models like the given one for cameras, clipped to [0, 1]; compiled once while the capacity suffices."""
     if not cameras:
         raise ValueError("there are no views to measure a loss on")
     options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
@@ -128,7 +131,7 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> float:
 
 
 def try_choices(model: Model, choices: CompactChoices, losses: Sequence[Loss], group: str = "") -> Trial:
-    """Return the size of a file, and what the model that is read from it loses by each measure (host)."""
+    """Return the size of a file, and the loss of the model in it by each measure (host)."""
     data = encode_model(model, choices)
     again = decode_model(data)
     return Trial(choices, len(data), tuple(loss(again) for loss in losses), group)
@@ -140,7 +143,7 @@ def finest_choices(ladder: Ladder = LADDER) -> CompactChoices:
 
 
 def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDER) -> list[Trial]:
-    """Return sizes and losses of each group at each of its steps, the other groups at their finest (host).
+    """Return sizes and losses of each step of each group, with the other groups at their finest (host).
 
     Args:
       model: the model.
@@ -148,7 +151,7 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
       ladder: steps of groups, from coarse to fine.
 
     Returns:
-      Trials by group, from coarse to fine; of the groups that the model has any numbers of.
+      Trials from coarse to fine, for each group of which the model has numbers.
     """
     finest = finest_choices(ladder)
     trials = []
@@ -163,9 +166,8 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
 def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial]) -> Trial:
     """Return the smallest file within a loss by the first measure, found greedily (host).
 
-    From the finest choices on, the step that saves most bytes for what it loses is taken, as long as the losses of all
-    groups together, as measured apart, stay within; then the last steps are taken back until the file itself does, and
-    at last single steps are tried that may still be there.
+    Start from the finest choices. Take the step with the most bytes saved per loss while the sum of the separate losses
+    stays within the limit. Then undo the last steps until the file itself is within it, and finally try single steps.
 
     Args:
       model: the model.
@@ -208,7 +210,7 @@ def _with_single_steps(
 
 
 def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[dict[str, Precision]]:
-    """Return the precisions after each step down, of groups' trials from small to large."""
+    """Return the precisions after each step down, given the groups' trials from small to large."""
     at = {group: own[-1] for group, own in by_group.items()}
     path: list[dict[str, Precision]] = []
     while True:

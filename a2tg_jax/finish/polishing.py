@@ -1,20 +1,21 @@
-"""The best colours for given shapes: least squares over all that a picture is linear in.
+"""Best colours for given shapes: least squares over the parameters in which a picture is linear.
 
 A picture is linear in the RGB texels, and in the spherical harmonics of those Gaussians whose colour is not cut off at
-0. With positions, rotations, scales, opacities and alpha textures held, the squared error over all views is therefore
-quadratic in them, and a few steps of conjugate gradients come near its least: of J d = photograph − picture, where J
-draws a change of colours and its transpose is the backward pass.
+0. With positions, rotations, scales, opacities and alpha textures fixed, the squared error over all views is quadratic
+in them. A few steps of conjugate gradients on J d = photograph − picture come near its minimum: J draws a change of
+colours, and its transpose is the backward pass.
 """
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
@@ -47,24 +48,24 @@ class Photographs(NamedTuple):
     images: Array
     """[V, H, W, 3] over the background."""
     weights: Array
-    """[V, H, W, 1]: 1 where a pixel counts, else 0; or [V, 1, 1, 1] where all of them do."""
+    """[V, H, W, 1]: 1 where a pixel counts, else 0; [V, 1, 1, 1] if all do."""
 
 
 def polish(
     model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: Any = None
 ) -> Model:
-    """Return the model with colours nearer to the least squared error over the views (host).
+    """Return the model with colours that lower the squared error over the views (host).
 
     Args:
       model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
-      views: those it was trained on.
-      num_steps: of conjugate gradients, each of which draws every view forwards and backwards. Few steps are a
-        regularisation: many fit the training views at the price of others.
-      ridge: what the squares of the changes weigh beside the squared error, summed over pixels.
+      views: training views.
+      num_steps: number of steps of conjugate gradients; each draws every view forwards and backwards. Few steps
+        regularise, many overfit the training views.
+      ridge: weight of the squared changes beside the squared error, summed over pixels.
       background: [3] colour; None is the model's own.
 
     Raises:
-      ValueError: if there is no view, or the model shows something that is not linear in its parameters.
+      ValueError: if there is no view, or a picture is not linear in the appearance parameters.
     """
     _check(model, views)
     model = model.live
@@ -80,16 +81,23 @@ def _jitted() -> jit:
     return jit(_solve, static_argnums=(3, 4))
 
 
-def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):
+def _solve(
+    model: Model,
+    groups: list[Photographs],
+    background: Array,
+    settings: RenderSettings,
+    num_steps: int,
+    ridge: ArrayLike,
+) -> Colors:
     """Return the changes of the colours."""
 
-    def over_views(function):
-        """Return the sum over all views of what a function of camera and photograph gives."""
-        total = jax.tree.map(jnp.zeros_like, colors_of(model))
+    def over_views(function: Callable[[Camera, Photographs], Colors]) -> Colors:
+        """Return the sum over all views of a function of camera and photograph."""
+        total: Colors = jax.tree.map(jnp.zeros_like, colors_of(model))
         for group in groups:
             height, width = group.images.shape[1:3]
 
-            def step(total, view, height=height, width=width):
+            def step(total: Colors, view: Photographs, height: int = height, width: int = width) -> tuple[Colors, None]:
                 camera = Camera(view.viewmats, view.Ks, width, height)
                 return jax.tree.map(jnp.add, total, function(camera, view)), None
 
@@ -106,7 +114,8 @@ def _solve(model: Model, groups: list[Photographs], background: Array, settings:
 
         return over_views(of_view)
 
-    return solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
+    changes: Colors = solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
+    return changes
 
 
 def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSettings) -> Array:
@@ -115,7 +124,7 @@ def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSett
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
-    """Return the change [H, W, 3] of a picture by a change of the colours; linear in it."""
+    """Return the change [H, W, 3] of a picture by a change of the colours, a linear function."""
     is_shown = model.rule.own_color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
     sums = changed.rule.own_color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
@@ -129,7 +138,8 @@ def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Ar
     """Return the transpose of `draw_change`, of an image."""
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
     _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
-    return back(image)[0]
+    transposed: Colors = back(image)[0]
+    return transposed
 
 
 def colors_of(model: Model) -> Colors:

@@ -1,11 +1,11 @@
-"""Textures that shrink where that costs next to nothing: the reverse of upscaling, for finished models.
+"""Shrinking of textures where it costs next to nothing: the reverse of upscaling, for finished models.
 
-A texture is halved along the side where its pairs of texels differ least, weighed by how much they show; a texture of
-one texel, which is no more than another colour and opacity, goes into those of its Gaussian. The cheapest of these
-steps per byte are taken, as many as a loss of PSNR on given views allows, again and again.
+A texture is halved along the side where its pairs of texels differ least, weighted by h. A texture of one texel is only
+another colour and opacity, and merges into those of its Gaussian. Rounds of the cheapest steps per byte are taken, as
+many as a loss of PSNR on given views allows.
 
-h: how much a texel shows, Σ over pixels and views of (∂picture/∂texel)², estimated as Hutchinson does from a vector of
-random signs for each view. Changing texels by δ then changes the squared error by about Σ h·δ².
+h is the visibility of a texel, Σ over pixels and views of (∂picture/∂texel)², by Hutchinson's estimator with a vector
+of random signs for each view. Changing texels by δ then changes the squared error by about Σ h·δ².
 """
 
 import dataclasses
@@ -30,20 +30,20 @@ from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Textur
 LEAST_OPACITY = 1e-4
 """Largest opacity of a Gaussian after absorbing a texel's alpha: its logit must be finite."""
 LEAST_SAVED = 0.005
-"""Rounds that save less of a model's bytes are the last."""
+"""Smallest share of a model's bytes that a round must save for another one."""
 
 
 def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.02, background: Any = None) -> Model:
-    """Return the model with smaller textures, and as many Gaussians (host).
+    """Return the model with smaller textures and as many Gaussians as before (host).
 
     Args:
       model: of `Textured` with signed RGB, or of `Banded` around it.
-      views: on which the loss is measured, such as those it was trained on.
-      max_loss: dB of PSNR, as a mean over the views, that may be lost at most.
+      views: views to measure the loss on, such as the training views.
+      max_loss: largest loss of PSNR in dB, as a mean over the views.
       background: [3] colour; None is the model's own.
 
     Returns:
-      A model whose `num_bytes` are no more, and whose loss is no more than `max_loss`; the same where nothing shrinks.
+      A model of no more bytes, with a loss of at most `max_loss`; the same model if nothing shrinks.
 
     Raises:
       ValueError: if there are no views, the loss is negative, or the model has no such textures.
@@ -75,7 +75,7 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
 
 
 def _shrunk_once(model: Model, views: Sequence[View], background: Any, is_allowed: Any) -> Model:
-    """Return the model after the cheapest of one step for each texture, as many as are allowed."""
+    """Return the model after the cheapest allowed steps, at most one for each texture."""
     step = halved(model, texel_weights(model, views, background))
     saved = step.saved
     order = np.argsort(step.cost / np.maximum(saved, 1), kind="stable")
@@ -108,13 +108,13 @@ class Step(NamedTuple):
     textures: Textures
     layout: AtlasLayout
     cost: np.ndarray
-    """[N] about how much the squared error grows."""
+    """[N] estimated growth of the squared error."""
     saved: np.ndarray
     """[N] bytes."""
 
 
 def halved(model: Model, weights: Textures) -> Step:
-    """Every texture halved along the side that costs less, and single texels taken over (host).
+    """Return all textures halved along the cheaper side, and single texels merged (host).
 
     Args:
       model: with textures.
@@ -148,7 +148,7 @@ def halved(model: Model, weights: Textures) -> Step:
 
 
 def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Textures [n, Tv, Tu, 4] with weighted means of pairs along an axis, and what each costs [n]."""
+    """Return textures [n, Tv, Tu, 4] with weighted means of pairs along an axis, and the cost [n] of each."""
     pairs = texels.reshape(*texels.shape[:axis], -1, 2, *texels.shape[axis + 1 :])
     own = weights.reshape(pairs.shape) + 1e-9
     means = (own * pairs).sum(axis=axis + 1) / own.sum(axis=axis + 1)
@@ -157,7 +157,7 @@ def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[n
 
 
 def _with_single_texels(model: Model) -> Gaussians:
-    """Return the Gaussians, those with a texture of one texel in its colour and as opaque as it makes them."""
+    """Return the Gaussians after absorbing the colour and opacity of textures of one texel."""
     textures, layout = model.textures  # type: ignore[misc]
     gaussians = model.gaussians
     texels = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (layout.num, 1))
@@ -194,7 +194,7 @@ def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
 def _filled(
     sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype: Any
 ) -> tuple[Textures, AtlasLayout]:
-    """Textures of the given sizes [N, 2], from pieces: Gaussians and their texels [n, Tv, Tu, 4], of one size each."""
+    """Return textures of the given sizes [N, 2] from pieces: Gaussians and their texels [n, Tv, Tu, 4] of one size."""
     layout, capacities = plan_layout(sizes)
     shapes = zip(capacities, layout.resolutions, strict=True)
     buckets = [np.tile(np.asarray(NEUTRAL_TEXEL, dtype), (capacity, *size, 1)) for capacity, size in shapes]
@@ -210,13 +210,13 @@ def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textu
 
     Args:
       model: with textures.
-      views: what is looked at; their photographs are not.
+      views: cameras; their photographs are not used.
       background: [3] colour.
     """
     assert model.textures is not None
     settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
     background = jnp.asarray(background, model.gaussians.means.dtype)
-    total = jax.tree.map(jnp.zeros_like, model.textures[0])
+    total: Textures = jax.tree.map(jnp.zeros_like, model.textures[0])
     for index, view in enumerate(views):
         total = jax.tree.map(jnp.add, total, _jitted()(model, view.camera, background, jax.random.key(index), settings))
     return total
@@ -238,4 +238,5 @@ def _weights_in(model: Model, camera: Camera, background: Array, key: Array, set
 
     color, back = jax.vjp(draw, textures)
     (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
-    return jax.tree.map(jnp.square, slopes)
+    squares: Textures = jax.tree.map(jnp.square, slopes)
+    return squares

@@ -1,10 +1,12 @@
-"""Files that appear whole or not at all, and are on the disk before they take the place of others."""
+"""Atomic writes: files appear whole or not at all, and reach the disk before they replace others."""
 
 import contextlib
 import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+
+from a2tg_jax.host.operating_system import flush_folder
 
 PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 """Name pattern of a partial file: the name of the final file, and the process."""
@@ -14,8 +16,8 @@ PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
 
-    A run killed while it writes, or a machine that loses its power, leaves the old file, or none, never half of one.
-    Missing parent folders are made.
+    If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
+    folders are made.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,19 +37,6 @@ def left_over(folder: Path) -> dict[Path, Path]:
         return {}
     names = {entry: PARTIAL.fullmatch(entry.name) for entry in folder.iterdir()}
     return {entry: folder / match[1] for entry, match in names.items() if match}
-
-
-def flush_folder(folder: Path) -> None:
-    """Flush the names of a folder's files to disk, if the operating system can flush folders."""
-    if os.name == "nt":
-        return
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        # Some file systems of networks refuse it; they keep names in another way.
-        with contextlib.suppress(OSError):
-            os.fsync(number)
-    finally:
-        os.close(number)
 
 
 def _flush(path: Path) -> None:

@@ -4,13 +4,13 @@ from pathlib import Path
 
 
 def group_folders(root: Path, controller: str) -> list[Path]:
-    """Return the folders of the groups that limit this process in something, its own first, those around it after.
+    """Return the folders of the control groups that limit this process, innermost first.
 
-    A group's limit holds for all groups in it. In a container the path of the process's group may be that outside,
-    whose folders do not exist; then the limit is found at the top.
+    A group's limit holds for all groups in it. In a container the path of the group may be that of the host, whose
+    folders do not exist. Then the limit is at the top.
 
     Args:
-      root: of the file system, with proc/self/cgroup and sys/fs/cgroup.
+      root: root of the file system, with proc/self/cgroup and sys/fs/cgroup.
       controller: "cpu" or "memory".
     """
     try:

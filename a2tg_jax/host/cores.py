@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from a2tg_jax.host.control_groups import group_folders
+from a2tg_jax.host.operating_system import has_control_groups, num_cores
 
 VARIABLE = "A2TG_NUM_THREADS"
 
@@ -15,10 +16,10 @@ _chosen: int | None = None
 def set_num_threads(num_threads: int | None) -> None:
     """Set the number of threads of native loops, from their next call on; XLA's own threads are not affected.
 
-    Results depend on it in the last bits of gradients only; on nothing else, such as timing.
+    Only the last bits of gradients depend on it.
 
     Args:
-      num_threads: at least 1; None: the environment's A2TG_NUM_THREADS, or else as many as the process may use.
+      num_threads: at least 1; None: A2TG_NUM_THREADS of the environment, or else all cores that the process may use.
 
     Raises:
       ValueError: if the number is not a positive integer.
@@ -32,7 +33,7 @@ def set_num_threads(num_threads: int | None) -> None:
 
 
 def num_threads() -> int:
-    """Return the number of threads: the one that was set, the environment's, or one per available core.
+    """Return the number of threads: the one set, that of the environment, or one per available core.
 
     Raises:
       ValueError: if the environment's is not a positive integer.
@@ -48,22 +49,20 @@ def num_threads() -> int:
 
 
 def _usable_cores() -> int:
-    """Return the cores that the process may run on, or fewer where a control group (a container) gives it less time."""
-    has_affinity = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, _own_quota())))
+    """Return the number of usable cores, which the quota of a control group (a container) may reduce."""
+    return max(1, math.ceil(min(num_cores(), _own_quota())))
 
 
 @functools.cache
 def _own_quota() -> float:
-    return cpu_quota(Path("/"))
+    return cpu_quota(Path("/")) if has_control_groups() else math.inf
 
 
 def cpu_quota(root: Path) -> float:
-    """Return the processors' time per time that control groups leave to this process; inf without a limit.
+    """Return the number of processors that control groups grant this process; inf without a limit.
 
     Args:
-      root: of the file system, as for `host.control_groups.group_folders`.
+      root: root of the file system, as for `host.control_groups.group_folders`.
     """
     return min([math.inf, *map(_folder_quota, group_folders(root, "cpu"))])
 

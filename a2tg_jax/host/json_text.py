@@ -1,4 +1,4 @@
-"""JSON and TOML of strangers: of bounded size and depth before they are parsed, and then of numbers that are finite."""
+"""Untrusted JSON and TOML: size and depth are checked before parsing, and numbers must be finite."""
 
 import json
 import math
@@ -37,8 +37,8 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
 
     Args:
       text: the text, or UTF-8.
-      allow_nan: take NaN and infinities, which are not JSON but are written by Python's own library, and floats that
-        are too large to be finite.
+      allow_nan: accept NaN and infinities, which Python's own library writes although they are not JSON, and floats
+        that overflow.
 
     Raises:
       ValueError: saying in a few words what is wrong.
@@ -91,16 +91,17 @@ def _check_size(data: bytes, most: int) -> None:
 
 
 def _outside_strings(data: bytes) -> np.ndarray:
-    """Return the brackets of a JSON text, and whatever else stands outside its strings, as bytes."""
+    """Return the bytes of a JSON text outside its strings, brackets included."""
     letters = np.frombuffer(data.replace(b"\\\\", b"").replace(b'\\"', b""), np.uint8)
     num_quotes = np.cumsum(letters == ord('"'), dtype=np.uint8)  # Wraps, which keeps it even or odd.
-    return letters[num_quotes % 2 == 0]
+    outside: np.ndarray = letters[num_quotes % 2 == 0]
+    return outside
 
 
 def _check_brackets(outside: np.ndarray) -> None:
-    """Raise ValueError unless the brackets among bytes are few enough and nested at most `DEEPEST` deep.
+    """Raise ValueError if there are too many brackets, or more than `DEEPEST` nested ones.
 
-    Texts whose brackets do not match are refused where they are parsed.
+    The parser refuses unmatched ones.
     """
     steps = STEPS[outside]
     steps = steps[steps != 0]

@@ -1,8 +1,9 @@
-"""Dependencies of a run's last bits besides its options: versions, processor, device, threads."""
+"""Machine of a run. Beside the options it decides the last bits: versions, processor, device, threads."""
 
 import dataclasses
 
 import jax
+from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host.cores import VARIABLE, num_threads
 from a2tg_jax.host.startup import processor_key
@@ -24,7 +25,7 @@ class Machine:
     """Number of threads of native loops, which divide sums among them."""
 
     def differences(self, now: "Machine") -> list[str]:
-        """Return what differs on another machine and changes the last bits, with a remedy if there is one."""
+        """Return the differences to another machine that change the last bits, with a remedy if there is one."""
         told = [
             f"{name} is {getattr(now, name)} and was {getattr(self, name)}"
             for name in ("jax", "jaxlib", "device", "processor")
@@ -41,4 +42,4 @@ def this_machine() -> Machine:
     """Return the machine of this process. This starts JAX's devices."""
     device = jax.devices()[0]
     kind = f"{device.platform} {device.device_kind}"
-    return Machine(jax.__version__, jax.lib.__version__, kind, processor_key(), num_threads())
+    return Machine(jax.__version__, jaxlib_version, kind, processor_key(), num_threads())

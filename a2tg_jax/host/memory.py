@@ -1,14 +1,11 @@
-"""Memory that a process has and may have, and what compiled programs leave behind in it."""
+"""Memory of the process: its use, its limit, and the leftovers of compiled programs."""
 
-import ctypes
-import functools
-import os
 from pathlib import Path
-from typing import Any
 
 import jax
 
 from a2tg_jax.host.control_groups import group_folders
+from a2tg_jax.host.operating_system import machine_memory, memory_mappings, memory_numbers, trim_heap
 
 LARGEST_SHARE = 0.6
 """Share of the memory mappings allowed to a process beyond which compiled programs are dropped."""
@@ -17,37 +14,28 @@ LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.us
 
 
 def memory_limit(root: Path = Path("/")) -> int:
-    """Return bytes of memory that this process may have in all: what it has and what is free, now (host).
+    """Return the bytes of memory that this process may use in all: its own and the free memory, now (host).
 
-    Limits of control groups count. What a group keeps of files that can be read again is free.
+    Limits of control groups count. A group's cache of files counts as free.
 
     Args:
-      root: of the file system; where Linux's proc is not there, the machine's memory is the answer.
+      root: of the file system. Without Linux's /proc the answer is the machine's memory.
     """
-    told = _told(root / "proc/meminfo")
+    told = memory_numbers(root / "proc/meminfo")
     if "MemAvailable" not in told:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**63 - 1
-    own = _told(root / "proc/self/status").get("VmRSS", 0)
+        return machine_memory()
+    own = memory_numbers(root / "proc/self/status").get("VmRSS", 0)
     groups = (_left_in(folder) for folder in group_folders(root, "memory"))
     return own + max(0, min([told["MemAvailable"], *(left for left in groups if left is not None)]))
 
 
 def memory_peak(root: Path = Path("/")) -> int:
-    """Return bytes of memory that this process had at its peak; 0 if the system does not report it (host)."""
-    return _told(root / "proc/self/status").get("VmHWM", 0)
-
-
-def _told(file: Path) -> dict[str, int]:
-    """Return the bytes of a file of lines "Name: 123 kB"; empty without such a file."""
-    try:
-        lines = [line.replace(":", " ").split() for line in file.read_text().splitlines()]
-    except OSError:
-        return {}
-    return {line[0]: 1024 * int(line[1]) for line in lines if line[2:] == ["kB"] and line[1].isdecimal()}
+    """Return the peak memory of this process in bytes; 0 if the system does not report it (host)."""
+    return memory_numbers(root / "proc/self/status").get("VmHWM", 0)
 
 
 def _left_in(folder: Path) -> int | None:
-    """Return bytes that a control group still has room for; None without a limit."""
+    """Return the free bytes of a control group; None without a limit."""
     for limit, usage in LIMITS:
         try:
             room = int((folder / limit).read_text()) - int((folder / usage).read_text())
@@ -59,48 +47,25 @@ def _left_in(folder: Path) -> int | None:
 
 
 def tidy_memory() -> None:
-    """Return free memory and keep room for programs, after one was compiled."""
-    return_free_memory()
+    """Return free memory, 100 to 200 MB with glibc, and keep room for programs, after one was compiled."""
+    trim_heap()
     keep_room_for_programs()
 
 
-def return_free_memory() -> None:
-    """Have the C library return the memory it caches: 100 to 200 MB after a training step was compiled.
-
-    With other C libraries than glibc nothing happens.
-    """
-    trim = getattr(_c_library(), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
-
-
-@functools.cache
-def _c_library() -> Any:
-    try:
-        return ctypes.CDLL(None)
-    except (OSError, TypeError):  # Windows has no such library
-        return None
-
-
 def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
-    """Drop all compiled programs of JAX if the process is about to run out of memory mappings for further ones.
+    """Drop all compiled programs of JAX if the process is about to run out of memory mappings.
 
-    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Where it gets
-    none it waits for ever. What is still needed is compiled again.
+    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Without one it
+    waits for ever. Programs in use are compiled again.
 
     Args:
-      processes: where the system tells about processes; nothing happens where it does not.
+      processes: /proc; on systems without one nothing happens.
 
     Returns:
       Whether programs were dropped.
     """
-    try:
-        limit = int((processes / "sys/vm/max_map_count").read_text())
-        with open(processes / "self/maps", "rb") as maps:
-            count = sum(1 for _ in maps)
-    except (OSError, ValueError):
-        return False
-    if count <= LARGEST_SHARE * limit:
+    mappings = memory_mappings(processes)
+    if mappings is None or mappings[0] <= LARGEST_SHARE * mappings[1]:
         return False
     jax.clear_caches()
     return True

@@ -1,4 +1,4 @@
-"""Reading .npz files of numbers. Nothing is allocated that the file is too small for, and nothing is unpickled."""
+"""Reading .npz files of numbers. No allocation exceeds what the file can hold, and nothing is unpickled."""
 
 import ast
 import math
@@ -28,7 +28,7 @@ def read_npz(
 
     Raises:
       OSError: if the file cannot be opened.
-      ValueError: saying what is wrong, if it is damaged, an array is not of numbers, or claims more than there is.
+      ValueError: saying what is wrong, if it is damaged, or an array is not numeric or larger than its data.
     """
     with open_regular(path) as file:
         try:
@@ -54,7 +54,7 @@ def _read_arrays(archive: zipfile.ZipFile, room: int, is_wanted: Callable[[str],
 
 
 def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
-    """Return one array, of as many bytes as its entry has left after its header."""
+    """Return one array. Its entry must hold exactly its bytes after the header."""
     dtype, is_fortran, shape = _read_header(file, name)
     left = size - file.tell()
     if math.prod(shape) * dtype.itemsize != left:
@@ -71,7 +71,7 @@ def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
 
 
 def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int, ...]]:
-    """Return the dtype of one array, whether its first index runs fastest, and its shape."""
+    """Return the dtype of one array, whether it is in Fortran order, and its shape."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{name} is of the version {version} of .npy, which is not known here")

@@ -1,7 +1,7 @@
-"""Files of strangers: only regular ones are opened, and none that is larger than its kind can be.
+"""Untrusted files: only regular files up to a largest size are opened.
 
-Links are followed, as their owner makes them on purpose. What they lead to must be a regular file: a device never ends,
-and a pipe waits for someone who writes.
+Links are followed, because their owner makes them on purpose. Their target must be a regular file: a device never ends,
+and a pipe waits for a writer.
 """
 
 import os
@@ -9,12 +9,14 @@ import stat
 from io import BufferedReader
 from pathlib import Path
 
+from a2tg_jax.host.operating_system import reading_flags
+
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:
-    """Return whether there is a regular file; False for nothing, or a folder.
+    """Return whether a path is a regular file; False if it is missing or a folder.
 
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.
@@ -41,8 +43,7 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError(_refusal(path))
     # It may have been replaced by a pipe meanwhile, for whose writer this does not wait.
-    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    file = open(os.open(path, flags), "rb")  # noqa: SIM115 - the caller closes it
+    file = open(os.open(path, reading_flags()), "rb")  # noqa: SIM115 - the caller closes it
     status = os.fstat(file.fileno())
     if stat.S_ISREG(status.st_mode) and status.st_size <= most_bytes:
         return file

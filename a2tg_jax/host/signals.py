@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: how a program ends when it is asked to."""
+"""Ctrl-C, SIGTERM and SIGHUP: orderly ends of a program."""
 
 import contextlib
 import signal
@@ -6,8 +6,10 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from a2tg_jax.host.operating_system import ending_signals
+
 CTRL_C = signal.SIGINT
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+ENDING = ending_signals()
 
 
 class Stopped(KeyboardInterrupt):
@@ -16,7 +18,7 @@ class Stopped(KeyboardInterrupt):
     def __init__(self, number: int, advice: str = ""):
         """Args:
         number: of the signal.
-        advice: how to go on with what was stopped.
+        advice: how to go on with the stopped work.
         """
         super().__init__(signal.Signals(number).name)
         self.number, self.advice = int(number), advice
@@ -42,7 +44,7 @@ def raised() -> Iterator[None]:
 def noted() -> Iterator[Callable[[], bool]]:
     """Note the first signal within the block, and raise `Stopped` at the second.
 
-    Yields a function that tells whether there was one. In the end any becomes a `Stopped`.
+    Yield a function that returns whether there was one. At the end of the block a noted signal raises `Stopped`.
     """
     numbers: list[int] = []
 

@@ -1,4 +1,4 @@
-"""Settings of JAX to be made before its first computation. The library itself never makes them."""
+"""Settings of JAX before its first computation. The library itself never changes them."""
 
 import hashlib
 import os
@@ -6,8 +6,10 @@ import platform
 from pathlib import Path
 
 import jax
+from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host import cores
+from a2tg_jax.host.operating_system import processor_features
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
 """Versions known to have the flags below; an unknown flag would end the process."""
@@ -20,15 +22,14 @@ WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> None:
     """Make JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
-    Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS, of which the user's own settings have
-    precedence: while-loops are compiled whole, which compositing by XLA gains from, and vectors are 512 bits wide where
-    the processor has AVX-512. Native compositing needs neither. A GPU is not affected.
-    The command line calls this; programs and notebooks may.
+    Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS unless you have set them: while-loops are
+    compiled whole, which speeds up compositing by XLA, and vectors are 512 bits wide on processors with AVX-512. Native
+    compositing needs neither. GPUs are not affected. The command line calls this; programs and notebooks may.
 
     Args:
       use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
-        unless JAX has a cache already. Where XLA would print pages for every program it reads, its log is reduced to
-        fatal errors (`silence_xla`).
+        unless JAX has a cache already. If XLA would print pages for every cached program, its log is reduced to fatal
+        errors (`silence_xla`).
       num_threads: of native loops (`set_num_threads`); None leaves what is set.
 
     Raises:
@@ -37,7 +38,7 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
     if num_threads is not None:
         cores.set_num_threads(num_threads)
     cores.num_threads()
-    features = _processor_features()
+    features = processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
     if use_cache and jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(compilation_cache_folder()))
@@ -47,18 +48,18 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
 
 
 def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the XLA flags that help on a processor with these features, as far as this JAX is known to have them."""
+    """Return the XLA flags that help on a processor with these features; none for an unknown version of JAX."""
     if jax_version not in CHECKED_JAX_VERSIONS:
         return ()
     return (WHOLE_LOOPS_FLAG, WIDE_VECTORS_FLAG) if "avx512f" in features else (WHOLE_LOOPS_FLAG,)
 
 
 def silence_xla() -> None:
-    """Let XLA's C++ code log fatal errors only; what it raises is not affected, nor what JAX itself logs.
+    """Let XLA's C++ code log fatal errors only. Exceptions and JAX's own log are not affected.
 
-    With AVX-512, XLA finds two tuning hints of its own missing from the processor's features whenever it reads a
-    program from a cache, and says at length that it may crash; it does not (openxla/xla#44565). A user who has asked
-    for XLA's log, by jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, gets it all.
+    With AVX-512, XLA warns at length of crashes whenever it reads a program from a cache, because two of its own tuning
+    hints are missing from the processor's features. It does not crash (openxla/xla#44565). If you ask for XLA's log by
+    jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, you get all of it.
     """
     asked = jax.config.values["jax_logging_level"]
     if asked in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "0":
@@ -68,7 +69,7 @@ def silence_xla() -> None:
 
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:
-    """Append flags to the environment's XLA_FLAGS, except those that the user has set already."""
+    """Append flags to XLA_FLAGS of the environment, except those that are set already."""
     own = os.environ.get("XLA_FLAGS", "").split()
     taken = {flag.split("=", 1)[0] for flag in own}
     os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
@@ -84,19 +85,10 @@ def compilation_cache_folder() -> Path:
 
     It lies in `cache_folder()` and may be deleted at any time.
     """
-    return cache_folder() / f"jaxlib-{jax.lib.__version__}-{processor_key()}"
+    return cache_folder() / f"jaxlib-{jaxlib_version}-{processor_key()}"
 
 
 def processor_key() -> str:
     """Return a short text shared by processors that run the same compiled code."""
-    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(_processor_features()))}"
+    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(processor_features()))}"
     return hashlib.sha256(processor.encode()).hexdigest()[:12]
-
-
-def _processor_features() -> frozenset[str]:
-    """Return the processor's features as Linux lists them; empty elsewhere."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return frozenset()
-    return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))

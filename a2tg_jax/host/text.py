@@ -3,12 +3,12 @@
 from typing import Any
 
 SLACK = 10
-"""Multiple of the told letters that is looked at, since runs of spaces are told as one."""
+"""Number of letters to read for each printed letter, because runs of spaces print as one."""
 
 
 def shortened(value: Any, most: int = 80) -> str:
-    """Return a value as an error tells it, on one line of bounded length; texts without quotes, nor what steers a
-    terminal."""
+    """Return a value as errors print it: one line of bounded length, without quotes around texts or terminal control
+    characters."""
     text = (value if isinstance(value, str) else repr(value))[: SLACK * most]  # Words of it all would take memory.
     text = " ".join(text.split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])

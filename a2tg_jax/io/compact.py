@@ -82,7 +82,7 @@ class CompactChoices:
 
     def keeping(self, others: Mapping[str, Any]) -> Self:
         """Return the choices with some changed, by name."""
-        return dataclasses.replace(self, **dict(others))  # type: ignore[arg-type]
+        return dataclasses.replace(self, **dict(others))
 
     def check(self) -> Self:
         """Raise ValueError, naming the choice, if one is invalid."""

@@ -84,7 +84,8 @@ def _to_json(value: Any) -> Any:
 
 
 def _from_json(hint: Any, value: Any, where: str) -> Any:
-    """Return `value` as the type that the annotation asks for."""
+    """Return `value` as the type that the annotation asks for; what a dict holds is not looked at."""
+    hint = dict if typing.get_origin(hint) is dict else hint
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
     is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union

@@ -54,8 +54,7 @@ def _camera(view: Any, where: str) -> Camera:
         raise ValueError(f"{where}.K must be intrinsics with positive focal lengths")
     if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise ValueError(f"{where}.size must be 1 to {LARGEST_SIDE} pixels; got {width:g} and {height:g}")
-    as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    return Camera(as_float(viewmat), as_float(K), int(width), int(height))
+    return Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), int(width), int(height))
 
 
 def _numbers(view: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:

@@ -5,7 +5,7 @@ and scale in 11, 10 and 11 bits; rotation as the index of its largest number and
 opacity in 8), and perhaps `sh` (uchar: spherical harmonics above degree 0). Unpacked they are vertices of 3DGS.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -85,7 +85,9 @@ def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
     return found
 
 
-def _within(bounds: Mapping[str, np.ndarray], what: str, axes: str, shares, names) -> dict[str, np.ndarray]:
+def _within(
+    bounds: Mapping[str, np.ndarray], what: str, axes: str, shares: Sequence[np.ndarray], names: Sequence[str]
+) -> dict[str, np.ndarray]:
     """Return columns scaled between their bounds."""
     ends = [(bounds[f"min_{what}{axis}"], bounds[f"max_{what}{axis}"]) for axis in axes]
     return {

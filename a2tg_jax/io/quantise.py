@@ -138,7 +138,8 @@ class Contraction(NamedTuple):
         return np.arcsinh((np.asarray(x, np.float64) - self.centre) / self.spread)
 
     def expanded(self, y: np.ndarray) -> np.ndarray:
-        return self.centre + self.spread * np.sinh(y)
+        values: np.ndarray = self.centre + self.spread * np.sinh(y)
+        return values
 
 
 def morton(codes: np.ndarray, bits: int) -> np.ndarray:
@@ -193,4 +194,5 @@ def with_w(xyz: np.ndarray) -> np.ndarray:
     """Return unit quaternions [n, 4] from their last three numbers [3, n]; w is not negative."""
     squares = np.minimum(np.sum(xyz**2, axis=0), 1.0)
     quats = np.concatenate([np.sqrt(1.0 - squares)[None], xyz]).T
-    return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+    units: np.ndarray = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+    return units

@@ -8,6 +8,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.gaussians import Gaussians
@@ -91,7 +92,8 @@ def ordered(rows: Rows, order: np.ndarray) -> Rows:
 def _owned(degrees: np.ndarray, order: np.ndarray, degree: int) -> np.ndarray:
     """Return the rows of a band, in the order of their splats."""
     places = np.cumsum(degrees >= degree) - 1
-    return places[order[degrees[order] >= degree]]
+    owned: np.ndarray = places[order[degrees[order] >= degree]]
+    return owned
 
 
 def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -104,7 +106,8 @@ def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarra
     row, column = np.divmod(within, np.maximum(widths, 1))
     row = np.where(np.repeat(np.isin(axis, V_MIRRORED), areas), heights - 1 - row, row)
     column = np.where(np.repeat(np.isin(axis, U_MIRRORED), areas), widths - 1 - column, column)
-    return np.repeat(starts, areas) + row * widths + column
+    places: np.ndarray = np.repeat(starts, areas) + row * widths + column
+    return places
 
 
 def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None) -> Model:
@@ -119,7 +122,10 @@ def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origi
     Raises:
       ValueError: if tables disagree.
     """
-    as_float = lambda x: jnp.asarray(np.asarray(x, np.float32))  # noqa: E731
+
+    def as_float(x: np.ndarray) -> Array:
+        return jnp.asarray(np.asarray(x, np.float32))
+
     gaussians = Gaussians(
         means=as_float(rows.means),
         quats=as_float(rows.quats),

@@ -160,7 +160,7 @@ class Reader:
         if count == 0 and length:
             raise ValueError(f"{name} are of a table that is empty")
         self.take_room(name, length)
-        indices = quantise.from_planes(self.planes(name, quantise.num_bytes_of(bits), length), 1)[0]
+        indices: np.ndarray = quantise.from_planes(self.planes(name, quantise.num_bytes_of(bits), length), 1)[0]
         if length and indices.max() >= count:
             raise ValueError(f"{name} must be below {count}; got {indices.max()}")
         return indices

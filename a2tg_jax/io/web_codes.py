@@ -137,12 +137,14 @@ def rows_of_body(header: Mapping[str, Any], body: bytes) -> Rows:
 
 def signed_root(x: np.ndarray) -> np.ndarray:
     """Return √|x| with the sign of x, so that steps grow with the residual; most residuals are small."""
-    return np.sign(x) * np.sqrt(np.abs(x))
+    root: np.ndarray = np.sign(x) * np.sqrt(np.abs(x))
+    return root
 
 
 def signed_square(x: np.ndarray) -> np.ndarray:
     """Return the inverse of `signed_root`."""
-    return x * np.abs(x)
+    square: np.ndarray = x * np.abs(x)
+    return square
 
 
 class Reader:

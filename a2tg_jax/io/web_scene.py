@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
@@ -129,14 +130,15 @@ def decode_web_scene(data: bytes, where: str = "the web scene") -> WebScene:
 def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
     """Return [N] opacity times the area that cameras see, on average; without cameras times the area itself."""
     shown = 1 / (1 + np.exp(-np.clip(rows.logit_opacities.astype(np.float64), -80, 80)))
-    areas = shown * np.exp(rows.log_scales.astype(np.float64).sum(axis=1))
+    areas: np.ndarray = shown * np.exp(rows.log_scales.astype(np.float64).sum(axis=1))
     if origin is None or not len(origin.viewmats):
         return areas
     viewmats = origin.viewmats[:: -(-len(origin.viewmats) // MOST_CAMERAS)]
     centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     squares = np.stack([np.sum((rows.means - center) ** 2, axis=1) for center in centers])
     least = NEAREST * np.median(squares) if squares.size else 1.0
-    return areas * np.mean(1 / np.maximum(squares, max(least, 1e-30)), axis=0)
+    seen: np.ndarray = areas * np.mean(1 / np.maximum(squares, max(least, 1e-30)), axis=0)
+    return seen
 
 
 def _as_shown(model: Model) -> Model:
@@ -233,7 +235,10 @@ def _appearance_of(header: Mapping[str, Any]) -> Appearance:
 def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
     if origin is None:
         return {"background": [0.0, 0.0, 0.0], "cameras": None}
-    as_floats = lambda x: [float(str(number)) for number in np.asarray(x, np.float32).ravel()]  # noqa: E731
+
+    def as_floats(x: ArrayLike) -> list[float]:
+        return [float(str(number)) for number in np.asarray(x, np.float32).ravel()]
+
     cameras = [
         {
             "name": name,

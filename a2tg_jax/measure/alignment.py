@@ -14,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.jit import jit
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
@@ -45,7 +47,8 @@ def color_fit(image: Any, target: Any, mask: Any = None) -> np.ndarray:
     counts = np.ones(np.shape(image)[:2], bool) if mask is None else np.asarray(mask)
     colors, wanted = np.asarray(image, np.float64)[counts], np.asarray(target, np.float64)[counts]
     inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
-    return np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
+    affine: np.ndarray = np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
+    return affine
 
 
 def align_poses(
@@ -103,7 +106,16 @@ def _jitted_descent() -> jit:
     return jit(_descent, static_argnums=(6, 7))
 
 
-def _descent(gaussians, rule, camera: Camera, target: Array, mask, background, settings, num_steps: int) -> _Best:
+def _descent(
+    gaussians: Gaussians,
+    rule: AppearanceRule,
+    camera: Camera,
+    target: Array,
+    mask: Array | None,
+    background: Array,
+    settings: RenderSettings,
+    num_steps: int,
+) -> _Best:
     """Return the twist of least loss among those that Adam comes to."""
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     shown = target if mask is None else jnp.where(mask[..., None], target, 0.0)

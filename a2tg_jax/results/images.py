@@ -34,13 +34,15 @@ LONGEST_SIDE = 1280
 
 def to_uint8(image: ArrayLike) -> np.ndarray:
     """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
-    return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
+    pixels: np.ndarray = np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
+    return pixels
 
 
 def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the absolute difference, brightened ERROR_GAIN times."""
     difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
-    return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
+    picture: np.ndarray = np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
+    return picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +66,7 @@ def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> C
     side = max(8, min(height, width) // 4)
 
     def in_squares(error: np.ndarray) -> np.ndarray:
-        means = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
+        means: np.ndarray = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
         return means[: max(1, height - side + 1), : max(1, width - side + 1)]
 
     errors = [np.sum(_squared_error(image, target), axis=-1) for image in (before, after)]
@@ -139,7 +141,8 @@ def resolution_colors(num_levels: int) -> np.ndarray:
 
 def texel_levels(layout: AtlasLayout) -> np.ndarray:
     """Return [N] integers log₂(Tu·Tv), rounded; 0 for an empty texture."""
-    return np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
+    levels: np.ndarray = np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
+    return levels
 
 
 def colored_by_resolution(model: Model) -> Model:

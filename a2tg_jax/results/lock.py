@@ -6,22 +6,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from a2tg_jax.host.atomic import left_over
+from a2tg_jax.host.operating_system import try_lock
 from a2tg_jax.results.folder import RunFolder, open_run
 from a2tg_jax.results.replacement import is_unfinished, undo_unfinished
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 
 @contextlib.contextmanager
 def claimed(run: RunFolder) -> Iterator[None]:
     """Keep other processes from training and measuring in a run folder. The folder is made if it does not exist.
 
-    The lock is the operating system's, on the marker: it ends with the process, however that ends. Windows, and file
-    systems without locks, have none. What a killed process left half written is removed, and a run
-    that it was about to replace is put back.
+    The lock is the operating system's, on the marker: it ends with the process, however that ends. Some file systems
+    have no locks. Partial files of a killed process are removed, and a run that it was about to replace is put back.
 
     Raises:
       FileExistsError: if another process is at it.
@@ -30,7 +25,10 @@ def claimed(run: RunFolder) -> Iterator[None]:
     run.written()
     run.path.mkdir(parents=True, exist_ok=True)
     with open(run.marker, "a", encoding="utf-8") as file:
-        _lock(file.fileno(), run)
+        if not try_lock(file.fileno()):
+            raise FileExistsError(
+                f"another process is training or measuring in {run.path}: wait until it ends, or choose another --out"
+            )
         run.own(run.marker)
         undo_unfinished(run)
         remove_left_over(run)
@@ -59,16 +57,3 @@ def remove_left_over(run: RunFolder) -> None:
         for partial, path in left_over(folder).items():
             if path in own:
                 partial.unlink(missing_ok=True)
-
-
-def _lock(number: int, run: RunFolder) -> None:
-    if fcntl is None or os.name == "nt":
-        return
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise FileExistsError(
-            f"another process is training or measuring in {run.path}: wait until it ends, or choose another --out"
-        ) from None
-    except OSError:
-        return  # a file system without locks

@@ -137,7 +137,7 @@ class RunFile:
     preset: str | None = None
     compare: tuple[str, ...] = ()
     on_nan: OnNan = "stop"
-    options: dict = dataclasses.field(default_factory=dict)
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def chosen(self, where: str) -> System:
         """Return the system with the file's preset and options.

@@ -10,7 +10,7 @@ A process killed within step 2 leaves no run.toml, or a folder .a2tg-old.partial
 import os
 from pathlib import Path
 
-from a2tg_jax.host.atomic import flush_folder
+from a2tg_jax.host.operating_system import flush_folder
 from a2tg_jax.results.folder import RunFolder
 
 OLD = ".a2tg-old"

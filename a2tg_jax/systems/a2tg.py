@@ -1,4 +1,4 @@
-"""A²TG: plain Gaussians first, then textures that grow where the gradient asks for them (arXiv 2026, §3)."""
+"""A²TG: plain Gaussians first, then textures that grow where the gradient is large (arXiv 2026, §3)."""
 
 import dataclasses
 import math
@@ -32,8 +32,8 @@ from a2tg_jax.training.stage import Stage
 QUICK_TEXTURES: dict[str, Any] = {"rate": QUICK_TEXELS, "single_rate": 0.0}
 """Options of short runs (docs/results.md)."""
 BUDGET_TEXELS = 5
-"""Texels a Gaussian that a memory budget leaves room for on average: about as many as two or three upscalings of a
-quarter of the Gaussians make. Gaussians then take four fifths of the bytes."""
+"""Average number of texels per Gaussian under a memory budget: about the result of two or three upscalings of a quarter
+of the Gaussians. Gaussians then take four fifths of the bytes."""
 PAPER_THRESHOLD = 2e-5
 """k_G, in the unit of the authors' own statistic."""
 
@@ -130,7 +130,7 @@ class A2tg(System):
         return first, later_stage(self, "textures", textured, events, self.stage2_iterations, rates)
 
     def _texture(self) -> TextureConfig:
-        """Return the textures' options, those of a memory budget in place of others."""
+        """Return the textures' options, set by the memory budget if there is one."""
         if self.memory_budget is None:
             return self.texture
         if self.texture.budget_mb is not None:
@@ -138,7 +138,7 @@ class A2tg(System):
         return dataclasses.replace(self.texture, select="budget", budget_mb=megabytes_of(self.memory_budget))
 
     def _budget_texels(self, upscale: Upscale) -> float:
-        """Return the texels a Gaussian that the budget leaves room for, at most half of the largest texture."""
+        """Return the texels per Gaussian that fit into the budget, at most half of the largest texture."""
         with self.naming_options():
             can_grow = bool(upscale.iterations(self.stage2_iterations))
         return min(BUDGET_TEXELS, (1 + upscale.cap**2) / 2) if can_grow else 1
@@ -165,7 +165,7 @@ class A2tg(System):
         }  # fmt: skip
 
     def check_number(self, num: int) -> None:
-        """Refuse textures' bytes that the Gaussians of the first stage take up already."""
+        """Refuse a budget of textures that the Gaussians of the first stage already exhaust."""
         if self._texture().select != "budget" or self.memory_budget is not None or not self.densify.is_enabled:
             return
         assert self.texture.budget_mb is not None

@@ -1,4 +1,4 @@
-"""Bytes where they pay: many Gaussians of one colour, then view dependence and texels for those that need them."""
+"""Bytewise: many Gaussians of one colour first, then view dependence and texels for those that need them."""
 
 import dataclasses
 import math
@@ -81,7 +81,7 @@ class Bytewise(System):
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
     base_degree: int = 0
-    """Degree of spherical harmonics of all Gaussians; those that need more rise up to sh_degree."""
+    """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
     prune: PruneConfig = dataclasses.field(default_factory=PruneConfig)
     view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
@@ -111,7 +111,7 @@ class Bytewise(System):
         return first, later_stage(self, "details", shown, self._details(), self.stage2_iterations, rates)
 
     def _growth(self) -> tuple[Event, ...]:
-        """Return the events that fill all bytes, prune during growth, and make room for details in the end."""
+        """Return the events that fill all bytes, prune during growth, and finally make room for details."""
         grow = SplitByGradient(self._num_gaussians())
         last = (Prune(keep=self._num_kept()),) if self._share else ()
         return Noise(), grow, *self._pruning(), *last
@@ -151,7 +151,7 @@ class Bytewise(System):
         return Banded(inner), BandedRates(self.view_dependence.rate, of_texels)
 
     def _details(self) -> tuple[Event, ...]:
-        """Return the events of degrees first, up to their share, then of texels for all that is left."""
+        """Return the events of degrees, up to their share of the bytes, then of texels for the rest."""
         megabytes = self._num_bytes() / MEGABYTE
         view, texture = self.view_dependence, self.texture
         events: list[Event] = []
@@ -204,7 +204,8 @@ class Bytewise(System):
         super().check()
 
     def _check_times(self) -> None:
-        """Refuse times that do not exist, after which nothing grows, or at which textures have taken the bytes."""
+        """Refuse times outside a stage, times after the last growth, and degrees that change after textures took the
+        bytes."""
         view, texture = self.view_dependence, self.texture
         asked = {"view_dependence.at": (view.share, view.at), "texture.at": (texture.share, texture.at)}
         times = {name: iterations_at(at, self.stage2_iterations, name) for name, (share, at) in asked.items() if share}

@@ -1,4 +1,5 @@
-"""2DGS*-MCMC: plain 2D Gaussians under MCMC densification; also continued, so that equal iterations can be compared."""
+"""2DGS*-MCMC: plain 2D Gaussians under MCMC densification. A second stage without events allows comparisons at equal
+iterations."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -33,7 +33,7 @@ DENSITY_OPTIONS = {
     "CloneSplitPrune.least_opacity": "densify.least_opacity",
     "OpacityReset.most": "densify.reset_opacity",
 }
-"""Options by the field of an event that they set (`System.event_options`)."""
+"""Option that sets a field of an event (`System.event_options`)."""
 DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0, 0.99)}
 
 
@@ -47,7 +47,7 @@ class McmcConfig:
     """Whether Gaussians relocate and grow."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
-        """Noise after every iteration; relocation and growth at their times.
+        """Return the events: noise after every iteration, relocation and growth at their times.
 
         Args:
           budget_cap: how many Gaussians there shall be in the end; None: at most `cap`.
@@ -76,7 +76,7 @@ class DensityConfig:
     """Largest opacity after a reset, every max(500, n/10) of n iterations until n/2."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
-        """Clone, split and prune; reset opacities.
+        """Return the events: clone, split and prune; reset opacities.
 
         Args:
           budget_cap: how many Gaussians there shall be in the end; None: at most `cap`.
@@ -133,7 +133,7 @@ def later_stage(
 
 
 def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:
-    """Return a first stage, and one that goes on from its result without events, unless that has no iterations."""
+    """Return a first stage, and a second one without events if it has iterations."""
     if not iterations:
         return (first,)
     return first, later_stage(system, "continued", first.appearance, (), iterations, first.params_rate)

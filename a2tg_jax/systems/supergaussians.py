@@ -1,4 +1,4 @@
-"""SuperGaussians: colour and opacity vary over each splat by four movable kernels; adaptive density control."""
+"""SuperGaussians: four movable kernels vary colour and opacity over each splat; adaptive density control."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Order of the views that iterations train on: shuffled epochs that depend on the seed and the iteration alone."""
+"""Batches of views: the order of a training, and photographs on their way to the device."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,11 +15,12 @@ HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
 """Photographs stay on the device while they take no more than this share of its memory; on a CPU, 1 GiB."""
 ROOM_AHEAD = 2**28
+"""Largest size of prepared batches in bytes."""
 MOST_AHEAD = 10
-"""Batches that are made ready before they are wanted: so many, as long as they take no more bytes than that."""
+"""Largest number of prepared batches."""
 
 ALIGNMENT = 64
-"""Bytes, of memory that XLA takes over."""
+"""Alignment in bytes of memory that XLA adopts."""
 
 
 class Photographs(NamedTuple):
@@ -32,20 +33,21 @@ class Photographs(NamedTuple):
     images: Array
     """[V, H, W, 3] uint8."""
     alphas: Array | None
-    """[V, H, W] uint8, or None where the images are opaque."""
+    """[V, H, W] uint8, or None if the images are opaque."""
     masks: Array | None = None
-    """[V, H, W] bool, which pixels count; None where all of them do."""
+    """[V, H, W] bool, True at pixels that count; None if all do."""
 
 
 class BatchOrder:
-    """Batches of views of one image size. Any iteration can be asked for, so a resumed run sees the same order."""
+    """Batches of views of one image size, in shuffled epochs. The order depends on the seed and the iteration alone, so
+    a resumed run sees the same one."""
 
     def __init__(self, views: tuple[View, ...], batch_size: int, seed: int, number: int = 0):
         """Args:
         views: of one scene.
         batch_size: views of an iteration.
         seed: of the order.
-        number: which of the orders of this seed, from 0.
+        number: index of the order among those of this seed.
         """
         self._views, self._batch_size = views, batch_size
         self._seeds = (seed, number) if number else (seed,)
@@ -59,7 +61,7 @@ class BatchOrder:
         return self._batches[position]
 
     def _draw(self, epoch: int) -> list[tuple[int, ...]]:
-        """One epoch: every view once; the last batch of a size is filled up from the start of its order."""
+        """Return one epoch: every view once. The last batch of a size is filled from the start of its order."""
         rng = np.random.default_rng([*self._seeds, epoch])
         by_size: dict[tuple[int, int], list[int]] = {}
         for index in rng.permutation(len(self._views)):
@@ -72,14 +74,14 @@ class BatchOrder:
 
 
 class BatchPlan(NamedTuple):
-    """Plan of how the photographs come to the device."""
+    """Place of the photographs during training."""
 
     is_resident: bool
     """All of them stay there."""
     batch_bytes: int
     """Bytes of the largest batch."""
     num_ahead: int
-    """Batches that are made ready before they are wanted, where not all stay."""
+    """Number of batches prepared ahead, if the photographs do not all stay on the device."""
 
 
 def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None) -> BatchPlan:
@@ -91,15 +93,15 @@ def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = 
 
 
 class PhotoStore:
-    """The photographs of a stage's iterations: on the device while all of them fit there, else brought to it batch by
-    batch, made ready by threads that know the order. Close it when the stage is over."""
+    """Photographs of a stage's iterations. They stay on the device if all of them fit; otherwise threads prepare
+    batches ahead of the step. Close it when the stage is over."""
 
     def __init__(self, views: tuple[View, ...], order: BatchOrder, last: int, room: float | None = None):
         """Args:
         views: of one scene.
-        order: which of them each iteration wants.
+        order: views of each iteration.
         last: the stage's last iteration.
-        room: bytes of the device that they may take; None: `DEVICE_SHARE` of it.
+        room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last = views, order, last
         plan = plan_batches(views, len(order.indices(1)), room)
@@ -108,10 +110,10 @@ class PhotoStore:
         self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices], views), self.num_ahead)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
-        """Photographs among which those of an iteration, all of one size, are; and where among them, int32.
+        """Return photographs of one size that include those of an iteration, and their int32 indices among them.
 
         Raises:
-          ValueError: if a photograph that was left on disk is not there any more, or is another.
+          ValueError: if a photograph that was left on disk has gone or has changed.
         """
         indices = self._order.indices(iteration)
         if not self.is_resident:
@@ -135,7 +137,7 @@ class PhotoStore:
 
 
 class Ahead:
-    """Makes batches ready in threads, those that are wanted next first."""
+    """Threads that prepare the next batches in order."""
 
     def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int):
         """Args:
@@ -147,7 +149,7 @@ class Ahead:
         self._batches: dict[int, Future[Photographs]] = {}
 
     def first(self, wanted: dict[int, tuple[int, ...]]) -> Photographs:
-        """Return the first of the wanted batches, by iteration; the others, and no more, are prepared."""
+        """Return the first of the wanted batches, by iteration, and prepare the others."""
         for iteration in self._batches.keys() - wanted.keys():
             self._batches.pop(iteration).cancel()
         for iteration, indices in wanted.items():
@@ -156,7 +158,7 @@ class Ahead:
         return self._batches[next(iter(wanted))].result()
 
     def close(self) -> None:
-        """Ends the threads, once what they are at is done."""
+        """End the threads when their present batches are done."""
         self._pool.shutdown(cancel_futures=True)
 
 
@@ -185,12 +187,12 @@ def device_room() -> float:
 
 
 def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Photographs:
-    """Views of one image size, stacked on the host.
+    """Return views of one image size, stacked on the host.
 
     Args:
       views: those to stack.
-      among: all the views; where one of that size has opacities or a mask the stack has, so that every stack of it is
-        of one structure. None: `views`.
+      among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
+        them. None: `views`.
     """
     alike = [view for view in among or views if view.picture.size == views[0].picture.size]
     pixels = [view.picture.read() for view in views]
@@ -212,7 +214,7 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Pho
 
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
-    """`np.stack` in memory that `jax.device_put` takes over on CPUs as it stands; `jnp.asarray` would copy it twice."""
+    """Return `np.stack` of arrays in aligned memory, which `jax.device_put` adopts on CPUs without a copy."""
     shape, dtype = (len(arrays), *arrays[0].shape), arrays[0].dtype
     num_bytes = int(np.prod(shape)) * dtype.itemsize
     room = np.empty(num_bytes + ALIGNMENT, np.uint8)

@@ -64,7 +64,7 @@ class History:
 
 
 class HistoryLog:
-    """A history that grows by rows, each in constant time on average."""
+    """History that grows row by row, in amortised constant time."""
 
     def __init__(self, history: History):
         """Args:
@@ -88,7 +88,7 @@ class HistoryLog:
 
 
 FIRST_ROWS = 16
-"""Rows that an empty log has room for."""
+"""Number of rows that an empty log has room for."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
 
     Args:
       path: the file.
-      system: the class of its system, where that is not one of this library's and its module is not imported.
+      system: class of its system. Only needed for a system of your own whose module is not imported.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -165,7 +165,7 @@ def _checkpoint_of(
     options.check()
     stage = find_stage(options, header["stage"])
     is_ahead = check_is_ahead(header["is_ahead"], stage)
-    (gaussians,) = _filled((Gaussians(*range(5)),), arrays)  # type: ignore[arg-type]
+    (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
     shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
     params, layout = stage.appearance.from_arrays(shown)
@@ -187,16 +187,16 @@ def _checkpoint_of(
 
 MOST_RESTORED = 2**31 - 1
 SHOWN = "shown/"
-"""Names of the arrays of what splats show begin so."""
+"""Prefix of the names of appearance arrays."""
 
 
 def _rest(state: TrainState) -> tuple[Any, ...]:
-    """Return the part of a checkpoint besides Gaussians and what they show."""
+    """Return the part of a checkpoint beside Gaussians and appearance."""
     return state.moments, state.model.num_live, state.events, state.iteration, state.status, state.corrections
 
 
 def _packed(model: Model, moments: AdamState) -> AdamState:
-    """Moments in the room that parameters have when they are read again, whatever more of it training gave them."""
+    """Return moments at the capacity that parameters get when they are loaded, which may be less than in training."""
 
     def packed(moment: Any) -> Any:
         gaussians, params = moment
@@ -212,14 +212,14 @@ def _named_arrays(tree: Any, *, only_names: bool = False) -> dict[str, Any]:
 
 
 def _filled(template: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a tree of the template's structure, each leaf being the array of its name."""
+    """Return a tree of the template's structure with the array of its name at each leaf."""
     leaves = [arrays[name] for name in _named_arrays(template, only_names=True)]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def _wanted(stage: Stage, gaussians: Gaussians, params: Any, layout: Any, is_ahead: Sequence[bool]) -> TrainState:
-    """Shapes and dtypes of a state of a stage, of which some events may be past."""
+    """Return the shapes and dtypes of a state of a stage, some of whose events may be past."""
     model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
-    state = jax.eval_shape(lambda: initial_state(stage, model, [""]))
+    state: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
     events = (event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
     return dataclasses.replace(state, events=tuple(events))

@@ -1,8 +1,8 @@
 """Corrections: the exposure and the pose of each training photograph, learned beside the model.
 
-A correction has one row of numbers for each training view and changes, inside the step, the camera from which the
-model is drawn, or the colours that come of it. The rows are part of the training state, not of the model. Like an
-event, a correction is a frozen dataclass that is a pytree of its numbers. V views.
+A correction has one row of numbers for each training view. Inside the step it changes the camera of the render or the
+rendered colours. The rows are part of the training state, not of the model. Like an event, a correction is a frozen
+dataclass that is a pytree of its numbers. V views.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ class Correction:
 class Exposure(Correction):
     """An affine map of colours per view, [3, 4], c ↦ A·c + b; on average over the views it changes nothing.
 
-    If all views could change alike, the model would change the other way round and test views would have no exposure.
+    A change shared by all views would only shift the model, and leave test views without an exposure.
     """
 
     rate: float = 1e-2
@@ -106,7 +106,7 @@ class CorrectionState:
     rows: Array
     """[V, ...], in the order of the training views."""
     moments: AdamState
-    """Adam's memory, of each view its own: `count` [V] counts how often it was seen."""
+    """Adam's moments per view; `count` [V] counts how often each was seen."""
 
 
 def exposed(exposure: Array, color: Array) -> Array:
@@ -118,7 +118,7 @@ def exposed(exposure: Array, color: Array) -> Array:
 def initial_corrections(
     corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype: Any
 ) -> tuple[CorrectionState, ...]:
-    """Return the states before a stage: as an earlier stage left them, or neutral if none did.
+    """Return the states before a stage: those of the earlier stage, or neutral ones.
 
     Args:
       corrections: of the stage.
@@ -136,7 +136,7 @@ def _known_row(correction: Correction, name: str, origin: Origin | None) -> np.n
     rows = None if origin is None else origin.corrections.get(correction.name)
     if origin is None or rows is None or name not in origin.names:
         return correction.neutral
-    row = rows[origin.names.index(name)]
+    row: np.ndarray = rows[origin.names.index(name)]
     if row.shape != correction.neutral.shape:
         shapes = f"{list(correction.neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
         raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")
@@ -180,10 +180,10 @@ def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], co
 def updated(
     correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
 ) -> CorrectionState:
-    """Return the state after a step of Adam on the rows of the views that were seen, and on no others.
+    """Return the state after a step of Adam on the rows of the views that were seen.
 
     Args:
-      correction: whose state it is.
+      correction: owner of the state.
       state: before.
       views: [B] int32; one may occur twice.
       grads: [B, ...] of each view's own loss by its row.
@@ -202,7 +202,7 @@ def updated(
 
 
 def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: Sequence[CorrectionState]) -> Origin:
-    """Return the origin with what was learned, and with the training cameras as they were corrected (host).
+    """Return the origin with the learned corrections and the corrected training cameras (host).
 
     Args:
       origin: of the scene, training views first.

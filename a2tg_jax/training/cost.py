@@ -1,8 +1,8 @@
 """Cost of a stage of training, from its shapes alone: bytes of memory at its peak, seconds of an iteration.
 
-Photographs, rows of Gaussians and what they show are counted. What a step needs besides, for each byte of the model,
-row, pixel and pair, is what XLA says of compiled steps (`memory_analysis`); what a process takes before it holds any of
-them was measured (`benchmarks/forecasts.py`, which compares all of it with peaks).
+Photographs, rows of Gaussians and their appearance are counted. A step needs further bytes per byte of the model, row,
+pixel and pair, as XLA reports for compiled steps (`memory_analysis`). The size of an empty process was measured;
+`benchmarks/forecasts.py` compares forecasts with peaks.
 """
 
 import dataclasses
@@ -24,9 +24,9 @@ from a2tg_jax.training.start import initial_number, no_rows, num_rows
 
 MB = 10**6
 PROCESS = 300 * MB
-"""Python, JAX and what else is imported."""
+"""Python, JAX and other imports."""
 FIRST_PROGRAM, FURTHER_STAGE, FURTHER_PROGRAM = 270 * MB, 110 * MB, 25 * MB
-"""Memory that a stage's compiled programs leave: the first stage, each further one, and each program of new shapes."""
+"""Memory of compiled programs: of the first stage, of each further one, and of each program of new shapes."""
 COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
@@ -37,7 +37,7 @@ STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 GEOMETRY_PER_PIXEL = 72
 """Further bytes if a term of the loss reads depth or normals."""
 STATISTIC_PER_ROW = 480
-"""Further bytes if events gather a statistic and change rows by it inside the step."""
+"""Further bytes if events gather a statistic and change rows inside the step."""
 VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
 """Bytes of each view of a batch, beside its gradient of the model."""
 PAIRS_PER_TILE = 90
@@ -49,10 +49,10 @@ SECONDS_PER_ROW, SECONDS_PER_PIXEL = 2.4e-6, 0.72e-6
 
 
 class Bytes(NamedTuple):
-    """Bytes in memory at one time, by what they are for."""
+    """Bytes in memory at one time, by purpose."""
 
     program: float = 0
-    """The program, its libraries and what it compiles."""
+    """The program, its libraries and compiled code."""
     photographs: float = 0
     model: float = 0
     """The model and its moments."""
@@ -136,7 +136,7 @@ def held_bytes(scene: Scene) -> int:
 
 
 def fed_bytes(views: Sequence[View], batch_size: int) -> float:
-    """Return the bytes of the photographs that wait for the step, all or the next ones, and of reading them."""
+    """Return the bytes of the photographs that are ready for the step, all or the next batches, and of reading them."""
     plan = plan_batches(tuple(views), batch_size)
     if plan.is_resident:
         return sum(view.picture.nbytes for view in views)

@@ -1,6 +1,6 @@
 """Place where training diverged: iteration, views, and rows of parameters, found after the fact (host).
 
-The step itself says no more than that it could not be taken (`step.NOT_FINITE`, `step.EXPLODED`), which costs nothing.
+The step itself only reports that it could not be taken (`step.NOT_FINITE`, `step.EXPLODED`), which costs nothing.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Training from photographs: every stage of a system, one from the result of the other."""
+"""Training from photographs: the stages of a system, each from the result of the one before."""
 
 import dataclasses
 import warnings
@@ -17,7 +17,7 @@ from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model
 
 BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
-"""Background behind a trained model, by the background of its training."""
+"""Background of a finished model for each background of training."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class StageResult:
     seconds: float
     """Training time, compilation included."""
     num_regrown: int
-    """Number of times the tile lists needed more room, each at the price of a compilation."""
+    """Number of times the tile lists needed more room; each cost a compilation."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,16 +84,16 @@ def fit(
       system: stages and options, such as `A2tg.preset("quick")`.
       resume: a checkpoint of the same system to go on from.
       on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
-        iteration takes over the state's buffers, so save it there and then, or copy it.
+        iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
       progress: show a progress bar.
-      is_stopped: asked between steps. Once it says True, `on_checkpoint` is called a last time, and then
-        KeyboardInterrupt raised.
+      is_stopped: asked between steps. If it returns True, `on_checkpoint` is called a last time and KeyboardInterrupt
+        is raised.
       session: shapes that trainings of this process share; None: a new one.
 
     Raises:
-      DivergedError: if the loss or a gradient is not finite, or the loss explodes; it has the state before that.
-      ValueError: if the options contradict each other or the checkpoint.
+      DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
+      ValueError: if options contradict each other or the checkpoint.
     """
     system.check()
     if resume is not None:
@@ -137,11 +137,11 @@ def fit_stage(
     """Train one stage of a system. Arguments as in `fit`.
 
     Args:
-      index: which stage, from 0.
+      index: stage, from 0.
       start: the model to start from; None: Gaussians at the scene's points.
       title: of the progress bar; None: the stage's name.
-      num_restored: how often the stage went back because it diverged: another number is another order of the views.
-        None: that of the checkpoint, or 0.
+      num_restored: number of times the stage went back because it diverged; each number gives another order of the
+        views. None: that of the checkpoint, or 0.
       watch: called between steps with the stage under way (`training.loop.Watch`).
     """
     system.check()

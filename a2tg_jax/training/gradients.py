@@ -1,4 +1,4 @@
-"""The gradients of one view's loss, and with them the statistic that tells where a model lacks detail."""
+"""Gradients of one view's loss, and the statistic that shows where a model lacks detail."""
 
 import dataclasses
 from collections.abc import Callable
@@ -28,14 +28,14 @@ class ViewGradients(NamedTuple):
     params: Any
     """Its gradient in what they show."""
     norms: Array
-    """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection); of another
-    statistic, which is by the position on the screen, in units of half an image."""
+    """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection). Other
+    statistics differentiate by the position on the screen, in units of half an image."""
     is_visible: Array
-    """[N] whether the Gaussian was composited at one pixel at least."""
+    """[N] whether the Gaussian was composited at any pixel."""
     output: RenderOutput
-    """The view; `output.overflow` says that the capacity did not suffice, and nothing here may be used."""
+    """Render of the view. If `output.overflow` is set, the capacity was too small and no result is valid."""
     num_pairs: Array
-    """Number of pairs that a capacity must hold (`plan_render`)."""
+    """Number of pairs, the least capacity (`plan_render`)."""
 
 
 def view_gradients(
@@ -49,7 +49,7 @@ def view_gradients(
     sh_degree: Any = None,
     statistic: Statistic = "position",
 ) -> ViewGradients:
-    """Render a view and differentiates any loss of it, in one pass; meant for jit.
+    """Render a view and differentiate a loss of it in one pass; meant for jit.
 
     Average the statistic over views with `GradientStatistics`:
 
@@ -62,11 +62,11 @@ def view_gradients(
       background: [3] colour; None is the model's own.
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
       has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
-      sh_degree: overrides the settings' by a value that may be traced.
-      statistic: of which position on its way to the screen (`rasterize.pixel.positional_gradient`).
+      sh_degree: degree in place of that of the settings; may be traced.
+      statistic: kind of position that it differentiates by (`rasterize.pixel.positional_gradient`).
 
     Raises:
-      ValueError: if an argument has another shape than it must have, or under jit without a capacity.
+      ValueError: if an argument has a wrong shape, or under jit without a capacity.
     """
     background = model.background if background is None else background
     check_gaussians(model.gaussians, "model.gaussians")
@@ -89,7 +89,7 @@ def view_gradients(
 
 
 class View(NamedTuple):
-    """A view that `differentiate` renders, with the corrections that it is differentiated in."""
+    """View that `differentiate` renders, with its corrections, which are differentiated."""
 
     camera: Camera
     background: Array
@@ -112,7 +112,7 @@ class Differentiated(NamedTuple):
     told: Any
     """Second result of the loss function."""
     num_pairs: Array
-    """Number of pairs that a capacity must hold."""
+    """Number of pairs, the least capacity."""
     gaussians: Gaussians
     """Gradient in the Gaussians."""
     params: Any
@@ -120,7 +120,7 @@ class Differentiated(NamedTuple):
     rows: tuple[Array, ...]
     """Gradient in the view's row of each correction."""
     probe: Any
-    """[N, 4] gradient at the probe, from which `read_probe` reads the statistic; None without a probe."""
+    """[N, 4] gradient at the probe, for `read_probe`; None without a probe."""
 
 
 def differentiate(
@@ -137,7 +137,7 @@ def differentiate(
     """Render a view and differentiate its loss: the core of `view_gradients` and of the training step.
 
     Args:
-      loss: of the model, the corrected view and its render; returns a scalar, and anything beside it.
+      loss: function of the model, the corrected view and its render; returns a scalar and any auxiliary value.
       model: differentiated in its Gaussians and parameters.
       view: differentiated in its rows.
       settings: with a capacity under jit.

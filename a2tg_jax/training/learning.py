@@ -33,7 +33,7 @@ class LearningCheck:
 
         Args:
           views: the training views.
-          order: which of them each iteration trains on.
+          order: training views of each iteration.
           iterations: length of the stage.
           background: behind transparent photographs.
           is_first: whether this is the first stage; later ones are not checked.
@@ -44,7 +44,7 @@ class LearningCheck:
         self._seen: collections.deque[tuple[int, float]] = collections.deque(maxlen=NUM_COMPARED)
 
     def observe(self, iteration: int, psnr: float) -> None:
-        """Take note of the training PSNR of an iteration, in dB, and warn if it is time and there is cause."""
+        """Record the training PSNR of an iteration in dB; warn once if it stays low."""
         if self._at is None or iteration > self._at:
             return
         self._seen.append((iteration, psnr))
@@ -82,7 +82,7 @@ def has_learned(psnr: float, flat: float) -> bool:
 
 
 def flat_psnr(target: Array, mask: Array | None = None) -> Array:
-    """PSNR in dB of the best image of one flat colour: what a model reaches that has learned nothing else.
+    """Return the PSNR in dB of the best image of one flat colour, which a model reaches without learning more.
 
     Args:
       target: [H, W, 3], clipped to [0, 1] first.

@@ -1,7 +1,7 @@
 """The training loop of one stage, on the host, top to bottom: steps, host events, checkpoints, history.
 
-The host launches up to `LAUNCHED` steps before it waits for the device. A step that could not be taken made all behind
-it idle (`step.TrainState.status`), so they are launched again once its cause is mended.
+The host launches up to `LAUNCHED` steps before it waits for the device. If a step cannot be taken, the launched ones
+after it stay idle (`step.TrainState.status`); the loop mends the cause and launches them again.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ from a2tg_jax.training.step import (
 )
 
 LAUNCHED = 10
-"""Steps between two waits for the device; fewer if the photographs of so many take too much memory."""
+"""Number of steps between two waits for the device; fewer if their photographs take too much memory."""
 LOG_EVERY = 10
 PLANNED_VIEWS = 64
 GROWTH_ROOM = 1.5
@@ -57,8 +57,8 @@ def never() -> bool:
 
 
 Watch = Callable[["StageRun", IsStopped], float]
-"""Called between steps with the stage under way, whose state it may read but not keep: the next step takes over its
-buffers. It returns for how many seconds it held the training up, which are not counted."""
+"""Function called between steps with the running stage. It may read the state but not keep it, because the next step
+reuses its buffers. It returns the seconds it took, which are not counted as training."""
 
 
 def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
@@ -67,13 +67,13 @@ def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
 
 
 def read(infos: list[StepInfo]) -> list[StepInfo]:
-    """Return the scalars of some steps as host numbers: only here does the loop wait for the device."""
+    """Return the scalars of some steps as host numbers. Only here the loop waits for the device."""
     on_host: list[StepInfo] = jax.device_get(infos)
     return on_host
 
 
 class StageRun:
-    """One stage under way: the state, and what the host keeps beside it."""
+    """Running stage: its state, and what the host keeps beside it."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class StageRun:
 
     @property
     def checkpoint(self) -> Checkpoint:
-        """The state now; the next step takes over its buffers."""
+        """Present state; the next step reuses its buffers."""
         return Checkpoint(self.system, self.index, self.state, self.history, self.num_restored)
 
     def train(
@@ -151,9 +151,8 @@ class StageRun:
         is_stopped: IsStopped = never,
         watch: Watch = unwatched,
     ) -> None:
-        """Run the stage to its end, or, with a last checkpoint and a KeyboardInterrupt, to where it is stopped.
-
-        Its photographs are let go then.
+        """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
+        KeyboardInterrupt.
         """
         try:
             self._train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
@@ -198,12 +197,12 @@ class StageRun:
             )
 
     def _told_by_events(self, name: str) -> list[str]:
-        """Return the messages of step events in an attribute, with the options' names for the events' fields."""
+        """Return the messages that step events have in an attribute, with option names in place of field names."""
         events = [event for event in self.stage.events if isinstance(event, StepEvent)]
         return [self.system.told(event, message) for event in events if (message := getattr(event, name))]
 
     def _next_stop(self, iteration: int, checkpoint_every: int | None) -> int:
-        """Return the iteration after which the host has something to do."""
+        """Return the next iteration that the host acts after."""
         stops = [iteration + self.launched - iteration % self.launched, self.stage.iterations]
         stops += [due for due in self._due_on_host() if due > iteration]
         if checkpoint_every is not None:
@@ -211,7 +210,7 @@ class StageRun:
         return min(stops)
 
     def _due_on_host(self) -> list[int]:
-        """Return the iterations of all host events, and those after which a step event is past."""
+        """Return the iterations of all host events, and the last one of each step event."""
         count = self.stage.iterations
         due: list[int] = []
         for event, times in zip(self.stage.events, self.clock.times, strict=True):
@@ -222,7 +221,7 @@ class StageRun:
         return due
 
     def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
-        """Run iterations `first` to `last`, or up to one that cannot be taken, and mend its cause."""
+        """Run iterations `first` to `last`. Stop at one that cannot be taken and mend its cause."""
         launched: list[StepInfo] = []
         while first + len(launched) <= last and not is_stopped():
             launched.append(self._launch(first + len(launched)))
@@ -253,7 +252,7 @@ class StageRun:
         return self.views[self.order.indices(iteration)[0]].picture.size
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
-        """Make more room for the tile lists; refuses to go on for every other reason."""
+        """Make more room for the tile lists; raise an error for every other cause."""
         self.state = dataclasses.replace(self.state, status=jnp.zeros((), jnp.int32))
         if info.status == OVERFLOW:
             self.num_regrown += 1
@@ -271,7 +270,7 @@ class StageRun:
         )
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
-        """Return the error that tells what was not finite, or too large."""
+        """Return the error that names the values that are not finite or too large."""
         names = [self.views[index].name for index in self.order.indices(iteration)]
         what = "loss or gradient is not finite" if info.status == NOT_FINITE else "the loss has exploded"
         return DivergedError(
@@ -291,7 +290,7 @@ class StageRun:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:
-        """Apply the host events that follow an iteration; events that are past forget what they have gathered."""
+        """Apply the host events that follow an iteration, and drop the statistics of past events."""
         for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
             state = self.state.events[place]
             if isinstance(event, HostEvent):
@@ -308,7 +307,7 @@ class StageRun:
                 self._keep(place, None)
 
     def _move_rows(self, rows: np.ndarray) -> None:
-        """Move what the events have gathered along with the Gaussians."""
+        """Move the events' statistics along with the Gaussians."""
         pairs = zip(self.stage.events, self.state.events, strict=True)
         events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
         self.state = dataclasses.replace(self.state, events=events)

@@ -87,8 +87,8 @@ def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product:
 def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera) -> Array:
     """2DGS's normal consistency: the mean over pixels of Σ_i ω_i·(1 - n_i·n_depth) = alpha - normal·n_depth.
 
-    n_depth is the normal of the rendered depth. The image border, and pixels beside one where nothing was
-    rendered, have no such normal and count as 0.
+    n_depth is the normal of the rendered depth. Pixels at the image border, or beside an empty pixel, have no such
+    normal and count as 0.
 
     Args:
       normal: [H, W, 3] rendered normals Σ n·α·T in the world, facing the camera, not divided by alpha.
@@ -116,7 +116,7 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
 
     Args:
       depth: [H, W] depth along the camera's z axis.
-      is_valid: [H, W], where the depth means something.
+      is_valid: [H, W] bool, pixels with a depth.
       camera: the view.
 
     Returns:
@@ -172,7 +172,8 @@ def _back_project(depth: Array, camera: Camera) -> Array:
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
     rotation = camera.viewmat[:3, :3]
-    return (rays @ rotation) * depth[..., None] + camera.center[None, None]
+    points: Array = (rays @ rotation) * depth[..., None] + camera.center[None, None]
+    return points
 
 
 @jax.custom_vjp
@@ -202,4 +203,5 @@ def _blur(x: Array, axis: int) -> Array:
     for tap in range(SSIM_RADIUS):
         blurred = blurred + (shifted[tap] + shifted[-1 - tap]) * SSIM_TAPS[tap]
     # Without the barrier XLA fuses the two passes into one of 121 taps.
-    return jax.lax.optimization_barrier(blurred)
+    kept: Array = jax.lax.optimization_barrier(blurred)
+    return kept

@@ -17,7 +17,7 @@ from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
 Ranges = dict[str, tuple[float, float]]
-"""Smallest and largest value of options by name, both included; None is in any range."""
+"""Smallest and largest values of options by name, both included; None is in any range."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class System:
     seed: int = 0
     """Seed of all random numbers."""
     tile_size: int = 8
-    """Side of a tile in pixels; results do not depend on it."""
+    """Side of a tile in pixels. Results do not depend on it."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     exposure: bool = False
@@ -98,7 +98,7 @@ class System:
     ranges: ClassVar[Ranges] = {}
     """Ranges of the system's own options."""
     event_options: ClassVar[Mapping[str, str]] = {}
-    """Options by the field of an event that they set, such as {"Mcmc.cap": "densify.cap"}: messages name them."""
+    """Option that sets a field of an event, such as {"Mcmc.cap": "densify.cap"}; messages name the option."""
 
     def __post_init__(self) -> None:
         """Convert the memory budget to a number of MB."""
@@ -119,10 +119,10 @@ class System:
         """Return the number of Gaussians that the memory budget has room for; None without a budget.
 
         Args:
-          floats: further floats of each Gaussian, in the end, such as its texels.
+          floats: further floats of each finished Gaussian, such as its texels.
 
         Raises:
-          ValueError: if they are fewer than 2, or than training is to start from.
+          ValueError: if there are fewer than 2, or fewer than initial Gaussians.
         """
         if self.budget_bytes is None:
             return None
@@ -178,7 +178,7 @@ class System:
         return {"paper": cls()}
 
     def check(self) -> None:
-        """Refuse options that cannot be trained, before any time is spent.
+        """Refuse invalid options before training.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
@@ -210,7 +210,7 @@ class System:
         return "memory_budget" if self.memory_budget is not None and name in BUDGET_OPTIONS else name
 
     def told(self, event: Event, message: str) -> str:
-        """Return an event's message with the options' names in place of its fields, which stand in braces."""
+        """Return an event's message with option names in place of the field names in braces."""
         return with_names(message, lambda field: self.option_of(event, field) or f"{field} of {type(event).__name__}")
 
     @contextlib.contextmanager
@@ -231,14 +231,14 @@ class System:
         return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
     def check_number(self, num: int) -> None:
-        """Refuse options that cannot be trained from so many Gaussians.
+        """Refuse options that cannot be trained from this number of Gaussians.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
 
     def _check_numbers(self) -> None:
-        """Refuse numbers out of the range of the options that every system has, and whatever is not finite."""
+        """Refuse numbers that are not finite or outside the range of an option that every system has."""
         numbers = flatten_config(self)
         for name, value in numbers.items():
             held = value if isinstance(value, tuple) else (value,)
@@ -279,7 +279,8 @@ def like(kind: type[System] | System, other: System) -> System:
       kind: class or instance that gives all other options.
       other: the other system.
     """
-    return _like(kind() if isinstance(kind, type) else kind, other)
+    changed: System = _like(kind() if isinstance(kind, type) else kind, other)
+    return changed
 
 
 def _like(value: Any, other: Any) -> Any:

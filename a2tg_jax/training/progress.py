@@ -11,11 +11,11 @@ from a2tg_jax.training.step import StepInfo
 
 MOMENTUM = 0.95
 TIMED_SECONDS, TIMED_STEPS = 2.0, 3
-"""Least of steps that are timed before it is said how long the rest will take."""
+"""Smallest number of timed steps before a forecast of the duration."""
 
 
 class Pace:
-    """Forecast of a stage's duration, told once, after some steps beyond the first, which compiles, were timed."""
+    """Forecast of a stage's duration, printed once. The first step compiles and is not timed."""
 
     def __init__(self, total: int, now: Callable[[], float] = time.perf_counter):
         """Args:
@@ -27,7 +27,7 @@ class Pace:
         self._is_told = False
 
     def told(self, done: int) -> str | None:
-        """Return a text after some iterations, or None; the first call begins the timing."""
+        """Return the forecast after some iterations, or None. The first call begins the timing."""
         now = self._now()
         if self._start is None:
             self._start = done, now
@@ -58,7 +58,7 @@ class ProgressBar:
         self._bar.close()
 
     def tell_pace(self, done: int) -> None:
-        """Say once, after some steps that were launched together, how long the others will take."""
+        """Print the forecast once, after a group of steps that were launched together."""
         told = self._pace.told(done)
         if told is not None and not self._bar.disable:
             self._bar.write(f"{self._title}: {told}")

@@ -18,7 +18,7 @@ SYSTEMS = {
     "bbsplat": "a2tg_jax.systems.bbsplat:BBSplat",
     "bytewise": "a2tg_jax.systems.bytewise:Bytewise",
 }
-"""Module and class of each system of this library; a system is imported when it is asked for."""
+"""Module and class of each system of this library, imported on demand."""
 
 
 LONGEST_REASON = 300
@@ -77,12 +77,12 @@ def system_to_dict(system: System) -> dict[str, Any]:
 def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | None = None) -> System:
     """Return the system from its options, the inverse of `system_to_dict`.
 
-    A file makes this program import none but its own modules: the class of another system is looked for among the
-    modules that are imported already, unless it is given.
+    A file never makes this program import foreign modules: the class of another system must be given, or its module
+    already imported.
 
     Args:
       data: name and options.
-      where: what the errors call the file.
+      where: name of the file in errors.
       kind: the class.
 
     Raises:
@@ -107,7 +107,7 @@ def with_changes(system: System, changes: Mapping[str, Any], where: str) -> Syst
     """Return the system with some options changed, given as nested dictionaries as in a configuration file.
 
     Raises:
-      ValueError: if an option is unknown or of another type; it is named.
+      ValueError: naming the option, if it is unknown or of another type.
     """
     return config_from_dict(type(system), merged(config_to_dict(system), changes), where)
 

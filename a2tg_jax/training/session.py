@@ -1,4 +1,4 @@
-"""A session: what several trainings of one process share, so that they compile little."""
+"""Sessions: shapes that several trainings of one process share, so that they compile less."""
 
 from collections.abc import Callable, Hashable
 
@@ -26,7 +26,7 @@ class Session:
         """Capacities of tile lists, by stage and image size."""
 
     def capacity(self, place: Hashable, needed: int) -> int:
-        """Return the largest known capacity that is at most twice what is needed, or else a new one.
+        """Return the largest known capacity up to twice the need, or else a new one.
 
         Args:
           place: stage and image size.

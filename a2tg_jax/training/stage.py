@@ -56,7 +56,7 @@ class LearningRates:
     """Learning rate of the other spherical harmonics."""
 
     def of_gaussians(self, means: Any, sh_degree: int = 3) -> Gaussians:
-        """One rate per field of the Gaussians, given that of the means now, and the degree of their SH."""
+        """Return one rate per field of the Gaussians, given the present rate of the means and the SH degree."""
         sh = jnp.full((1, NUM_BASES[sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
         fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
         return Gaussians(*fields)
@@ -72,7 +72,7 @@ class Stage:
     appearance: Appearance = dataclasses.field(metadata={"static": True})
     """Appearance of the splats."""
     events: tuple[Event, ...]
-    """Densification, noise, textures that grow, in the order in which they happen."""
+    """Events such as densification, noise and texture growth, in order of application."""
     losses: tuple[LossTerm, ...]
     """Loss terms; their sum is minimised."""
     rates: LearningRates
@@ -80,7 +80,7 @@ class Stage:
     iterations: int
     """Views seen, times the batch size."""
     params_rate: Any = 0.0
-    """Learning rate of what the splats show: a number, or what `Appearance.rates` takes."""
+    """Learning rate of the appearance: a number, or the argument of `Appearance.rates`."""
     corrections: tuple[Correction, ...] = ()
     """Corrections of each training view, such as exposures and poses."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
@@ -88,7 +88,7 @@ class Stage:
 
     @property
     def statistic(self) -> Statistic | None:
-        """The statistic of the gradients that its events want, or None."""
+        """Gradient statistic that the events need, or None."""
         wanted = {event.statistic for event in self.events} - {None}
         return next(iter(wanted), None)
 
@@ -97,7 +97,7 @@ class Stage:
         return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
 
     def check(self) -> None:
-        """Refuse a stage that cannot be trained.
+        """Refuse an invalid stage.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
@@ -144,7 +144,7 @@ class Clock(NamedTuple):
     times: tuple[Times | None, ...]
     """Times of every event; None if it happens after every iteration, or on the host."""
     largest_loss: float = math.inf
-    """A larger one is an explosion: the step is not taken."""
+    """Largest loss; the step is not taken beyond it."""
 
 
 def _times(event: Event, num_iterations: int) -> Times | None:

@@ -1,4 +1,4 @@
-"""Start of training: Gaussians at a scene's points, and rows for all that events can add."""
+"""Start of training: Gaussians at a scene's points, and spare rows for those that events add."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
 NO_ROW_LOG_SCALE = -10.0
-"""Logarithm of the scales, and logit of the opacity, of rows that do not exist yet."""
+"""Log-scales and opacity logit of spare rows."""
 KEY_OF_PARAMETERS = 0x7E8E1
 FILTER_VARIANCE = 0.5
 """Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
 LEAST_OPACITY = INITIAL_OPACITY
-"""Opacity below which dense Gaussians are not made fainter: the one that 3DGS begins with."""
+"""Lower bound of the reduced opacities: the initial opacity of 3DGS."""
 NEAR = RenderSettings.near_plane
 """Depth from which splats are drawn."""
 SMALLEST_SIDE = 1e-6
@@ -41,14 +41,14 @@ def initial_model(scene: Scene, system: System) -> Model:
 def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
     """Lower the opacity of Gaussians that are smaller than a pixel to every camera (host).
 
-    The low-pass filter draws each of them over a pixel, so k = filter² / s² of them lie over each other, s being the
-    standard deviation in pixels from the camera where that is largest. They get the opacity of which k make the one
-    given, 1 − (1 − o)^(1/k), but at least `LEAST_OPACITY`. Opaque splats in many layers hide those behind them, which
-    then do not learn.
+    The low-pass filter draws each of them over a pixel, so k = filter² / s² of them overlap. s is the standard
+    deviation in pixels from the camera where it is largest. k layers of the new opacity 1 − (1 − o)^(1/k) are as opaque
+    as one of the given opacity o; the new one is at least `LEAST_OPACITY`. Many opaque layers would hide the splats
+    behind them, which then do not learn.
 
     Args:
-      gaussians: with the opacities of splats that are larger than a pixel.
-      cameras: those that train.
+      gaussians: initial Gaussians, with the opacity for splats larger than a pixel.
+      cameras: training cameras.
     """
     means, scales = np.asarray(gaussians.means, np.float64), np.asarray(gaussians.scales, np.float64).min(axis=1)
     largest = np.zeros(len(means))
@@ -65,7 +65,7 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
 
 
 def check_start(scene: Scene, system: System) -> None:
-    """Refuse a first stage whose events cannot do what they are to do with as many Gaussians as there are at first.
+    """Refuse a first stage whose events cannot work with the initial number of Gaussians.
 
     Raises:
       ValueError: naming the options to change.
@@ -89,19 +89,19 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 
 
 def initial_number(scene: Scene, system: System) -> int:
-    """Return the number of initial Gaussians: as many as asked for, and as the first stage has room for."""
+    """Return the number of initial Gaussians: as requested, up to the room of the first stage."""
     num = system.initial_gaussians or len(scene.points)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
 
 
 def num_rows(stage: Stage, num: int) -> int:
-    """Return the number of rows that a stage allocates for `num` Gaussians: for all that its events can add."""
+    """Return the number of rows that a stage allocates for `num` Gaussians and those that its events can add."""
     return max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
 
 
 def padded(model: Model, stage: Stage, system: System) -> Model:
-    """Return the model with the appearance of a stage and with rows for all that its events can add.
+    """Return the model with the appearance of a stage and with spare rows for its events.
 
     If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew.
 
@@ -131,12 +131,13 @@ def _rows_of(params: Any) -> Any:
 
 
 def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
-    """Return the Gaussians, followed by rows that do not exist yet."""
+    """Return the Gaussians, followed by spare rows."""
     num = room - gaussians.num
     if num == 0:
         return gaussians
     empty = no_rows(num, gaussians.sh.shape[1], gaussians.means.dtype)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
+    filled: Gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
+    return filled
 
 
 def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:

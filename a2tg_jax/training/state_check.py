@@ -1,4 +1,4 @@
-"""Checks that the content of a checkpoint is a state that training can go on from (host)."""
+"""Checks that a checkpoint holds a valid state of training (host)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from a2tg_jax.training.step import EXPLODED, TrainState
 
 
 def find_stage(system: System, index: Any) -> Stage:
-    """Return the stage of a header's number. ValueError: there is none."""
+    """Return the stage of a header's number. Raise ValueError if there is none."""
     stages = system.stages()
     if type(index) is not int or not 0 <= index < len(stages):
         raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
@@ -24,7 +24,7 @@ def find_stage(system: System, index: Any) -> Stage:
 
 
 def check_is_ahead(is_ahead: Any, stage: Stage) -> Sequence[bool]:
-    """Return a header's list of the events that are still ahead. ValueError: it is none of this stage."""
+    """Return a header's list of the events that are still ahead. Raise ValueError if it does not fit the stage."""
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
         raise ValueError(
             f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}. Where an older "
@@ -34,12 +34,12 @@ def check_is_ahead(is_ahead: Any, stage: Stage) -> Sequence[bool]:
 
 
 def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
-    """Raise ValueError, naming the leaf, unless a state is one of a stage.
+    """Raise ValueError, naming the leaf, unless a state fits a stage.
 
     Args:
-      state: what was read; its model has been made of arrays that fit each other.
+      state: state from the file; the arrays of its model fit each other.
       wanted: shapes and dtypes of a state of that model.
-      stage: of both.
+      stage: stage of both states.
     """
     check_like("state.model.num_live", state.model.num_live, wanted.model.num_live)
     for name in ("moments", "events", "iteration", "status"):
@@ -57,7 +57,7 @@ def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
 
 
 def _check_corrections(state: TrainState, stage: Stage) -> None:
-    """Raise ValueError unless there are finite rows for each correction of a stage, all for as many views."""
+    """Raise ValueError unless each correction of a stage has finite rows, all for the same number of views."""
     names, dtype = [""] * len(state.corrections[0].rows) if state.corrections else [], state.model.gaussians.means.dtype
     wanted = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
     check_like("state.corrections", state.corrections, wanted)

@@ -1,7 +1,7 @@
 """One training step, jitted once per image size and stage: render, loss, gradients, Adam, events.
 
-What cannot be taken, because the tile lists overflowed, a number is not finite or the loss exploded, leaves the state
-as it was, with a status that makes all further steps idle: the host may look at it some steps later and lose nothing.
+A step is not taken if the tile lists overflow, a number is not finite or the loss explodes. Then the state keeps its
+values, and its status makes all further steps idle, so that the host may look at it some steps later and lose nothing.
 """
 
 import dataclasses
@@ -36,21 +36,21 @@ from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
-"""The status of a state: why it did not take the last step."""
+"""Status of a state: the reason why the last step was not taken."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState:
-    """All that training changes; everything else follows from the system and the iteration."""
+    """All values that training changes. Everything else follows from the system and the iteration."""
 
     model: Model
     moments: AdamState
     """Adam's memory of (gaussians, params)."""
     events: tuple[Any, ...]
-    """State that each event has gathered; None for one that is past."""
+    """State of each event; None for past ones."""
     iteration: Array
-    """int32, iterations of this stage done so far."""
+    """int32 number of finished iterations of this stage."""
     status: Array
     """int32: FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE or EXPLODED."""
     corrections: tuple[CorrectionState, ...] = ()
@@ -59,7 +59,7 @@ class TrainState:
 
 @dataclasses.dataclass(frozen=True)
 class StepSettings:
-    """Settings that a step is compiled for, besides its stage; hashable."""
+    """Settings that a step is compiled for, beside its stage; hashable."""
 
     render: RenderSettings
     """Render settings with a capacity."""
@@ -73,12 +73,12 @@ class StepInfo(NamedTuple):
     psnr: Array
     """Mean over the views, in dB."""
     num_pairs: Array
-    """The most pairs among the views: what the capacity must hold."""
+    """Largest number of pairs among the views, the least capacity."""
     status: Array
     """Status after the step."""
     num_live: Array
     num_refused: Array
-    """Gaussians that events wanted to add, for which there was no room."""
+    """Number of Gaussians that events could not add for lack of room."""
 
 
 def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
@@ -88,7 +88,7 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
       stage: which.
       model: with the rows and the appearance of the stage.
       names: of the training views.
-      origin: of the model that the stage starts from, whose corrections go on.
+      origin: of the model that the stage starts from; its corrections go on.
     """
     return TrainState(
         model=model,
@@ -101,11 +101,11 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
 
 
 class Attempt(NamedTuple):
-    """Outcome of a step, whether the step can be taken or not."""
+    """Outcome of a step, taken or not."""
 
     views: "BatchGradients"
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
-    """Means over the views; of the corrections, by the row of each view [V, ...]."""
+    """Mean gradients over the views; of corrections, gradients in the row of each view [V, ...]."""
     state: TrainState
     """State after the step, with the status of the state before."""
     info: EventInfo
@@ -129,7 +129,7 @@ def train_step(
       clock: `stage.clock()`.
       state: donated.
       photographs: of one image size.
-      views: [V] int32, which of them are looked at.
+      views: [V] int32 indices of the photographs to use.
       scene_scale: factor of the means' learning rate.
       key: of the stage; each iteration folds in its number.
       rows: [V] int32, their numbers among all training views; needed for corrections.
@@ -184,7 +184,7 @@ class BatchGradients(NamedTuple):
     num_pairs: Array
     is_overflow: Array
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
-    """Gradients in the Gaussians, in what they show, and in the view's row of each correction."""
+    """Gradients in the Gaussians, the appearance parameters, and the view's row of each correction."""
     statistic: Array | None
     """[V, N, 4]."""
 
@@ -227,11 +227,12 @@ def _gradients(
         return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
 
     pictures = batch.images, batch.alphas, batch.masks
-    return jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
+    gradients: BatchGradients = jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
+    return gradients
 
 
 def _over(image: Array, alpha: Array | None, background: Array) -> Array:
-    """Return a photograph as floats, over the background where it is transparent."""
+    """Return a photograph as floats, composed over the background."""
     color = image.astype(background.dtype) / 255
     if alpha is None:
         return color
@@ -240,12 +241,12 @@ def _over(image: Array, alpha: Array | None, background: Array) -> Array:
 
 
 def _black_outside(mask: Array | None, color: Array) -> Array:
-    """Return an image [H, W, 3], black where pixels do not count, so that no loss term sees them."""
+    """Return an image [H, W, 3] with excluded pixels black, so that no loss term sees them."""
     return color if mask is None else jnp.where(mask[..., None], color, jnp.zeros_like(color))
 
 
 def _mean_over(mask: Array | None, values: Array) -> Array:
-    """Return the mean of values [H, W, 3] over the pixels that count, those that do not being 0."""
+    """Return the mean of values [H, W, 3] over the pixels that count; the values of the others are 0."""
     mean = jnp.mean(values)
     return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
 
@@ -270,7 +271,7 @@ def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: Batch
 
 
 def _updated(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array) -> tuple[Model, AdamState]:
-    """Return model and moments after Adam, with the parameters projected to where they belong."""
+    """Return model and moments after Adam, with projected parameters."""
     model = state.model
     rates = (
         stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree),
@@ -317,11 +318,13 @@ def _at_its_times(
     def wait(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
         return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
 
-    return jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
+    changed: tuple[Model, AdamState, Any, EventInfo]
+    changed = jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
+    return changed
 
 
 def _status(clock: Clock, tried: Attempt) -> Array:
-    """Return why a step may not be taken, the first reason that holds."""
+    """Return the first reason why a step may not be taken."""
     found, model = tried.views, tried.state.model
     rows = [known.rows for known in tried.state.corrections]
     is_finite = _all_finite((found.loss, tried.grads, model.gaussians, model.params, rows))

@@ -1,4 +1,4 @@
-"""Loss terms: what a stage minimises is the sum of them, each times its weight.
+"""Loss terms: a stage minimises their weighted sum.
 
 A term is a frozen dataclass registered as a pytree, whose numbers are traced; `Term` makes one of any function.
 """
@@ -21,11 +21,11 @@ class Target(NamedTuple):
 
     camera: Camera
     image: Array
-    """[H, W, 3] the photograph, over the background where it is transparent."""
+    """[H, W, 3] photograph, composed over the background."""
     background: Array
     """[3]."""
     mask: Array | None = None
-    """[H, W] bool: which pixels count; None: all. Photograph and render are black where they do not."""
+    """[H, W] bool, True at pixels that count; None: all. Excluded pixels of photograph and render are black."""
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
@@ -33,12 +33,12 @@ LossFunction = Callable[[Model, Target, RenderOutput], Array]
 
 @event
 class Term:
-    """A function of model, target and render, times a weight."""
+    """Function of model, target and render, times a weight."""
 
     function: LossFunction = static()
     weight: float = 1.0
     has_geometry: bool = static(default=False)
-    """The function reads depth, normals or distortion, which are composited only where a term needs them."""
+    """Whether the function reads depth, normals or distortion, which are composited only on demand."""
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         return self.weight * self.function(model, target, output)

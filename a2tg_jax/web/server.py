@@ -4,10 +4,11 @@ import contextlib
 import dataclasses
 import importlib
 import socket
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
+
+from a2tg_jax.host.operating_system import allow_recent_port
 
 LOOPBACK = "127.0.0.1"
 HEADERS = (
@@ -117,8 +118,7 @@ def _listening(port: int) -> socket.socket:
     """Return a socket bound to a port of the loopback."""
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        if sys.platform != "win32":  # There it would let two programs share the port.
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        allow_recent_port(found)
         found.bind((LOOPBACK, port))
     except (OSError, OverflowError) as error:
         found.close()

@@ -1,0 +1,121 @@
+"""Each system's way of a call, with the modules and functions of the others taken away."""
+
+import math
+import os
+import signal
+import socket
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from a2tg_jax.host import cores, operating_system
+from a2tg_jax.host.memory import memory_limit
+
+SYSTEMS = ("linux", "darwin", "win32")
+NOT_LOCKED, TAKEN, NO_LOCKS = None, "taken", OSError(95, "Operation not supported")
+
+
+@pytest.fixture
+def locking(monkeypatch):
+    """Stand-ins for both systems' locks: choose one, and what it answers; the other cannot be imported."""
+
+    def chosen(system, answer):
+        calls = []
+
+        def call(*arguments):
+            calls.append(arguments)
+            if answer is not NOT_LOCKED:
+                raise answer if answer is not TAKEN else {"win32": PermissionError, "linux": BlockingIOError}[system]
+
+        monkeypatch.setattr(sys, "platform", system)
+        fcntl = SimpleNamespace(flock=call, LOCK_EX=2, LOCK_NB=4) if system == "linux" else None
+        monkeypatch.setitem(sys.modules, "fcntl", fcntl)
+        msvcrt = SimpleNamespace(locking=call, LK_NBLCK=2) if system == "win32" else None
+        monkeypatch.setitem(sys.modules, "msvcrt", msvcrt)
+        return calls
+
+    return chosen
+
+
+@pytest.mark.parametrize("answer, is_ours", [(NOT_LOCKED, True), (TAKEN, False), (NO_LOCKS, True)])
+@pytest.mark.parametrize("system", ["linux", "win32"])
+def test_a_lock_is_the_system_s(locking, tmp_path, system, answer, is_ours):
+    calls = locking(system, answer)
+    with open(tmp_path / "marker", "a+") as file:
+        assert operating_system.try_lock(file.fileno()) == is_ours
+        file.write("still at the end")
+        file.flush()
+        expected = (file.fileno(), 6) if system == "linux" else (file.fileno(), 2, 1)
+    assert calls == [expected] and (tmp_path / "marker").stat().st_size == len("still at the end")
+
+
+def test_folders_are_flushed_except_on_windows(monkeypatch, tmp_path):
+    flushed = []
+    monkeypatch.setattr(os, "fsync", flushed.append)
+    operating_system.flush_folder(tmp_path)
+    assert len(flushed) == (0 if sys.platform == "win32" else 1)
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "open", lambda *_: pytest.fail("Windows cannot open folders"))
+    operating_system.flush_folder(tmp_path)
+    assert len(flushed) < 2
+
+
+def test_a_system_without_sighup_ends_by_sigterm(monkeypatch):
+    monkeypatch.setattr(signal, "SIGHUP", 1, raising=False)
+    assert operating_system.ending_signals() == (signal.SIGTERM, 1)
+    monkeypatch.delattr(signal, "SIGHUP")
+    assert operating_system.ending_signals() == (signal.SIGTERM,)
+
+
+def test_cores_and_memory_without_linux(monkeypatch, tmp_path):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 7)
+    assert operating_system.num_cores() == 7
+    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1000}
+    monkeypatch.setattr(os, "sysconf", sizes.get, raising=False)
+    assert memory_limit(tmp_path) == 4_096_000
+    monkeypatch.delattr(os, "sysconf")
+    assert memory_limit(tmp_path) == operating_system.UNKNOWN_MEMORY
+    assert operating_system.processor_features(tmp_path / "cpuinfo") == frozenset()
+
+
+def test_features_are_those_of_the_first_processor(tmp_path):
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t\t: fpu avx2\n\nprocessor\t: 1\nflags\t\t: fpu\n")
+    assert operating_system.processor_features(tmp_path / "cpuinfo") == {"fpu", "avx2"}
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_port_is_never_shared(monkeypatch, system):
+    monkeypatch.setattr(sys, "platform", system)
+    with socket.socket() as listening:
+        operating_system.allow_recent_port(listening)
+        assert bool(listening.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)) == (system != "win32")
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_only_linux_is_asked_for_control_groups(monkeypatch, system):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(cores, "cpu_quota", lambda root: 2.0)
+    assert cores._own_quota.__wrapped__() == (2.0 if system == "linux" else math.inf)
+
+
+@pytest.mark.parametrize("library", [SimpleNamespace(), None])
+def test_a_heap_is_trimmed_only_by_a_library_that_can(monkeypatch, library):
+    monkeypatch.setattr(operating_system, "_c_library", lambda: library)
+    operating_system.trim_heap()
+    trimmed = []
+    monkeypatch.setattr(operating_system, "_c_library", lambda: SimpleNamespace(malloc_trim=trimmed.append))
+    operating_system.trim_heap()
+    assert trimmed == [0]
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("variable", [None, "DISPLAY", "WAYLAND_DISPLAY"])
+def test_linux_needs_a_display_for_a_browser(monkeypatch, system, variable):
+    monkeypatch.setattr(sys, "platform", system)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if variable:
+        monkeypatch.setenv(variable, ":0")
+    assert operating_system.has_display() == (system != "linux" or variable is not None)
