@@ -245,8 +245,9 @@ def test_maps_show_what_varies_between_gaussians():
 
     textured = some_model()
     assert legends(textured) == {"resolutions.png": ["1 or none", "2", "4", "8"]}
-    single, layout = textures_from_arrays([np.ones((1, 1, 4), np.float32)] * 4)
-    assert legends(textured.with_textures(single, layout)) == {}
+    for side in (1, 4):
+        alike, layout = textures_from_arrays([np.ones((side, side, 4), np.float32)] * 4)
+        assert legends(textured.with_textures(alike, layout)) == {}
     gaussians = init_from_points(np.eye(3, dtype=np.float32) / 2, np.full((3, 3), 0.5), sh_degree=0)
     bands, owners = allocate_bands([0, 2, 1], 0)
     banded = Model(gaussians, BandedParams(bands, ()), BandedLayout(owners, ()), appearance=Banded())

@@ -65,22 +65,26 @@ class LevelMap(NamedTuple):
 def level_maps(model: Model) -> list[LevelMap]:
     """Return the texels of each Gaussian and its degree, each only if it varies."""
     maps = []
-    if has_textures(model):
-        assert model.textures is not None
-        levels = texel_levels(model.textures[1])
-        names = ["1 or none", *(str(2**level) for level in range(1, levels.max() + 1))]
-        maps.append(LevelMap("resolutions.png", "the number of its texels", levels, names))
-    degrees = np.zeros(1, int) if model.bands is None else model.bands[1].degrees
-    if degrees.min() < degrees.max():
+    texels = _texel_levels(model)
+    if _vary(texels):
+        names = ["1 or none", *(str(2**level) for level in range(1, texels.max() + 1))]
+        maps.append(LevelMap("resolutions.png", "the number of its texels", texels, names))
+    degrees = np.zeros(0, int) if model.bands is None else model.bands[1].degrees
+    if _vary(degrees):
         names = [str(degree) for degree in range(degrees.max() + 1)]
         maps.append(LevelMap("degrees.png", "the degree of its view dependence", degrees, names))
     return maps
 
 
-def has_textures(model: Model) -> bool:
-    """Return whether a Gaussian has a texture of more than one texel."""
-    options = model.appearance.texture_options
-    return model.textures is not None and options is not None and bool(texel_levels(model.textures[1]).any())
+def _texel_levels(model: Model) -> np.ndarray:
+    """Return [N] log₂ of the texels; none without textures."""
+    if model.textures is None or model.appearance.texture_options is None:
+        return np.zeros(0, int)
+    return texel_levels(model.textures[1])
+
+
+def _vary(levels: np.ndarray) -> bool:
+    return len(np.unique(levels)) > 1
 
 
 def write_figures(
@@ -99,7 +103,7 @@ def write_figures(
     """
     return Figures(
         curves=[_curves(run, histories, starts)],
-        textures=_textures(run, model) if has_textures(model) else [],
+        textures=_textures(run, model) if _texel_levels(model).any() else [],
         maps=[_map(run, model, one, camera, settings) for one in level_maps(model)],
         geometry=_geometry(run, model, camera, settings),
         flight=_flight(run, model, settings),
