@@ -40,6 +40,7 @@ from a2tg_jax.results.model_pictures import (
 )
 from a2tg_jax.results.report import SECTIONS, Comparison, ShownComparison, write_report
 from a2tg_jax.results.run_figures import Figures, ReportFigure, level_maps
+from a2tg_jax.results.summary import ModelResult
 from a2tg_jax.texture import textures_from_arrays
 
 
@@ -119,6 +120,24 @@ def test_texts_of_a_scene_never_become_markup(tmp_path):
     assert tags.count("script") == 1
     # Twice the title, the view, and its two captions below pictures and crops and on buttons.
     assert sum(nasty in text for text in texts) == 2 + 1 + 2 * 3
+
+
+def test_the_report_says_what_is_special_about_a_run(tmp_path):
+    """No test views, metrics up to exposure and pose, and a model no better than one flat colour per view."""
+
+    def special(measured: ModelResult) -> ModelResult:
+        views = [dataclasses.replace(view, flat_psnr=26.0) for view in measured.train.per_view]
+        train = dataclasses.replace(measured.train, per_view=tuple(views))
+        corrected = {f"train_{way}": train for way in ("color_fit", "aligned")}
+        return dataclasses.replace(measured, train=train, test=None, corrected=corrected)
+
+    plain = some_result()
+    result = dataclasses.replace(plain, models={name: special(found) for name, found in plain.models.items()})
+    report = written_report(tmp_path / "special", result, view="a", captions=["b"])
+    usual = written_report(tmp_path / "usual", plain, view="a", captions=["b"])
+    for told in ("2 views, none held out", "Training PSNR", "Colours fitted: ", "Poses aligned: ", "did not learn"):
+        assert told in report and told not in usual
+    assert "4 views, 2 held out" in usual and "test views: " in usual and "test views: " not in report
 
 
 def test_what_a_phone_shows_is_not_cut_off():
