@@ -4,24 +4,31 @@ import base64
 import dataclasses
 import hashlib
 import io
+import json
 import re
+import subprocess
 from html.parser import HTMLParser
+from importlib.resources import files
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from test_results import NAMES, circle, some_history, some_result
 
-from a2tg_jax.appearance import Plain, Textured
+from a2tg_jax.appearance import Banded, Plain, Textured
+from a2tg_jax.appearance.banded import BandedLayout, BandedParams
+from a2tg_jax.appearance.sh_bands import allocate_bands
 from a2tg_jax.core.gaussians import SH_C0, init_from_points
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput, RenderSettings
-from a2tg_jax.results.figures import curves_figure, save_figure
+from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.images import largest_gain
-from a2tg_jax.results.markup import image, page, slider, table
 from a2tg_jax.results.model_pictures import (
     FLIGHT_FRAMES,
     TEXTURE_SIDE,
@@ -31,24 +38,32 @@ from a2tg_jax.results.model_pictures import (
     learned_textures,
     normal_picture,
 )
-from a2tg_jax.results.report import SECTIONS, Comparison, comparison_html, write_report
+from a2tg_jax.results.report import SECTIONS, Comparison, ShownComparison, write_report
+from a2tg_jax.results.run_figures import Figures, ReportFigure, level_maps
+from a2tg_jax.results.summary import ModelResult
 from a2tg_jax.texture import textures_from_arrays
+
+
+def written_report(folder, result, *, view: str, captions: list[str], figures: Figures = Figures()) -> str:  # noqa: B008
+    run = create_run(folder)
+    run.own(run.point_cloud).touch()
+    image = np.zeros((30, 40, 3), np.uint8)
+    comparison = Comparison(view, [image] * len(captions), captions, largest_gain(image, image, image))
+    write_report(run, result, [ShownComparison.of(comparison)], figures)
+    return run.report.read_text(encoding="utf-8")
 
 
 @pytest.fixture
 def report(tmp_path) -> str:
-    run = create_run(tmp_path)
-    save_figure(run.figures / "curves.png", curves_figure({"a": some_history()}, {"a": 0}))
-    run.own(run.point_cloud).touch()
-    image = np.zeros((30, 40, 3), np.uint8)
-    crop = largest_gain(image, image, image)
-    pictures = comparison_html(Comparison("a<b.png", [image] * 3, ["photograph", "before", "after"], crop))
-    write_report(run, some_result(), [pictures])
-    return run.report.read_text(encoding="utf-8")
+    path = tmp_path / "curves.png"
+    save_figure(path, curves_figure({"a": some_history()}, {"a": 0}))
+    figures = Figures(curves=[ReportFigure(path, "Curves.", "chart", [("#ff0000", "red")])])
+    captions = ["photograph", "before", "after"]
+    return written_report(tmp_path / "run", some_result(), view="a<b.png", captions=captions, figures=figures)
 
 
 def test_report_is_one_self_contained_page(report):
-    for name, title in SECTIONS:
+    for name, title in SECTIONS.items():
         assert f'<section id="{name}"><h2>{title}</h2>' in report
     assert "http" not in report.replace("http-equiv", "") and "<link" not in report
     assert report.count("<img ") == report.count('src="data:image/') == 7
@@ -76,25 +91,104 @@ def test_the_main_model_comes_first_and_the_best_of_each_figure_is_marked(report
     assert marked["test PSNR (dB)"] == ["24.00"]
     assert marked["test SSIM"] == [] == marked["frames a second"]  # all are alike
     assert marked["memory (MB)"] == ["0.02", "0.02"] and marked["Gaussians"] == []
-    assert marked["a&lt;b.png"] == ["23.00"]
+    assert marked["a&lt;b.png"] == ["23.00 / 0.5000"]
+
+
+def test_every_comparison_of_psnr_names_bytes(report):
+    """The gains, the headline table, and the table of each view."""
+    assert "at equal bytes" in report or "times its bytes" in report
+    for table in re.findall("<table.*?</table>", report, re.DOTALL)[:3]:
+        assert ("PSNR" in table and "memory (MB)" in table) or table.count(" MB)</th>") == len(NAMES)
 
 
 def test_the_models_own_training_time_stands_apart(report):
     cards = dict(re.findall(r'<div class="card">([^<]*)<b>([^<]*)</b>', report))
     gain = "Gain over gaussians-2d-mcmc-continued, with 1.2 times its bytes (0.03 MB and 0.02 MB)"
     assert cards[gain] == "+1.00 dB"
-    assert cards["Training"] == "2 min 4 s" and cards["Comparisons&#x27; training"] == "1 min 2 s"
+    assert cards["Training"] == "2 min 4 s" and cards["Comparisons&#39; training"] == "1 min 2 s"
 
 
-def test_texts_of_a_scene_never_become_markup():
+def test_texts_of_a_scene_never_become_markup(tmp_path):
     nasty = '"><script>alert(1)</script>'
+    result = dataclasses.replace(some_result(), scene=nasty)
+    report = written_report(tmp_path, result, view=nasty, captions=[nasty, nasty])
     parser = HTMLParser()
     tags, texts = [], []
     parser.handle_starttag = lambda tag, attributes: tags.append(tag)
     parser.handle_data = texts.append
-    parser.feed(slider("", [nasty, nasty]) + table([nasty], [[nasty]], {(0, 0)}) + image("data:,", nasty))
-    assert "script" not in tags and texts == [nasty] * 5
-    assert page(nasty, "", style="", script="").count("<script>") == 1
+    parser.feed(report)
+    assert tags.count("script") == 1
+    # Twice the title, the view, and its two captions below pictures and crops and on buttons.
+    assert sum(nasty in text for text in texts) == 2 + 1 + 2 * 3
+
+
+def test_the_report_says_what_is_special_about_a_run(tmp_path):
+    """No test views, metrics up to exposure and pose, and a model no better than one flat colour per view."""
+
+    def special(measured: ModelResult) -> ModelResult:
+        views = [dataclasses.replace(view, flat_psnr=26.0) for view in measured.train.per_view]
+        train = dataclasses.replace(measured.train, per_view=tuple(views))
+        corrected = {f"train_{way}": train for way in ("color_fit", "aligned")}
+        return dataclasses.replace(measured, train=train, test=None, corrected=corrected)
+
+    plain = some_result()
+    result = dataclasses.replace(plain, models={name: special(found) for name, found in plain.models.items()})
+    report = written_report(tmp_path / "special", result, view="a", captions=["b"])
+    usual = written_report(tmp_path / "usual", plain, view="a", captions=["b"])
+    for told in ("2 views, none held out", "Training PSNR", "Colours fitted: ", "Poses aligned: ", "did not learn"):
+        assert told in report and told not in usual
+    assert "4 views, 2 held out" in usual and "test views: " in usual and "test views: " not in report
+
+
+def test_what_a_phone_shows_is_not_cut_off():
+    """Commands wrap, and so do the cells of tables."""
+    style = files("a2tg_jax.results").joinpath("templates/report.css").read_text("utf-8")
+    rules = dict(re.findall(r"^([^@{}]+) \{([^{}]*)\}", style, re.MULTILINE))
+    assert "pre-wrap" in rules["pre"] and "anywhere" in rules["pre"]
+    assert "nowrap" not in style
+
+
+@pytest.mark.parametrize(
+    ("commit", "told"),
+    [
+        (None, r"repository at version [\d.]+:"),
+        ("abc-dirty", r"repository at commit <code>abc</code>, with local changes \(version [\d.]+\):"),
+    ],
+)
+def test_repeating_a_run_needs_no_package_index(tmp_path, monkeypatch, commit, told):
+    monkeypatch.setattr("a2tg_jax.results.report.source_commit", lambda: commit)
+    report = written_report(tmp_path, some_result(), view="a", captions=["b"])
+    assert re.search(told, " ".join(report.split()))
+    assert "<pre>pip install .\na2tg train --config" in report
+
+
+def git(folder, *words: str) -> str:
+    command = ["git", "-C", str(folder), "-c", "user.name=a", "-c", "user.email=a@b", *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_the_commit_is_that_of_the_checkout(tmp_path, monkeypatch):
+    monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path)
+    git(tmp_path, "init")
+    assert source_commit() is None
+    (tmp_path / "a").write_text("1")
+    git(tmp_path, "add", "a")
+    git(tmp_path, "commit", "-m", "1")
+    commit = git(tmp_path, "rev-parse", "HEAD")
+    assert source_commit() == commit
+    (tmp_path / "a").write_text("2")
+    assert source_commit() == f"{commit}-dirty"
+
+
+def test_the_commit_of_an_installation_is_the_one_that_pip_noted(tmp_path, monkeypatch):
+    """A folder of a repository holds site-packages often, and its commit is another."""
+    git(tmp_path, "init")
+    monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path / "site-packages")
+    noted = {"vcs_info": {"commit_id": "abc"}}
+    for note, commit in ((noted, "abc"), ({"dir_info": {}}, None)):
+        found = SimpleNamespace(read_text=lambda _, note=note: json.dumps(note))
+        monkeypatch.setattr("a2tg_jax.host.source_commit.distribution", lambda _, found=found: found)
+        assert source_commit() == commit
 
 
 # Pictures of a model
@@ -139,10 +233,51 @@ def test_depth_and_normals_are_pictures():
     towards = -np.asarray(camera.viewmat)[2, :3]
     normal = alpha[..., None] * towards
     output = RenderOutput(*map(jnp.asarray, (normal, alpha, depth, normal, False, depth)))
-    seen = depth_picture(output)
-    assert seen[:, :5].max() == 0 and seen[0, -1].sum() > seen[-1, -1].sum()
-    assert np.abs(normal_picture(output, camera)[:, 5:] - np.array([128.0, 128.0, 255.0])).max() <= 1
-    assert normal_picture(output, camera)[:, :5].max() == 0
+    seen, stops = depth_picture(output)
+    assert seen[0, -1].sum() > seen[-1, -1].sum()
+    distances = [distance for distance, _ in stops]
+    assert distances == sorted(distances) and 1 < distances[0] < 1.1 and 2.7 < distances[-1] < 3
+    normals = normal_picture(output, camera)
+    assert np.abs(normals[:, 5:] - np.array([128.0, 128.0, 255.0])).max() <= 1
+    for picture in (seen, normals):
+        assert {tuple(color) for color in picture[:, :5].reshape(-1, 3)} == {(140,) * 3, (191,) * 3}
+
+
+@pytest.mark.parametrize(("share", "factor"), [(0.2, 1000), (0.04, 0.01)], ids=["far", "near"])
+def test_outliers_leave_the_colours_of_depth_to_the_scene(share, factor):
+    """A far background, and splats before the camera."""
+    depth = np.broadcast_to(np.linspace(1, 3, 100, dtype=np.float32), (100, 100)).copy()
+    depth[: round(100 * share)] *= factor
+    output = RenderOutput(*map(jnp.asarray, (depth, np.ones_like(depth), depth, depth, False, depth)))
+    colors = depth_picture(output).picture[-1].astype(int)
+    assert np.abs(colors[5] - colors[94]).max() > 150
+
+
+def test_without_a_hit_there_is_a_picture_of_depth():
+    nothing = jnp.zeros((4, 4))
+    assert depth_picture(RenderOutput(*[nothing] * 4, False, nothing)).picture.shape == (4, 4, 3)
+
+
+def test_maps_show_what_varies_between_gaussians():
+    def legends(model: Model) -> dict[str, list[str]]:
+        return {one.file: list(one.names) for one in level_maps(model)}
+
+    textured = some_model()
+    assert legends(textured) == {"resolutions.png": ["1 or none", "2", "4", "8"]}
+    for side in (1, 4):
+        alike, layout = textures_from_arrays([np.ones((side, side, 4), np.float32)] * 4)
+        assert legends(textured.with_textures(alike, layout)) == {}
+    gaussians = init_from_points(np.eye(3, dtype=np.float32) / 2, np.full((3, 3), 0.5), sh_degree=0)
+    bands, owners = allocate_bands([0, 2, 1], 0)
+    banded = Model(gaussians, BandedParams(bands, ()), BandedLayout(owners, ()), appearance=Banded())
+    assert legends(banded) == {"degrees.png": ["0", "1", "2"]}
+
+
+def test_the_title_of_the_sizes_is_within_its_figure():
+    figure = sizes_figure(np.array([(0, 0)] * 187_000 + [(2, 2)] * 3_000))
+    FigureCanvasAgg(figure).draw()
+    box = figure.axes[0].title.get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.x1
 
 
 def test_a_flight_is_a_small_animation():

@@ -18,10 +18,10 @@ from a2tg_jax.data import View, view_image
 from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics, evaluate
 from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.render import render_image
-from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
+from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
 from a2tg_jax.results.history import read_history, write_history
-from a2tg_jax.results.images import error_picture, largest_gain, resolution_colors, side_by_side, to_uint8
+from a2tg_jax.results.images import error_picture, largest_gain, level_colors, side_by_side, to_uint8
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import (
     RunRecord,
@@ -103,6 +103,24 @@ def test_evaluation_measures_the_render():
     assert found[1:].per_view == found.per_view[1:] and found.frames_per_second > 0
     with pytest.raises(ValueError, match="no views"):
         evaluate((), gaussians)
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("/photos/fox", "fox"),
+        ("/photos/Kitchen/Scene", "Kitchen/Scene"),
+        ("/photos/kitchen/colmap/dense", "kitchen/colmap/dense"),
+        ("/photos/kitchen/scene/transforms.json", "kitchen/scene"),
+        ("/data/scene", "scene"),
+        ("synthetic", "synthetic"),
+    ],
+)
+def test_a_scene_is_named_by_what_tells_it_from_others(path, name):
+    assert SceneSource(path).name == name
 
 
 # Folders
@@ -440,22 +458,17 @@ def test_side_by_side_puts_images_in_a_row():
     assert sheet[-1, 0, 0] == 50 and sheet[-1, -1, 0] == 150
 
 
-def test_resolution_colors_differ():
-    colors = resolution_colors(5)
+def test_colors_of_levels_differ():
+    colors = level_colors(5)
     assert colors.shape == (5, 3) and len(np.unique(colors, axis=0)) == 5
-    assert resolution_colors(1).shape == (1, 3)
+    assert level_colors(1).shape == (1, 3)
 
 
 def test_figures_are_written(tmp_path):
     histories = {NAMES[0]: some_history(1), NAMES[1]: some_history(2), NAMES[2]: some_history(2)}
     starts = {NAMES[0]: 0, NAMES[1]: 60, NAMES[2]: 60}
     sizes = np.array([(1, 1), (1, 4), (4, 2), (1, 1), (8, 8)])
-    figures = [
-        curves_figure(histories, starts),
-        sizes_figure(sizes),
-        resolutions_figure(np.zeros((30, 40, 3), np.uint8), 7),
-    ]
-    for index, figure in enumerate(figures):
+    for index, figure in enumerate([curves_figure(histories, starts), sizes_figure(sizes)]):
         save_figure(tmp_path / f"{index}.png", figure)
         assert (tmp_path / f"{index}.png").stat().st_size > 1000
 

@@ -17,7 +17,7 @@ from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.photo_store import Shelf
-from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat
+from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat, scene_name
 from a2tg_jax.host.regular_files import is_regular
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
@@ -63,7 +63,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     shots = map_in_threads(shoot, registered)
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
     train, test = every_kth(shots, test_every)
-    return assemble_scene(images_folder.parent.name, train, test, read_points(reconstruction), source=str(path))
+    return assemble_scene(scene_name(images_folder.parent), train, test, read_points(reconstruction), source=str(path))
 
 
 def read_points(reconstruction: Any) -> PointCloud:

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,11 @@ from a2tg_jax.data.world import normalizing_similarity, scene_scale
 NUM_RANDOM_POINTS = 10_000
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
+GENERIC_NAMES = {
+    "0", "capture", "colmap", "data", "dataset", "dense", "images", "input", "output", "photos", "scene", "sfm",
+    "sparse", "undistorted",
+}  # fmt: skip
+"""Names of folders, in lower case, that do not tell one scene from another."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,6 +197,13 @@ def assemble_scene(
         transform=transform,
         scale=scene_scale(centers),
     )
+
+
+def scene_name(folder: Path) -> str:
+    """Return the end of a folder's path, from the last name that tells more than "scene" or "colmap" does."""
+    parts = folder.resolve().parts
+    told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
+    return "/".join(parts[told[-1] if told else -1 :])
 
 
 def check_test_every(test_every: int) -> None:

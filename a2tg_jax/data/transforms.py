@@ -19,7 +19,16 @@ from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
-from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, random_points, rigid_viewmat
+from a2tg_jax.data.scene import (
+    PointCloud,
+    Scene,
+    Shot,
+    assemble_scene,
+    every_kth,
+    random_points,
+    rigid_viewmat,
+    scene_name,
+)
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -62,7 +71,7 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
     else:
         train, test = every_kth(shots, test_every)
     cloud = read_ply_points(file.parent / meta["ply_file_path"]) if meta.get("ply_file_path") else None
-    return assemble_scene(file.resolve().parent.name, train, test, cloud, source=str(file))
+    return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
 def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
@@ -88,7 +97,7 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
         train, test = every_kth(train, test_every)
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
     logger.info("%s: a Blender scene, starting from %d random points", folder, len(cloud.points))
-    return assemble_scene(folder.resolve().name, train, test, cloud, source=str(folder))
+    return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder))
 
 
 def _read_json(file: Path) -> dict[str, Any]:

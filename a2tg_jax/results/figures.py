@@ -8,17 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.results.images import resolution_colors
 from a2tg_jax.training import History
 
 COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66ccee")
 """Colours of the stages, in turn."""
-GREY = "#7a8088"
-"""Colour of text, legible on white and on black."""
 RUNNING_MEANS = 10
 """Number of running-mean windows in a stage; each covers a tenth."""
 MOST_POINTS = 4000
@@ -31,11 +27,11 @@ CURVES = (
 )
 
 
-def save_figure(path: Path, figure: Figure, *, is_transparent: bool = False) -> None:
-    """Write a PNG, whole or not at all; on white, unless it is transparent."""
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a PNG on white, whole or not at all."""
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110, transparent=is_transparent)
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:
@@ -100,29 +96,6 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
     axes.set_xlabel("Tu (texels along u)")
     axes.set_ylabel("Tv (texels along v)")
     num_empty = int(np.sum((sizes == 0).all(axis=1)))
-    without = f", {num_empty:,} of them without" if num_empty else ""
+    without = f"\n({num_empty:,} of them without)" if num_empty else ""
     axes.set_title(f"Textures of {len(sizes):,} Gaussians{without}", fontsize=10)
-    return figure
-
-
-def resolutions_figure(picture: np.ndarray, num_levels: int) -> Figure:
-    """Return a view whose Gaussians are coloured by their number of texels, with a legend; for any ground.
-
-    Args:
-      picture: uint8 [H, W, 3] render of the coloured model.
-      num_levels: colours in use: 2⁰ to 2^(num_levels - 1) texels.
-    """
-    height, width = picture.shape[:2]
-    figure = Figure(figsize=(8, 8 * height / width + 0.7), layout="constrained")
-    axes = figure.add_subplot()
-    axes.imshow(picture)
-    axes.set_axis_off()
-    names = ["1 or none", *(str(2**level) for level in range(1, num_levels))]
-    colors = zip(resolution_colors(num_levels), names, strict=True)
-    handles = [Patch(color=color, label=name) for color, name in colors]
-    legend = figure.legend(
-        handles=handles, title="texels per Gaussian", loc="outside lower center", ncols=num_levels, fontsize=9,
-        labelcolor=GREY, frameon=False,
-    )  # fmt: skip
-    legend.get_title().set_color(GREY)
     return figure

@@ -25,6 +25,8 @@ from a2tg_jax.model import Model
 from a2tg_jax.texture import AtlasLayout
 
 ERROR_GAIN = 4
+CHECKER = (0.75, 0.55)
+"""Greys of `checkered`."""
 MARGIN, CAPTION_HEIGHT = 6, 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 """Font of captions; Pillow's own lacks × and ²."""
@@ -36,6 +38,12 @@ def to_uint8(image: ArrayLike) -> np.ndarray:
     """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
     pixels: np.ndarray = np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
     return pixels
+
+
+def checkered(shape: tuple[int, ...], side: int) -> np.ndarray:
+    """Return the ground [H, W, 1] behind what is transparent or not hit, in squares of `side` pixels."""
+    y, x = np.indices(shape) // side
+    return np.where((x + y) % 2, *CHECKER)[..., None]
 
 
 def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -134,8 +142,8 @@ def file_uri(path: Path) -> str:
     return f"data:image/{path.suffix[1:]};base64," + base64.b64encode(path.read_bytes()).decode()
 
 
-def resolution_colors(num_levels: int) -> np.ndarray:
-    """Return [num_levels, 3] colours of textures with 2⁰, 2¹, … texels, dark to bright."""
+def level_colors(num_levels: int) -> np.ndarray:
+    """Return [num_levels, 3] colours of levels 0, 1, …, dark to bright."""
     return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
 
 
@@ -145,17 +153,20 @@ def texel_levels(layout: AtlasLayout) -> np.ndarray:
     return levels
 
 
-def colored_by_resolution(model: Model) -> Model:
-    """Return a model with textures, every Gaussian in the colour of its texture's log₂(Tu·Tv), from any direction.
+def colored_by_level(model: Model, levels: np.ndarray) -> Model:
+    """Return a model with every Gaussian in the colour of its level, from any direction.
 
     Alpha textures stay, RGB residuals and view dependence go.
+
+    Args:
+      model: the model.
+      levels: [N] integers.
     """
-    assert model.textures is not None
-    textures, layout = model.textures
-    levels = texel_levels(layout)
-    colors = (resolution_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
-    flat = model.with_textures(jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures), layout)
-    return with_colors(flat, np.ones(model.gaussians.num, bool), colors)
+    colors = (level_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
+    if model.textures is not None:
+        textures, layout = model.textures
+        model = model.with_textures(jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures), layout)
+    return with_colors(model, np.ones(model.gaussians.num, bool), colors)
 
 
 def with_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:

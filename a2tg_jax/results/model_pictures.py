@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,16 +17,18 @@ from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.images import to_uint8
+from a2tg_jax.results.images import checkered, colored_by_level, to_uint8
 from a2tg_jax.texture import texture_arrays
 
 NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8
-CHECKER = (0.75, 0.55)
-"""Greys behind transparent texels."""
 LEAST_ALPHA = 0.5
 """Smallest alpha that shows a depth and a normal."""
-DEPTH_RANGE = 2, 98
-"""Percentiles of the depths that colours reach from and to."""
+DEPTH_RANGE = 5, 95
+"""Percentiles of the inverse depths that colours reach from and to."""
+DEPTH_STOPS = 5
+"""Number of depths in the legend."""
+NUM_CHECKERS = 60
+"""Squares across a picture, of the ground where nothing is hit."""
 FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 
 
@@ -62,8 +65,7 @@ def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
     """
     scale = TEXTURE_SIDE // max(texels.shape[:2])
     large = np.kron(texels, np.ones((scale, scale, 1)))
-    y, x = np.indices(large.shape[:2]) // (TEXTURE_SIDE // 8)
-    ground = np.where((x + y) % 2, *CHECKER)[..., None]
+    ground = checkered(large.shape[:2], TEXTURE_SIDE // 8)
     alpha = np.clip(large[..., 3:], 0, 1)
     return to_uint8(alpha * np.clip(color + large[..., :3], 0, 1) + (1 - alpha) * ground)
 
@@ -81,23 +83,55 @@ def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
     return sheet
 
 
-def depth_picture(output: RenderOutput) -> np.ndarray:
-    """Return uint8 [H, W, 3] of the depth, near bright; black where little or nothing is seen."""
-    alpha = np.asarray(output.alpha)
-    is_seen = alpha > LEAST_ALPHA
-    depth = np.asarray(output.depth) / np.where(is_seen, alpha, 1.0)
-    near, far = np.percentile(depth[is_seen], DEPTH_RANGE) if is_seen.any() else (0.0, 1.0)
-    nearness = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
-    return to_uint8(np.where(is_seen[..., None], colormaps["viridis"](nearness)[..., :3], 0.0))
+class DepthPicture(NamedTuple):
+    """Depths as colours, evenly in inverse depth: what is far behind the scene takes few colours."""
+
+    picture: np.ndarray
+    """uint8 [H, W, 3], near bright; chequered where little or nothing is hit."""
+    stops: list[tuple[float, np.ndarray]]
+    """Some depths, nearest first, and their colours, [3] in [0, 1]. Depths beyond the first and last are clipped."""
+
+
+def depth_picture(output: RenderOutput) -> DepthPicture:
+    """Return the picture of the depths of a render."""
+    is_hit = _is_hit(output)
+    inverse = np.asarray(output.alpha) / np.where(is_hit, np.asarray(output.depth), 1.0)
+    far, near = np.percentile(inverse[is_hit], DEPTH_RANGE) if is_hit.any() else (1.0, 1.0)
+    colors = colormaps["viridis"](np.clip((inverse - far) / max(near - far, 1e-9), 0, 1))[..., :3]
+    shares = np.linspace(1, 0, DEPTH_STOPS if near > far else 1)
+    stops = [(1 / (far + share * (near - far)), colormaps["viridis"](share)[:3]) for share in shares]
+    return DepthPicture(_on_hit(colors, is_hit), stops)
 
 
 def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
-    """Return uint8 [H, W, 3] of the normals seen from the camera: red to the right, green up, blue towards it; black as
-    in `depth_picture`."""
+    """Return uint8 [H, W, 3] of the normals seen from the camera: red to the right, green up, blue towards it;
+    chequered as in `depth_picture`."""
     normal = np.asarray(output.normal) @ np.asarray(camera.viewmat)[:3, :3].T * (1, -1, -1)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    is_seen = (np.asarray(output.alpha) > LEAST_ALPHA)[..., None] & (length > 0)
-    return to_uint8(np.where(is_seen, 0.5 + 0.5 * normal / np.where(is_seen, length, 1.0), 0.0))
+    is_seen = _is_hit(output) & (length[..., 0] > 0)
+    return _on_hit(0.5 + 0.5 * normal / np.where(is_seen[..., None], length, 1.0), is_seen)
+
+
+def level_picture(model: Model, levels: np.ndarray, camera: Camera, settings: RenderSettings) -> np.ndarray:
+    """Return uint8 [H, W, 3] of the Gaussians in the colours of their levels, on a chequered ground."""
+    output = Renderer(colored_by_level(model, levels), settings=settings, has_geometry=False)(camera)
+    behind = (1 - np.asarray(output.alpha))[..., None]
+    ground = _ground((camera.height, camera.width)) - np.asarray(model.background)
+    return to_uint8(np.asarray(output.color) + behind * ground)
+
+
+def _is_hit(output: RenderOutput) -> np.ndarray:
+    """Return [H, W] whether a ray hits enough for a depth and a normal."""
+    return (np.asarray(output.alpha) > LEAST_ALPHA) & (np.asarray(output.depth) > 0)
+
+
+def _on_hit(colors: np.ndarray, is_hit: np.ndarray) -> np.ndarray:
+    """Return uint8 [H, W, 3] of colours where something is hit."""
+    return to_uint8(np.where(is_hit[..., None], colors, _ground(is_hit.shape)))
+
+
+def _ground(shape: tuple[int, ...]) -> np.ndarray:
+    return checkered(shape, max(1, shape[1] // NUM_CHECKERS))
 
 
 def flight(model: Model, settings: RenderSettings) -> bytes | None:

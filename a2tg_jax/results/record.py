@@ -22,6 +22,7 @@ import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.mask_files import AlphaMeaning
+from a2tg_jax.data.scene import scene_name
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -53,6 +54,12 @@ class SceneSource:
     """Interval k of test views: every k-th view is held out."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask."""
+
+    @property
+    def name(self) -> str:
+        """Name of the scene in titles."""
+        path = Path(self.path)
+        return SYNTHETIC if self.path == SYNTHETIC else scene_name(path.parent if path.suffix == ".json" else path)
 
     def load(self, room: int | None = None) -> Scene:
         """Return the scene in its normalised world.

@@ -16,25 +16,22 @@ from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.corrected import measure_corrected, write_corrections
-from a2tg_jax.results.figures import curves_figure, resolutions_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,
-    colored_by_resolution,
     error_picture,
     largest_gain,
     picture_names,
     save_picture,
     side_by_side,
-    texel_levels,
     to_uint8,
 )
 from a2tg_jax.results.kept_lpips import sha256_of, with_kept_lpips
-from a2tg_jax.results.model_pictures import depth_picture, flight, learned_textures, normal_picture
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import read_record
-from a2tg_jax.results.report import Comparison, comparison_html, write_report
+from a2tg_jax.results.report import Comparison, ShownComparison, write_report
+from a2tg_jax.results.run_figures import write_figures
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.training import System
 from a2tg_jax.web.page import viewer_html_with
@@ -76,14 +73,13 @@ def evaluate_run(
     for name, model in models.items():
         write_corrections(run, name, model)
     main = models[result.main]
-    _write_curves(run, plan, list(models))
-    if main.appearance.texture_options is not None:
-        _write_texture_figures(run, main, plan[result.main].system, scene)
     save_ply(run.own(run.point_cloud), main)
-    _write_surface(run, main, plan[result.main].system, scene)
-    _write_flight(run, main, plan[result.main].system)
     _write_viewer(run, main, f"{scene.name} · {result.main}")
-    _write_pictures(run, result, models, scene)
+    histories = {name: read_history(run.history(name)) for name in models}
+    starts = {name: plan.first_iteration(name) for name in models}
+    camera = (*scene.test, *scene.train)[0].camera
+    figures = write_figures(run, main, camera, settings_of(plan[result.main].system), histories, starts)
+    write_report(run, result, _write_pictures(run, result, models, scene), figures)
     return result
 
 
@@ -127,46 +123,10 @@ def _measure(
     )
 
 
-def _write_curves(run: RunFolder, plan: RunPlan, names: list[str]) -> None:
-    """Write figures/curves.png, with each stage after those that it follows."""
-    histories = {name: read_history(run.history(name)) for name in names}
-    starts = {name: plan.first_iteration(name) for name in names}
-    save_figure(run.own(run.figures / "curves.png"), curves_figure(histories, starts))
-
-
-def _write_texture_figures(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
-    """Write figures/sizes.png, textures.png, and resolutions.png of the first view."""
-    assert model.textures is not None
-    _, layout = model.textures
-    learned = learned_textures(model)
-    if learned is not None:
-        save_picture(run.own(run.figures / "textures.png"), learned)
-    save_figure(run.own(run.figures / "sizes.png"), sizes_figure(layout.sizes))
-    colored = colored_by_resolution(model)
-    camera = (*scene.test, *scene.train)[0].camera
-    picture = to_uint8(Renderer(colored, settings=settings_of(system), has_geometry=False)(camera).color)
-    num_levels = int(texel_levels(layout).max()) + 1
-    save_figure(run.own(run.figures / "resolutions.png"), resolutions_figure(picture, num_levels), is_transparent=True)
-
-
-def _write_surface(run: RunFolder, model: Model, system: System, scene: Scene) -> None:
-    """Write figures/depth.png and normals.png of the first view."""
-    camera = (*scene.test, *scene.train)[0].camera
-    output = Renderer(model, settings=settings_of(system))(camera)
-    save_picture(run.own(run.figures / "depth.png"), depth_picture(output))
-    save_picture(run.own(run.figures / "normals.png"), normal_picture(output, camera))
-
-
-def _write_flight(run: RunFolder, model: Model, system: System) -> None:
-    """Write figures/flight.webp, if there are cameras to fly past."""
-    moving = flight(model, settings_of(system))
-    if moving is not None:
-        with replacing(run.own(run.figures / "flight.webp")) as temporary:
-            temporary.write_bytes(moving)
-
-
-def _write_pictures(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> None:
-    """Write a sheet of each view, and the report with some of them. Memory holds the pictures of one view at a time."""
+def _write_pictures(
+    run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene
+) -> list[ShownComparison]:
+    """Write a sheet of each view, and return some for the report. Memory holds the pictures of one view at a time."""
     views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
     renderers = {name: _renderer(models[name], scene, result.plan[name].system) for name in names}
     files = picture_names(view.name for view in views)
@@ -175,8 +135,8 @@ def _write_pictures(run: RunFolder, result: RunResult, models: Mapping[str, Mode
         comparison = _compare(view, renderers, models[result.main].background)
         _write_sheet(run.test / files[view.name], run, comparison)
         if index % -(-len(views) // REPORTED_VIEWS) == 0:
-            reported.append(comparison_html(comparison))
-    write_report(run, result, reported)
+            reported.append(ShownComparison.of(comparison))
+    return reported
 
 
 def _renderer(model: Model, scene: Scene, system: System) -> Renderer:

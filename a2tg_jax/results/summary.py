@@ -183,10 +183,10 @@ def bytes_compared(result: RunResult, name: str) -> str:
     """Return the bytes of the main model beside those of another, for the line of its gain."""
     own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
     if abs(own - other) <= EQUAL_BYTES * other:
-        return f"at equal bytes ({own / 1e6:.2f} MB)"
+        return f"at equal bytes ({megabytes(own)} MB)"
     ratio = own / max(other, 1)
     times = f"{ratio:.1f}" if ratio >= 1.05 else f"{ratio:.2f}"
-    return f"with {times} times its bytes ({own / 1e6:.2f} MB and {other / 1e6:.2f} MB)"
+    return f"with {times} times its bytes ({megabytes(own)} MB and {megabytes(other)} MB)"
 
 
 def budget_lines(result: RunResult) -> list[str]:
@@ -231,6 +231,11 @@ def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
     return lines
 
 
+def megabytes(num_bytes: int) -> str:
+    """Return a number of bytes in MB, without the unit."""
+    return f"{num_bytes / 1e6:.2f}"
+
+
 def minutes(seconds: float) -> str:
     """Return a duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
     whole = round(seconds)
@@ -263,10 +268,6 @@ def _qualities(found: Evaluation | None) -> list[str]:
 
 def _figures(measured: ModelResult) -> list[str]:
     """Return one model's column of the headline table; empty for a missing metric."""
-
-    def megabytes(num_bytes: int) -> str:
-        return f"{num_bytes / 1e6:.2f}"
-
     is_textured = measured.num_texels > 0
     is_counted_otherwise = measured.num_published_bytes != measured.num_bytes
     return [

@@ -91,7 +91,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
         except (OSError, ValueError):
             return None  # The photographs are gone; the model shows itself.
 
-    title = f"{Path(record.scene.path).name} · {planned.name}"
+    title = f"{record.scene.name} · {planned.name}"
     return Source(load_model(path), title, settings=settings_of(planned.system), load_scene=load_scene)
 
 
