@@ -86,6 +86,13 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
+  test("the vertical is what the cameras tell", async () => {
+    const page = await opened(DESK);
+    const up = await page.evaluate(() => window.a2tg?.viewer.splats?.header.cameras[0]?.viewmat.slice(4, 7));
+    expect((await axesOn(page)).up).toEqual(up?.map((x) => -x));
+    await page.close();
+  });
+
   test("the view is rolled, and made level by a button and a key", async () => {
     const page = await opened(DESK);
     await page.click("#leveling > summary");
