@@ -164,7 +164,7 @@ def test_addresses_on_a_network(monkeypatch):
     assert lan_address() == "127.0.0.1"
 
 
-@pytest.mark.parametrize("host", ["192.0.2.77", "a..b", "::1"])
+@pytest.mark.parametrize("host", ["203.0.113.77", "a..b", "::1"])
 def test_hosts_that_are_not_this_machine_are_refused(host):
     with pytest.raises(ValueError, match=f"{host}:0 cannot be used: .* 0.0.0.0"), served({}, host=host):
         pass
@@ -179,9 +179,6 @@ def test_view_tells_the_address_for_a_phone(monkeypatch, tmp_path, capsys):
     assert main(["view", str(tmp_path / "a.ply"), "--no-open", "--host", "0.0.0.0"]) == 0
     assert asked == [{"host": "0.0.0.0", "port": 0}]
     assert capsys.readouterr().out.startswith("http://x/t/ shows")
-    with pytest.raises(SystemExit):
-        main(["view", "--help"])
-    assert "opens the page to the network" in " ".join(capsys.readouterr().out.replace("│", "").split())
 
 
 def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys):

@@ -36,8 +36,8 @@ class View:
     model: str | None = None
     """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
     host: str = LOOPBACK
-    """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi: anyone who has the
-    printed address, which contains a random token, sees the scene, and the connection is not encrypted."""
+    """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi. Anyone who has the
+    printed address, which contains a random token, can see the scene; the connection is not encrypted."""
     port: int = 0
     """Port at that address; 0 takes a free one."""
     open: bool = True
