@@ -20,7 +20,7 @@ from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.loop import never
-from a2tg_jax.web.server import application
+from a2tg_jax.web.server import Door, application
 
 SCENE = synthetic_scene(num_views=4, width=24, height=16, num_points=40)
 SYSTEM = A2tg(
@@ -97,7 +97,7 @@ def test_slow_snapshots_are_rare():
 
 def test_pause_holds_the_training_up_until_it_is_resumed_or_stopped():
     live, run = LiveView(SCENE, "scene"), stage_run()
-    app = application(live.routes, 80)
+    app = application(live.routes, Door(port=80))
 
     def post(path: str, **more) -> str:
         told = []

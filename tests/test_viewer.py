@@ -5,8 +5,10 @@ import hashlib
 import http.client
 import importlib
 import io
+import ipaddress
 import json
 import re
+import socket
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
 from a2tg_jax.web.page import viewer_html, viewer_html_with
-from a2tg_jax.web.server import Route, application, served
+from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, served
 
 
 def ask(app, path="/", method="GET", host="127.0.0.1:80"):
@@ -41,7 +43,8 @@ def ask(app, path="/", method="GET", host="127.0.0.1:80"):
 
 
 APP = application(
-    {"/": Route("text/html", b"page"), "/lazy": Route("x/y", lambda: b"late"), "/none": Route("x/y", lambda: None)}, 80
+    {"/": Route("text/html", b"page"), "/lazy": Route("x/y", lambda: b"late"), "/none": Route("x/y", lambda: None)},
+    Door(port=80),
 )
 
 
@@ -87,6 +90,95 @@ def test_a_server_listens_on_the_loopback_alone():
     with pytest.raises(OSError):
         http.client.HTTPConnection("127.0.0.1", port, timeout=20).request("GET", "/")
     connection.close()
+
+
+def network_app(door):
+    """An application with an action, as others on the network reach it."""
+    act = Route("x/y", b"done", act=lambda: None)
+    return application({"/": Route("text/html", b"page"), "/scene": Route("x/y", b"here"), "/act": act}, door)
+
+
+@pytest.mark.parametrize("path", ["/", "", "/scene", "/secret", "/Secret/", "/secre/", "/secret2/scene", "//secret/"])
+def test_on_a_network_nothing_is_told_without_the_token(path):
+    app = network_app(Door(ANY, ANY, 80, "secret"))
+    assert ask(app, path)[0] == 403
+    assert ask(app, path, method="POST")[0] == 403
+
+
+def test_on_a_network_the_token_opens_the_page_and_what_it_fetches():
+    app = network_app(Door(ANY, ANY, 80, "secret"))
+    asked = {path: ask(app, path, host="192.168.1.7:80") for path in ("/secret/", "/secret/scene", "/secret/none")}
+    assert {path: (status, body) for path, (status, _, body) in asked.items()} == {
+        "/secret/": (200, b"page"),
+        "/secret/scene": (200, b"here"),
+        "/secret/none": (404, b"404 Not Found"),
+    }
+    assert asked["/secret/"][1]["Referrer-Policy"] == "no-referrer"
+    assert ask(app, "/secret/../../etc/passwd")[0] == 404
+    assert ask(app, "/secret/", method="POST")[0] == 405
+    assert ask(app, "/secret/act", method="POST")[0] == 403, "no page of its own asks"
+
+
+@pytest.mark.parametrize(
+    ("name", "address", "host", "status"),
+    [
+        (ANY, ANY, "192.168.1.7:80", 200),
+        (ANY, ANY, "localhost:80", 200),
+        (ANY, ANY, "evil.example:80", 403),
+        (ANY, ANY, "192.168.1.7:81", 403),
+        (ANY, ANY, "192.168.1.7.evil.example:80", 403),
+        ("192.168.1.7", "192.168.1.7", "192.168.1.7:80", 200),
+        ("192.168.1.7", "192.168.1.7", "192.168.1.8:80", 403),
+        ("desk.local", "192.168.1.7", "desk.local:80", 200),
+        ("desk.local", "192.168.1.7", "192.168.1.7:80", 200),
+        ("desk.local", "192.168.1.7", "evil.example:80", 403),
+    ],
+)
+def test_on_a_network_requests_must_name_the_machine(name, address, host, status):
+    assert ask(network_app(Door(name, address, 80, "secret")), "/secret/", host=host)[0] == status
+
+
+def test_a_server_on_a_network_has_a_new_token_each_time(monkeypatch):
+    monkeypatch.setattr("a2tg_jax.web.server.lan_address", lambda: "192.168.1.7")
+    tokens = []
+    for _ in range(2):
+        with served({"/": Route("text/plain", b"here")}, host=ANY) as address:
+            port, token = re.fullmatch(r"http://192\.168\.1\.7:(\d+)/([\w-]{20,})/", address).groups()
+            for path, status in (("/", 403), (f"/{token}/", 200)):
+                connection = http.client.HTTPConnection("127.0.0.1", int(port), timeout=20)
+                connection.request("GET", path, headers={"Host": f"192.168.1.7:{port}"})
+                assert connection.getresponse().status == status
+                connection.close()
+            tokens.append(token)
+    assert tokens[0] != tokens[1]
+
+
+def test_addresses_on_a_network(monkeypatch):
+    ipaddress.IPv4Address(lan_address())
+
+    class Unplugged(socket.socket):
+        def connect(self, address):
+            raise OSError("Network is unreachable")
+
+    monkeypatch.setattr(socket, "socket", Unplugged)
+    assert lan_address() == "127.0.0.1"
+
+
+@pytest.mark.parametrize("host", ["203.0.113.77", "a..b", "::1"])
+def test_hosts_that_are_not_this_machine_are_refused(host):
+    with pytest.raises(ValueError, match=f"{host}:0 cannot be used: .* 0.0.0.0"), served({}, host=host):
+        pass
+
+
+def test_view_tells_the_address_for_a_phone(monkeypatch, tmp_path, capsys):
+    save_ply(tmp_path / "a.ply", some_gaussians())
+    asked = []
+    monkeypatch.setattr(
+        "a2tg_jax.cli.view.serve", lambda routes, *, on_start, **rest: (asked.append(rest), on_start("http://x/t/"))
+    )
+    assert main(["view", str(tmp_path / "a.ply"), "--no-open", "--host", "0.0.0.0"]) == 0
+    assert asked == [{"host": "0.0.0.0", "port": 0}]
+    assert capsys.readouterr().out.startswith("http://x/t/ shows")
 
 
 def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys):

@@ -113,4 +113,4 @@ def test_the_page_shows_a_real_scene(node, shared, tmp_path):
 
 
 def test_the_page_itself(node):
-    run_node("test:browser", "--", "page")
+    run_node("test:browser", "--", "page", "adjust")

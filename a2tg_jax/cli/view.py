@@ -14,32 +14,37 @@ from a2tg_jax.results.live import shown_live
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
 from a2tg_jax.training.loop import Watch
-from a2tg_jax.web.server import serve
+from a2tg_jax.web.server import LOOPBACK, serve
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
     """Show a scene in a browser on this machine.
 
-    Other machines cannot connect. A run is shown with its photographs. Gaussians of 3DGS (PLY) are flattened along
-    their thinnest axis.
+    Other machines cannot connect without --host. A run is shown with its photographs. Gaussians of 3DGS (PLY) are
+    flattened along their thinnest axis.
 
     Examples:
       a2tg view runs/fox
       a2tg view scene.ply --port 8080 --no-open
+      a2tg view runs/fox --host 0.0.0.0
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
     model: str | None = None
     """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
+    host: str = LOOPBACK
+    """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi. Anyone who has the
+    printed address, which contains a random token, can see the scene; the connection is not encrypted."""
     port: int = 0
-    """Port on 127.0.0.1; 0 takes a free one."""
+    """Port at that address; 0 takes a free one."""
     open: bool = True
     """Open a browser if the machine has a display."""
 
     def run(self) -> None:
-        serve(routes_of(open_source(self.source, self.model)), port=self.port, on_start=self._started)
+        routes = routes_of(open_source(self.source, self.model))
+        serve(routes, host=self.host, port=self.port, on_start=self._started)
 
     def _started(self, address: str) -> None:
         print(f"{address} shows {self.source}; press Ctrl-C to stop", flush=True)

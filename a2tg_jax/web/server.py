@@ -1,8 +1,14 @@
-"""Server of a page and its files from memory, for browsers of this machine alone; runs on waitress."""
+"""Server of a page and its files from memory; runs on waitress.
+
+It listens on the loopback, or, if asked, on a network. There it answers only below a random path, the token: whoever
+has the address has access.
+"""
 
 import contextlib
 import dataclasses
 import importlib
+import ipaddress
+import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -10,7 +16,9 @@ from typing import Any
 
 from a2tg_jax.host.operating_system import allow_recent_port
 
-LOOPBACK = "127.0.0.1"
+LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
+ELSEWHERE = "192.0.2.1"
+"""Address that no machine has (RFC 5737)."""
 HEADERS = (
     ("Cache-Control", "no-store"),
     ("Content-Security-Policy", "frame-ancestors 'none'"),
@@ -38,22 +46,82 @@ class Route:
         return self.content() if callable(self.content) else self.content
 
 
-def application(routes: Mapping[str, Route], port: int) -> Application:
+@dataclasses.dataclass(frozen=True)
+class Door:
+    """Where a server listens, and what requests must know to be let in."""
+
+    name: str = LOOPBACK
+    """Name or address by which the server was asked to listen."""
+    address: str = LOOPBACK
+    """IPv4 address at which it listens; 0.0.0.0 for all of this machine."""
+    port: int = 0
+    token: str = ""
+    """First part of every path; empty for none."""
+
+    @staticmethod
+    def of(listening: socket.socket, name: str) -> "Door":
+        """Return the door of a bound socket, with a new token if other machines can reach it."""
+        address, port = listening.getsockname()
+        return Door(name.lower(), address, port, "" if _is_loopback(address) else secrets.token_urlsafe(16))
+
+    @property
+    def url(self) -> str:
+        """Address that opens the page."""
+        host = lan_address() if self.address == ANY else self.name
+        return f"http://{host}:{self.port}/{self.token}/" if self.token else f"http://{host}:{self.port}/"
+
+    def admits(self, host: str) -> bool:
+        """Return whether `host`, such as 127.0.0.1:8000, names this server, and not by a name that others chose."""
+        name, _, port = host.rpartition(":")
+        is_own = name in (self.name, self.address, LOOPBACK, "localhost")
+        return port == str(self.port) and (is_own or (self.address == ANY and _is_ip(name)))
+
+    def behind(self, path: str) -> str | None:
+        """Return the path behind the token; None if the path has another token or none."""
+        if not self.token:
+            return path
+        token, slash, rest = path.removeprefix("/").partition("/")
+        return f"/{rest}" if slash and secrets.compare_digest(token.encode(), self.token.encode()) else None
+
+
+def lan_address() -> str:
+    """Return the IPv4 address by which the network reaches this machine; the loopback if there is no network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((ELSEWHERE, 9))  # Chooses an interface and sends nothing.
+        except OSError:
+            return LOOPBACK
+        return str(probe.getsockname()[0])
+
+
+def _is_ip(name: str) -> bool:
+    try:
+        ipaddress.IPv4Address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_loopback(address: str) -> bool:
+    return ipaddress.IPv4Address(address).is_loopback
+
+
+def application(routes: Mapping[str, Route], door: Door) -> Application:
     """Answer GET and HEAD, or POST, at the paths of `routes`, such as "/", and nothing else.
 
-    A request must name this machine as the host it asks: a page from elsewhere, whose name is made to lead here, cannot
-    read the scene.
+    A request must name this machine as the host that it asks, and begin its path with the door's token. A page from
+    elsewhere, whose name is made to lead here, cannot read the scene.
     """
-    hosts = {f"{name}:{port}" for name in (LOOPBACK, "localhost")}
 
     def answer(environ: Mapping[str, Any], start_response: StartResponse) -> Iterable[bytes]:
         def refuse(status: str) -> list[bytes]:
             start_response(status, [("Content-Type", "text/plain"), *HEADERS])
             return [status.encode()]
 
-        if environ.get("HTTP_HOST") not in hosts:
+        path = door.behind(environ["PATH_INFO"] or "/")
+        if path is None or not door.admits(environ.get("HTTP_HOST") or ""):
             return refuse("403 Forbidden")
-        route = routes.get(environ["PATH_INFO"] or "/")
+        route = routes.get(path)
         is_action = route is not None and route.act is not None
         if environ["REQUEST_METHOD"] not in (("POST",) if is_action else ("GET", "HEAD")):
             return refuse("405 Method Not Allowed")
@@ -70,31 +138,34 @@ def application(routes: Mapping[str, Route], port: int) -> Application:
     return answer
 
 
-def serve(routes: Mapping[str, Route], *, port: int = 0, on_start: Callable[[str], None] = print) -> None:
+def serve(
+    routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0, on_start: Callable[[str], None] = print
+) -> None:
     """Serve until the process is interrupted.
 
     Args:
       routes: what is answered, by path.
-      port: on this machine; 0 is a free one.
+      host: address to listen on; any but the loopback opens the server to the network, below a random path.
+      port: on that address; 0 is a free one.
       on_start: called with the address once it answers.
 
     Raises:
-      ValueError: if waitress is not installed, or the port is taken.
+      ValueError: if waitress is not installed, the port is taken, or this machine has no such address.
     """
-    server = _opened(routes, port, {})
-    on_start(f"http://{LOOPBACK}:{server.effective_port}/")
+    server, url = _opened(routes, host, port, {})
+    on_start(url)
     server.run()
 
 
 @contextlib.contextmanager
-def served(routes: Mapping[str, Route], *, port: int = 0) -> Iterator[str]:
+def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) -> Iterator[str]:
     """Serve in a thread within the block, and yield the address. Arguments and errors are those of `serve`."""
     connections: dict[int, Any] = {}
-    server = _opened(routes, port, connections)
+    server, url = _opened(routes, host, port, connections)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     try:
-        yield f"http://{LOOPBACK}:{server.effective_port}/"
+        yield url
     finally:
         # In the server's own thread, which ends when all is closed.
         server.trigger.pull_trigger(lambda: [connection.close() for connection in list(connections.values())])
@@ -102,26 +173,30 @@ def served(routes: Mapping[str, Route], *, port: int = 0) -> Iterator[str]:
         server.task_dispatcher.shutdown()
 
 
-def _opened(routes: Mapping[str, Route], port: int, connections: dict[int, Any]) -> Any:
-    """Return a server of waitress that listens, and answers once it is run; it keeps what it holds open in
-    `connections`."""
+def _opened(routes: Mapping[str, Route], host: str, port: int, connections: dict[int, Any]) -> tuple[Any, str]:
+    """Return a server of waitress that listens, and answers once it is run, and the address of the page; the server
+    keeps what it holds open in `connections`."""
     try:
         waitress: Any = importlib.import_module("waitress")
     except ImportError as error:
         raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
-    listening = _listening(port)
-    app = application(routes, listening.getsockname()[1])
-    return waitress.create_server(app, map=connections, sockets=[listening], threads=4, ident=None)
+    listening = _listening(host, port)
+    door = Door.of(listening, host)
+    app = application(routes, door)
+    return waitress.create_server(app, map=connections, sockets=[listening], threads=4, ident=None), door.url
 
 
-def _listening(port: int) -> socket.socket:
-    """Return a socket bound to a port of the loopback."""
+def _listening(host: str, port: int) -> socket.socket:
+    """Return a socket bound to a port of an address of this machine."""
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         allow_recent_port(found)
-        found.bind((LOOPBACK, port))
-    except (OSError, OverflowError) as error:
+        found.bind((host, port))
+    except (OSError, OverflowError, UnicodeError) as error:
         found.close()
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"port {port} cannot be used: {reason}; leave out --port for a free one") from error
+        place, remedy = f"port {port}", "leave out --port for a free one"
+        if host != LOOPBACK:
+            place, remedy = f"{host}:{port}", "--host takes an IPv4 address of this machine, or 0.0.0.0"
+        raise ValueError(f"{place} cannot be used: {reason}; {remedy}") from error
     return found

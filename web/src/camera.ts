@@ -1,5 +1,7 @@
 /** The camera: pose, lens, projection from the world to pixels, and motions. */
 
+import { halfAlong } from "./extent";
+import type { Extent } from "./extent";
 import { add, cross, dot, lookingAlong, normalize, orthonormal, scale, subtract, turned } from "./math";
 import type { Mat3, Row4, Vec2, Vec3 } from "./math";
 
@@ -32,9 +34,16 @@ export type Projection = readonly [Row4, Row4, Row4];
 
 export const target = (pose: Pose): Vec3 => add(pose.position, scale(pose.rotation[2], pose.focus));
 
-/** Scale and centre the lens so that its whole image just fits a canvas. */
-export function fitted(lens: Lens, width: number, height: number): Lens {
-  const s = Math.min(width / lens.width, height / lens.height);
+/** Whether all of an image fits into a canvas, or so much that it covers most of the canvas. */
+export type Fit = "whole" | "close";
+/** Share of a canvas that a close image covers at least. */
+const LEAST_COVERED = 0.6;
+
+/** Scale and centre the lens so that its image fits a canvas. */
+export function fitted(lens: Lens, width: number, height: number, fit: Fit = "whole"): Lens {
+  const [across, down] = [width / lens.width, height / lens.height];
+  const [least, most] = [Math.min(across, down), Math.max(across, down)];
+  const s = fit === "whole" ? least : Math.max(least, LEAST_COVERED * most);
   return {
     fx: lens.fx * s,
     fy: lens.fy * s,
@@ -134,10 +143,13 @@ export function aimed(pose: Pose, at: Vec3): Pose {
   return { ...pose, focus, position: subtract(at, scale(pose.rotation[2], focus)) };
 }
 
-/** Return an initial view of a scene with this centre and radius. */
-export function overview(centre: Vec3, radius: number, up: Vec3): Pose {
+/** Return a view in which the ellipsoid of an extent just fits into the narrower angle of a lens. */
+export function overview(extent: Extent, up: Vec3, { fx, fy, width, height }: Lens): Pose {
   const side = Math.abs(up[0]) < 0.9 ? cross(up, [1, 0, 0]) : cross(up, [0, 1, 0]);
-  const forward = normalize(subtract(scale(normalize(side), 1), scale(up, 0.35)));
-  const focus = 2.5 * radius;
-  return { position: subtract(centre, scale(forward, focus)), rotation: lookingAlong(forward, up), focus };
+  const rotation = lookingAlong(subtract(normalize(side), scale(up, 0.35)), up);
+  const [right, down, forward] = rotation;
+  const depth = halfAlong(extent, forward);
+  const across = Math.hypot(depth, (2 * halfAlong(extent, right) * fx) / width);
+  const focus = Math.max(across, Math.hypot(depth, (2 * halfAlong(extent, down) * fy) / height));
+  return { position: subtract(extent.centre, scale(forward, focus)), rotation, focus };
 }

@@ -1,7 +1,7 @@
 /** Conversion between views and URL fragments. */
 
-import type { Lens, Pose } from "./camera";
-import { isVector, orthonormal } from "./math";
+import type { Fit, Lens, Pose } from "./camera";
+import { isVector, normalize, orthonormal } from "./math";
 import type { Vec3 } from "./math";
 import { MODES } from "./shaders";
 import type { Mode } from "./shaders";
@@ -10,13 +10,16 @@ export interface View {
   readonly pose: Pose;
   readonly lens: Lens;
   readonly mode: Mode;
+  readonly fit: Fit;
+  /** The vertical; null if it is estimated. */
+  readonly up: Vec3 | null;
 }
 
 /** Position, right, forward; focus; fx, fy, cx, cy, skew, width, height. */
 type ViewNumbers = readonly [...Vec3, ...Vec3, ...Vec3, number, ...Vec3, ...Vec3, number];
 
 /** Return the fragment of a view, such as #view=…&mode=depth. */
-export function linkOf({ pose, lens, mode }: View): string {
+export function linkOf({ pose, lens, mode, fit, up }: View): string {
   const numbers: ViewNumbers = [
     ...pose.position,
     ...pose.rotation[0],
@@ -30,14 +33,18 @@ export function linkOf({ pose, lens, mode }: View): string {
     lens.width,
     lens.height,
   ];
-  const view = numbers.map((x) => Number(x.toPrecision(7)).toString()).join(",");
-  return mode === "full" ? `#view=${view}` : `#view=${view}&mode=${mode}`;
+  const fields = [`view=${textOf(numbers)}`];
+  if (mode !== "full") fields.push(`mode=${mode}`);
+  if (fit !== "whole") fields.push(`fit=${fit}`);
+  if (up !== null) fields.push(`up=${textOf(up)}`);
+  return `#${fields.join("&")}`;
 }
 
 /** Parse a fragment. Returns null if it holds no valid view. */
 export function viewOf(hash: string): View | null {
   const fields = new URLSearchParams(hash.replace(/^#/, ""));
-  const numbers: readonly number[] = (fields.get("view") ?? "").split(",").map(Number);
+  const numbers = numbersOf(fields.get("view"));
+  const up = numbersOf(fields.get("up"));
   if (!isVector<ViewNumbers>(numbers, 17) || numbers.some((x) => Math.abs(x) >= 1e9)) return null;
   const [x, y, z, rightX, rightY, rightZ, forwardX, forwardY, forwardZ, focus, ...image] = numbers;
   const [fx, fy, cx, cy, skew, width, height] = image;
@@ -52,5 +59,12 @@ export function viewOf(hash: string): View | null {
     pose: { position: [x, y, z], rotation, focus },
     lens: { fx, fy, cx, cy, skew, width, height },
     mode,
+    fit: fields.get("fit") === "close" ? "close" : "whole",
+    up: isVector<Vec3>(up, 3) ? normalize(up) : null,
   };
 }
+
+const textOf = (numbers: readonly number[]): string =>
+  numbers.map((x) => Number(x.toPrecision(7)).toString()).join(",");
+
+const numbersOf = (text: string | null): readonly number[] => (text ?? "").split(",").map(Number);

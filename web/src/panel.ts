@@ -1,5 +1,6 @@
 /** The side panel: display mode, cameras and their photographs, link, path. */
 
+import { CropControls, LevelControls } from "./adjust";
 import { intrinsicsOf, viewmatOf } from "./camera";
 import type { Intrinsics, Viewmat } from "./camera";
 import type { Header } from "./format";
@@ -38,6 +39,7 @@ export class Panel {
   private current: number | null = null;
   private kept: KeptView[] = [];
   private linkTimer = 0;
+  private readonly leveling: LevelControls;
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
@@ -57,6 +59,8 @@ export class Panel {
     });
     this.onClick("keep", () => this.keep());
     this.onClick("save", () => this.save());
+    this.leveling = new LevelControls(viewer);
+    new CropControls(viewer);
     viewer.onLeave = () => this.leave();
     addEventListener("keydown", (event) => this.pressKey(event));
     addEventListener("resize", () => this.placePhotograph());
@@ -185,8 +189,8 @@ export class Panel {
   }
 
   private get link(): string {
-    const { pose, image, mode } = this.viewer;
-    return linkOf({ pose, lens: image, mode });
+    const { pose, image, mode, fit, up, isUpChosen } = this.viewer;
+    return linkOf({ pose, lens: image, mode, fit, up: isUpChosen ? up : null });
   }
 
   private async copyLink(): Promise<void> {
@@ -209,8 +213,8 @@ export class Panel {
     if (view === null) return false;
     const { viewer } = this;
     if (viewer.splats !== null) viewer.settle(viewer.splats);
-    viewer.pose = view.pose;
-    viewer.image = view.lens;
+    [viewer.pose, viewer.image, viewer.fit] = [view.pose, view.lens, view.fit];
+    if (view.up !== null) viewer.chooseUp(view.up);
     this.setMode(view.mode);
     this.setCurrent(null);
     viewer.draw();
@@ -246,6 +250,7 @@ export class Panel {
     if (/^[1-7]$/.test(event.key) && mode !== undefined) this.setMode(mode);
     else if (event.key === ",") this.step(-1);
     else if (event.key === ".") this.step(1);
+    else if (event.key.toLowerCase() === "l") this.leveling.level();
     else if (event.key.toLowerCase() === "h") {
       const panel = element("panel", HTMLDetailsElement);
       panel.open = !panel.open;

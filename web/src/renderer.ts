@@ -2,6 +2,7 @@
 
 import type { Lens, Pose } from "./camera";
 import { projection } from "./camera";
+import type { Clip } from "./extent";
 import type { Ends } from "./format";
 import { Program, Target } from "./gl";
 import type { Vec2 } from "./math";
@@ -35,7 +36,7 @@ export class Renderer {
   }
 
   /** Draw a pose at the lens' size. Right of the share `divided` of the width, textures are left out. */
-  draw(splats: Splats, pose: Pose, lens: Lens, mode: Mode, divided: number | null = null): void {
+  draw(splats: Splats, pose: Pose, lens: Lens, clip: Clip, mode: Mode, divided: number | null = null): void {
     const { gl, target } = this;
     target.resize(lens.width, lens.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
@@ -45,6 +46,7 @@ export class Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (splats.numDrawn === 0) return;
     this.prepare(splats, pose, lens);
+    this.limit(clip);
     const middle = divided === null ? lens.width : Math.round(divided * lens.width);
     const parts: Part[] = [{ mode, from: 0, to: middle }];
     if (middle < lens.width) parts.push({ mode: "plain", from: middle, to: lens.width });
@@ -106,6 +108,15 @@ export class Renderer {
     gl.uniform2f(splat.at("size"), lens.width, lens.height);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  private limit({ axes, low, high, faintest, largest }: Clip): void {
+    const { gl, splat } = this;
+    gl.uniform3fv(splat.at("boxAxes"), axes.flat());
+    gl.uniform3fv(splat.at("boxLow"), low);
+    gl.uniform3fv(splat.at("boxHigh"), high);
+    gl.uniform1f(splat.at("faintest"), faintest);
+    gl.uniform1f(splat.at("largest"), largest);
   }
 
   private drawPart(splats: Splats, lens: Lens, { mode, from, to }: Part): void {

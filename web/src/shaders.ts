@@ -35,6 +35,8 @@ uniform vec4 projection[3];
 uniform vec3 center;
 uniform vec2 size;
 uniform float nearPlane, peak;
+uniform vec3 boxAxes[3], boxLow, boxHigh;
+uniform float faintest, largest;
 uniform vec2 scaleEnds, quatEnds, opacityEnds, harmonicEnds[4];
 uniform int mode;
 uniform bool isClamped;
@@ -164,6 +166,8 @@ void main() {
   vec3 position = uintBitsToFloat(first.xyz);
   float depth = dot(projection[2].xyz, position) + projection[2].w;
   if (!(depth >= nearPlane)) return;
+  vec3 inBox = vec3(dot(boxAxes[0], position), dot(boxAxes[1], position), dot(boxAxes[2], position));
+  if (any(lessThan(inBox, boxLow)) || any(greaterThan(inBox, boxHigh))) return;
   uvec4 second = wordsAt(rows, 2u * row + 1u);
   float opacity = values(second.x, opacityEnds).a;
   float cutoff = 2.0 * log(255.0 * opacity * peak);
@@ -171,6 +175,7 @@ void main() {
   if (!(cutoff > 0.0)) return;
 
   vec2 scales = exp(values(second.y, scaleEnds).xy);
+  if (opacity < faintest || max(scales.x, scales.y) > largest) return;
   mat3 R = rotationOf(values(second.x, quatEnds).xyz);
   vec3 M[3];
   for (int i = 0; i < 3; i++) {

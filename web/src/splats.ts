@@ -1,16 +1,12 @@
 /** A scene in GPU memory and the worker that sorts it. */
 
-import { at } from "./arrays";
 import type { Chunk } from "./chunks";
 import type { Header } from "./format";
 import { LongTexture } from "./gl";
-import type { Row4, Vec3 } from "./math";
+import type { Row4 } from "./math";
 import { Packer, mostHarmonics } from "./packing";
 import SortWorker from "./sort.worker?worker&inline";
 import type { AddMessage, OrderMessage, SortMessage } from "./sort.worker";
-
-/** Size at which the sample stops growing, and largest number of positions that one chunk adds to it. */
-const SAMPLE = 4096;
 
 export class Splats {
   readonly header: Header;
@@ -25,8 +21,6 @@ export class Splats {
   numDrawn = 0;
   numTexels = 0;
   numBytes = 0;
-  /** Positions of the first rows, the most visible ones, from which the initial view is found. */
-  readonly sample: Vec3[] = [];
   /** Handler for a new order. */
   onOrder: () => void = () => undefined;
   /** Handler for errors of the worker. */
@@ -62,7 +56,6 @@ export class Splats {
     this.numBytes += packed.rows.byteLength + packed.harmonics.byteLength + packed.texels.byteLength;
     this.num += packed.num;
     this.numTexels += packed.texels.length / 4;
-    if (this.sample.length < SAMPLE) this.sample.push(...pointsOf(packed.means.subarray(0, 3 * SAMPLE)));
     const message: AddMessage = { kind: "add", means: packed.means, total: this.header.num };
     this.worker.postMessage(message, [packed.means.buffer]);
   }
@@ -106,13 +99,4 @@ export class Splats {
     this.next();
     this.onOrder();
   }
-}
-
-/** Split [x, y, z, …] into positions. */
-function pointsOf(means: Float32Array): Vec3[] {
-  return Array.from({ length: means.length / 3 }, (_, i) => [
-    at(means, 3 * i),
-    at(means, 3 * i + 1),
-    at(means, 3 * i + 2),
-  ]);
 }

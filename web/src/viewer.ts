@@ -2,36 +2,49 @@
 
 import { at } from "./arrays";
 import { aimed, fitted, lensOf, overview, poseOf, projection } from "./camera";
-import type { Lens, Pose } from "./camera";
+import type { Fit, Lens, Pose } from "./camera";
 import { Controls } from "./controls";
 import type { Steered } from "./controls";
+import { WHOLE, clipOf, extentOf } from "./extent";
+import type { Clip, Crop, Extent } from "./extent";
 import { SceneError } from "./format";
 import type { Header, SceneCamera } from "./format";
-import { add, dot, norm, scale, subtract } from "./math";
+import { add, dot, scale } from "./math";
 import type { Row4, Vec2, Vec3 } from "./math";
 import { Renderer } from "./renderer";
 import type { Mode } from "./shaders";
 import { Splats } from "./splats";
+import { verticalOf } from "./vertical";
 
 const SLOW = 45;
 const QUICK = 18;
 const COARSEST = 0.25;
 /** Milliseconds after the last motion until the picture is drawn at full resolution. */
 const REST = 160;
+/** Lens for scenes without cameras: 53° across the narrower side. */
+const FREE_LENS: Lens = { fx: 600, fy: 600, cx: 300, cy: 300, skew: 0, width: 600, height: 600 };
+const UNIT: Extent = { centre: [0, 0, 0], half: [1, 1, 1] };
 
 export class Viewer implements Steered {
   readonly canvas: HTMLCanvasElement;
   splats: Splats | null = null;
-  pose: Pose = overview([0, 0, 0], 1, [0, 0, 1]);
-  /** Lens of the current view. The canvas shows its whole image and, if wider or higher, more around it. */
-  image: Lens = { fx: 600, fy: 600, cx: 400, cy: 300, skew: 0, width: 800, height: 600 };
+  pose: Pose = overview(UNIT, [0, 0, 1], FREE_LENS);
+  /** Lens of the current view. */
+  image: Lens = FREE_LENS;
+  /** How the image of that lens fits the canvas, which may show more around it. */
+  fit: Fit = "whole";
   up: Vec3 = [0, 0, 1];
+  /** Whether the user has chosen the vertical. */
+  isUpChosen = false;
   extent = 1;
+  crop: Crop = WHOLE;
+  /** Strictness with which floaters are hidden, 0 to 1. */
+  floaters = 0;
   mode: Mode = "full";
   /** Share of the width left of which textures are shown; null shows them everywhere. */
   divided: number | null = null;
   /** Handler called after each frame. */
-  onFrame: (milliseconds: number) => void = () => undefined;
+  onFrame: () => void = () => undefined;
   /** Handler called when the scene cannot be drawn. */
   onFail: (reason: string) => void = () => undefined;
   /** Handler called when the user has moved the camera. */
@@ -80,19 +93,22 @@ export class Viewer implements Steered {
     splats.sort(this.depthRow);
   }
 
-  /** Estimate the extent and up direction of a scene, and go to its first camera. */
-  settle(splats: Splats): void {
-    const { cameras } = splats.header;
-    const { centre, radius } = middleOf(splats.sample);
-    const [first] = cameras;
-    this.up = first !== undefined ? [0, 0, 1] : [0, -1, 0];
-    this.extent = first !== undefined ? 1 : radius;
-    if (first !== undefined) this.goTo(first);
-    else this.pose = overview(centre, radius, this.up);
+  /** Go to the first camera, or to where most of the scene is seen, with the vertical that the cameras tell. */
+  settle({ header }: Splats): void {
+    const [first] = header.cameras;
+    const extent = extentOf(header.means);
+    [this.up, this.isUpChosen] = [verticalOfScene(header), false];
+    this.extent = first !== undefined ? 1 : Math.max(...extent.half);
+    if (first !== undefined) {
+      this.goTo(first, "close");
+      return;
+    }
+    [this.image, this.fit] = [FREE_LENS, "close"];
+    this.pose = overview(extent, this.up, this.lens);
   }
 
-  goTo(camera: SceneCamera): void {
-    this.image = lensOf(camera.K, camera.size);
+  goTo(camera: SceneCamera, fit: Fit = "whole"): void {
+    [this.image, this.fit] = [lensOf(camera.K, camera.size), fit];
     const pose = poseOf(camera.viewmat, 1);
     // Cameras carry no target: use the point on the optical axis nearest to the origin, the middle of the scene.
     this.pose = { ...pose, focus: Math.max(-dot(pose.position, pose.rotation[2]), 0.2 * this.extent) };
@@ -101,7 +117,13 @@ export class Viewer implements Steered {
 
   /** Lens for the canvas, in CSS pixels. */
   get lens(): Lens {
-    return fitted(this.image, Math.max(this.canvas.clientWidth, 1), Math.max(this.canvas.clientHeight, 1));
+    const { clientWidth, clientHeight } = this.canvas;
+    return fitted(this.image, Math.max(clientWidth, 1), Math.max(clientHeight, 1), this.fit);
+  }
+
+  chooseUp(up: Vec3): void {
+    [this.up, this.isUpChosen] = [up, true];
+    this.draw();
   }
 
   onMove(): void {
@@ -114,7 +136,7 @@ export class Viewer implements Steered {
   onAim(x: number, y: number): void {
     const { lens, splats } = this;
     if (splats === null) return;
-    this.renderer.draw(splats, this.pose, lens, "depth");
+    this.renderer.draw(splats, this.pose, lens, this.clip, "depth");
     const column = Math.min(Math.max(Math.floor(x), 0), lens.width - 1);
     const row = Math.min(Math.max(Math.floor(y), 0), lens.height - 1);
     const pixel = this.renderer.target.read(column, row, 1, 1);
@@ -142,10 +164,15 @@ export class Viewer implements Steered {
     if (splats === null) throw new SceneError("No scene is loaded yet.");
     splats.sort(projection(pose, lens)[2]);
     await splats.settled();
-    this.renderer.draw(splats, pose, lens, mode);
+    this.renderer.draw(splats, pose, lens, this.clip, mode);
     const found = this.renderer.target.read(0, 0, lens.width, lens.height);
     this.draw();
     return found;
+  }
+
+  private get clip(): Clip {
+    const extent = this.splats === null ? UNIT : extentOf(this.splats.header.means);
+    return clipOf(extent, this.up, this.crop, this.floaters);
   }
 
   private get depthRow(): Row4 {
@@ -163,10 +190,10 @@ export class Viewer implements Steered {
     const width = Math.max(Math.round(canvas.clientWidth * share), 1);
     const height = Math.max(Math.round(canvas.clientHeight * share), 1);
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    const began = performance.now();
-    this.renderer.draw(splats, this.pose, fitted(this.image, width, height), this.mode, this.divided);
+    const lens = fitted(this.image, width, height, this.fit);
+    this.renderer.draw(splats, this.pose, lens, this.clip, this.mode, this.divided);
     this.renderer.present(splats, this.mode, this.depths, this.divided);
-    this.onFrame(performance.now() - began);
+    this.onFrame();
     this.drawnAt = time;
     this.isSettled = !isMoving;
     if (isMoving) this.draw();
@@ -184,23 +211,7 @@ export class Viewer implements Steered {
   }
 }
 
-/** Return the median position and the radius around it that holds three quarters of the points. */
-function middleOf(points: readonly Vec3[]): { centre: Vec3; radius: number } {
-  if (points.length === 0) return { centre: [0, 0, 0], radius: 1 };
-  const median = (k: 0 | 1 | 2): number =>
-    quantile(
-      points.map((point) => point[k]),
-      0.5,
-    );
-  const centre: Vec3 = [median(0), median(1), median(2)];
-  const distances = points.map((point) => norm(subtract(point, centre)));
-  return { centre, radius: Math.max(quantile(distances, 0.75), 1e-6) };
-}
-
-/** Return a quantile of one or more values, which are sorted in place. */
-function quantile(values: number[], share: number): number {
-  return at(
-    values.sort((a, b) => a - b),
-    Math.floor(share * (values.length - 1)),
-  );
+/** Return the vertical that the cameras of a scene tell; without cameras −y, as in most point clouds. */
+function verticalOfScene({ cameras }: Header): Vec3 {
+  return cameras.length === 0 ? [0, -1, 0] : verticalOf(cameras.map(({ viewmat }) => poseOf(viewmat, 1).rotation));
 }

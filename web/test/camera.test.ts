@@ -2,6 +2,7 @@ import { expect, test } from "vitest";
 
 import { aimed, dollied, fitted, moved, orbited, overview, poseOf, projection, target, viewmatOf } from "../src/camera";
 import type { Lens, Pose } from "../src/camera";
+import type { Extent } from "../src/extent";
 import { linkOf, viewOf } from "../src/link";
 import { cross, dot, norm, orthonormal, subtract } from "../src/math";
 import type { Row4, Vec3 } from "../src/math";
@@ -9,7 +10,8 @@ import { expectClose } from "./close";
 
 const LENS: Lens = { fx: 500, fy: 510, cx: 320.5, cy: 230, skew: 0.5, width: 640, height: 480 };
 const UP: Vec3 = [0, 0, 1];
-const POSE: Pose = overview([0.3, -0.2, 0.1], 1.3, UP);
+const EXTENT: Extent = { centre: [0.3, -0.2, 0.1], half: [1.3, 0.9, 0.6] };
+const POSE: Pose = overview(EXTENT, UP, LENS);
 
 function pixel(pose: Pose, lens: Lens, point: Vec3): [number, number, number] {
   const along = ([a, b, c, d]: Row4): number => dot([a, b, c], point) + d;
@@ -79,12 +81,48 @@ test.each([
   expect(lens.fy / lens.fx).toBeCloseTo(LENS.fy / LENS.fx, 9);
 });
 
+test.each([
+  [1280, 480],
+  [390, 844],
+  [1100, 700],
+])("a close image covers most of a canvas of %i × %i, and is in its middle", (width, height) => {
+  const [whole, close] = [fitted(LENS, width, height), fitted(LENS, width, height, "close")];
+  const s = close.fx / LENS.fx;
+  expect(s).toBeGreaterThanOrEqual(whole.fx / LENS.fx);
+  expect(Math.min((s * LENS.width) / width, (s * LENS.height) / height)).toBeGreaterThan(0.599);
+  expect(close.cx - width / 2).toBeCloseTo(s * (LENS.cx - 320), 9);
+});
+
+test("an image of nearly the canvas' shape is shown whole at first, too", () => {
+  expect(fitted(LENS, 1100, 700, "close")).toEqual(fitted(LENS, 1100, 700));
+});
+
+test.each([
+  [1100, 700],
+  [390, 844],
+])("an overview on %i × %i shows the extent's ellipsoid from as near as it can", (width, height) => {
+  const lens = { ...LENS, fx: 500, fy: 500, cx: width / 2, cy: height / 2, skew: 0, width, height };
+  const pose = overview(EXTENT, UP, lens);
+  const { centre, half } = EXTENT;
+  const shares = Array.from({ length: 4000 }, (_, i) => {
+    const [z, azimuth] = [1 - (2 * i + 1) / 4000, 2.4 * i];
+    const [x, y] = [Math.sqrt(1 - z * z) * Math.cos(azimuth), Math.sqrt(1 - z * z) * Math.sin(azimuth)];
+    const seen = pixel(pose, lens, [centre[0] + half[0] * x, centre[1] + half[1] * y, centre[2] + half[2] * z]);
+    return Math.max(Math.abs(seen[0] / width - 0.5), Math.abs(seen[1] / height - 0.5));
+  });
+  expect(Math.max(...shares)).toBeGreaterThan(0.45);
+  expect(Math.max(...shares)).toBeLessThan(0.55);
+});
+
 test("links preserve a view", () => {
-  const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth" }));
+  const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth", fit: "close", up: [0, 0.6, 0.8] }));
   expect(view?.mode).toBe("depth");
   expectClose(view?.pose.position ?? [], POSE.position, 5);
   expectClose(view?.pose.rotation.flat() ?? [], POSE.rotation.flat(), 5);
   expect(view?.lens).toEqual(LENS);
+  expect([view?.fit, view?.up]).toEqual(["close", [0, 0.6, 0.8]]);
+  const plain = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "full", fit: "whole", up: null }));
+  expect([plain?.fit, plain?.up]).toEqual(["whole", null]);
 });
 
 test.each([

@@ -1,0 +1,143 @@
+/** What the page shows in Chromium: the first view on a phone, level views, the crop box and floaters. */
+
+import { readFileSync } from "node:fs";
+
+import type { Browser, BrowserContextOptions, Page } from "playwright-core";
+import { afterAll, beforeAll, describe, expect, test } from "vitest";
+
+import { expectClose } from "../test/close";
+import { CHROMIUM, launch, serve } from "./chromium";
+import type { Served } from "./chromium";
+
+const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
+const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgw", import.meta.url)));
+const PHONE: BrowserContextOptions = { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true };
+const DESK: BrowserContextOptions = { viewport: { width: 640, height: 480 } };
+
+describe.skipIf(CHROMIUM === undefined)("the page", () => {
+  let browser: Browser;
+  let served: Served;
+  beforeAll(async () => {
+    browser = await launch();
+    served = await serve({ "/": PAGE, "/scene.a2tgw": SCENE });
+  });
+  afterAll(async () => {
+    await browser.close();
+    served.close();
+  });
+
+  async function opened(options: BrowserContextOptions, hash = ""): Promise<Page> {
+    const page = await browser.newPage(options);
+    await page.goto(served.address + hash);
+    await page.evaluate(() => window.a2tg?.loaded);
+    return page;
+  }
+
+  /** Sum of alpha over a picture of the first camera. */
+  const shownOn = (page: Page): Promise<number> =>
+    page.evaluate(async () => {
+      const camera = window.a2tg?.viewer.splats?.header.cameras[0];
+      if (camera === undefined) return NaN;
+      const found = await window.a2tg?.render(camera.viewmat, camera.K, camera.size, "full");
+      return (found ?? new Float32Array(0)).reduce((sum, x, i) => (i % 4 === 3 ? sum + x : sum), 0);
+    });
+
+  /** The camera's right axis and the vertical. */
+  const axesOn = (page: Page): Promise<{ right: readonly number[]; up: readonly number[] }> =>
+    page.evaluate(() => ({
+      right: window.a2tg?.viewer.pose.rotation[0] ?? [],
+      up: window.a2tg?.viewer.up ?? [],
+    }));
+
+  const tilt = ({ right, up }: { right: readonly number[]; up: readonly number[] }): number =>
+    Math.abs(right.reduce((sum, x, k) => sum + x * (up[k] ?? NaN), 0));
+
+  test("a phone's first view is mostly the first camera's image", async () => {
+    const page = await opened(PHONE);
+    const share = await page.evaluate(() => {
+      const viewer = window.a2tg?.viewer;
+      if (viewer === undefined) return NaN;
+      return ((viewer.lens.fy / viewer.image.fy) * viewer.image.height) / viewer.canvas.clientHeight;
+    });
+    expect(share).toBeGreaterThan(0.599);
+    await page.close();
+  });
+
+  test("a phone lists gestures in whole lines, and no keys", async () => {
+    const page = await opened(PHONE);
+    await page.click("#panel > summary");
+    await page.click("#help > summary");
+    const boxes = await page
+      .locator("#help dd:visible")
+      .evaluateAll((found) =>
+        found.map((row) => row.getBoundingClientRect().height / parseFloat(getComputedStyle(row).lineHeight)),
+      );
+    expect(boxes.length).toBe(4);
+    expect(Math.max(...boxes)).toBeLessThan(1.1);
+    expect(await page.locator("#help .key:visible").count()).toBe(0);
+    await page.close();
+  });
+
+  test("a narrow window lists keys in whole lines, too", async () => {
+    const page = await opened({ viewport: { width: 390, height: 844 } });
+    await page.click("#panel > summary");
+    await page.click("#help > summary");
+    const widths = await page.locator("#help dd.key").evaluateAll((found) => found.map((row) => row.clientWidth));
+    expect(Math.min(...widths)).toBeGreaterThan(250);
+    await page.close();
+  });
+
+  test("the vertical is what the cameras tell", async () => {
+    const page = await opened(DESK);
+    const up = await page.evaluate(() => window.a2tg?.viewer.splats?.header.cameras[0]?.viewmat.slice(4, 7));
+    expectClose((await axesOn(page)).up, up?.map((x) => -x) ?? []);
+    await page.close();
+  });
+
+  test("the view is rolled, and made level by a button and a key", async () => {
+    const page = await opened(DESK);
+    await page.click("#leveling > summary");
+    await page.fill("#roll", "20");
+    expect(tilt(await axesOn(page))).toBeCloseTo(Math.sin(Math.PI / 9), 3);
+    await page.click("#level");
+    expect(tilt(await axesOn(page))).toBeLessThan(1e-9);
+    await page.fill("#roll", "-7");
+    await page.focus("#view");
+    await page.keyboard.press("l");
+    expect(tilt(await axesOn(page))).toBeLessThan(1e-9);
+    await page.close();
+  });
+
+  test("a view that is called upright gives the vertical, and the address keeps it", async () => {
+    const page = await opened(DESK);
+    await page.click("#leveling > summary");
+    await page.fill("#roll", "20");
+    const before = await axesOn(page);
+    await page.click("#upright");
+    const after = await axesOn(page);
+    expect([after.right, tilt(after) < 1e-9]).toEqual([before.right, true]);
+    await page.waitForFunction(() => location.hash.includes("&up="));
+    const other = await opened(DESK, new URL(page.url()).hash);
+    expect(tilt(await axesOn(other))).toBeLessThan(1e-5);
+    await page.click("#start");
+    expect((await axesOn(page)).up).toEqual(before.up);
+    await page.close();
+    await other.close();
+  });
+
+  test("the crop box and the floaters' slider leave out splats, and a button brings them back", async () => {
+    const page = await opened(DESK);
+    await page.click("#cropping > summary");
+    const all = await shownOn(page);
+    await page.fill("#to-height", "0.5");
+    const half = await shownOn(page);
+    await page.fill("#from-height", "0.49");
+    const slice = await shownOn(page);
+    expect([half < 0.9 * all, slice < 0.3 * half]).toEqual([true, true]);
+    await page.click("#uncrop");
+    expect(await shownOn(page)).toBe(all);
+    await page.fill("#floaters", "0.8");
+    expect(await shownOn(page)).toBeLessThan(0.9 * all);
+    await page.close();
+  });
+});

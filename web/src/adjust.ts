@@ -1,0 +1,80 @@
+/** The panel's sections that adjust what is shown: roll and vertical, crop box and floaters. */
+
+import { WHOLE } from "./extent";
+import type { Vec3 } from "./math";
+import { element } from "./page";
+import { rollOf, rolled, verticalIn } from "./vertical";
+import type { Viewer } from "./viewer";
+
+const DEGREES = 180 / Math.PI;
+
+/** Buttons and slider that turn the view upright, or call it so. */
+export class LevelControls {
+  private readonly viewer: Viewer;
+  private readonly roll = element("roll", HTMLInputElement);
+
+  constructor(viewer: Viewer) {
+    this.viewer = viewer;
+    this.roll.addEventListener("input", () => this.turn(-Number(this.roll.value) / DEGREES));
+    element("level", HTMLButtonElement).addEventListener("click", () => this.level());
+    element("upright", HTMLButtonElement).addEventListener("click", () => this.callUpright());
+    viewer.onFrame = () => this.tell();
+  }
+
+  /** Roll the view upright. */
+  level(): void {
+    this.turn(0);
+  }
+
+  /** Make the vertical what is up in this view, at the pitch that it has. */
+  private callUpright(): void {
+    const { viewer } = this;
+    viewer.chooseUp(verticalIn(viewer.pose, viewer.up));
+    viewer.onLeave();
+  }
+
+  private turn(roll: number): void {
+    const { viewer } = this;
+    viewer.pose = rolled(viewer.pose, viewer.up, roll);
+    viewer.onMove();
+  }
+
+  private tell(): void {
+    if (!this.roll.matches(":active")) this.roll.value = String(-rollOf(this.viewer.pose, this.viewer.up) * DEGREES);
+  }
+}
+
+/** Sliders of the crop box and of the floaters. */
+export class CropControls {
+  private readonly viewer: Viewer;
+  private readonly from = ["from-width", "from-depth", "from-height"].map((id) => element(id, HTMLInputElement));
+  private readonly to = ["to-width", "to-depth", "to-height"].map((id) => element(id, HTMLInputElement));
+  private readonly floaters = element("floaters", HTMLInputElement);
+
+  constructor(viewer: Viewer) {
+    this.viewer = viewer;
+    for (const slider of [...this.from, ...this.to, this.floaters]) {
+      slider.addEventListener("input", () => this.apply());
+    }
+    element("uncrop", HTMLButtonElement).addEventListener("click", () => this.reset());
+  }
+
+  private reset(): void {
+    for (const [k, slider] of this.from.entries()) slider.value = String(WHOLE.from[k]);
+    for (const [k, slider] of this.to.entries()) slider.value = String(WHOLE.to[k]);
+    this.floaters.value = "0";
+    this.apply();
+  }
+
+  private apply(): void {
+    const { viewer } = this;
+    viewer.crop = { from: valuesOf(this.from), to: valuesOf(this.to) };
+    viewer.floaters = Number(this.floaters.value);
+    viewer.draw();
+  }
+}
+
+function valuesOf(sliders: readonly HTMLInputElement[]): Vec3 {
+  const [x, y, z] = sliders.map((slider) => Number(slider.value));
+  return [x ?? 0, y ?? 0, z ?? 0];
+}
