@@ -48,7 +48,7 @@ class RenderSettings:
     A `Model` and a rule have options of their own, which win: this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
-    compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
+    compositor: Literal["auto", "cuda", "native", "pallas", "xla"] = "auto"
     """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
     and XLA with a warning if native loops do not support the appearance rule."""
     tile_batch: int | None = None

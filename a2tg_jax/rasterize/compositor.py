@@ -69,6 +69,10 @@ def _kernels(compositor: Compositor) -> ModuleType:
         from a2tg_jax.rasterize.kernels.native import composite as native
 
         return native
+    if compositor == "cuda":
+        from a2tg_jax.rasterize.kernels.cuda import composite as cuda
+
+        return cuda
     if compositor == "pallas":
         from a2tg_jax.rasterize.kernels import pallas
 

@@ -17,7 +17,7 @@ from a2tg_jax.core.geometry import homographies
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid
 
-Compositor = Literal["native", "pallas", "xla"]
+Compositor = Literal["cuda", "native", "pallas", "xla"]
 """Native loops (CPUs), Pallas kernels (GPUs) or XLA (everywhere)."""
 
 

@@ -20,13 +20,13 @@ MAX_TILE_SIZE = 64
 """Native loops keep a tile on the stack."""
 
 
-def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -> Compositor:
+def choose(wanted: Literal["auto", "cuda", "native", "pallas", "xla"], tile_size: int) -> Compositor:
     """The compositor that is wanted, or with "auto" the fastest that JAX's default backend can run.
 
     Raises:
       ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
     """
-    if wanted not in ("auto", "native", "pallas", "xla"):
+    if wanted not in ("auto", "cuda", "native", "pallas", "xla"):
         raise ValueError(f"compositor must be 'auto', 'native', 'pallas' or 'xla'; got {wanted!r}")
     if not 1 <= tile_size <= MAX_TILE_SIZE:
         raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
@@ -54,7 +54,7 @@ def wants_determinism() -> bool:
     return any(asked.values())
 
 
-def instead_of_native(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
+def instead_of_native(wanted: Literal["auto", "cuda", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
     """The compositor for a rule that native loops cannot run: XLA, with one warning per rule.
 
     Raises:

@@ -1,0 +1,53 @@
+"""The GPU kernels on the CPU: the same text as OpenCL C, run by PoCL."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from a2tg_jax.rasterize.kernels.cuda.source import num_parts, num_threads, source
+
+cl = pytest.importorskip("pyopencl", reason="the GPU kernels run here as OpenCL: pip install pyopencl, apt install pocl-opencl-icd")
+
+
+@functools.cache
+def _queue():
+    devices = [device for platform in cl.get_platforms() for device in platform.get_devices(cl.device_type.CPU)]
+    if not devices:
+        pytest.skip("the GPU kernels run here as OpenCL, which has no CPU device: apt install pocl-opencl-icd")
+    return cl.CommandQueue(cl.Context(devices[:1]))
+
+
+@functools.cache
+def _program(spec):
+    return cl.Program(_queue().context, source(spec, "opencl")).build(["-cl-std=CL1.2"])
+
+
+def run(spec, name, num_tiles, inputs, results, totals):
+    """Run a kernel on numpy arrays; return results and totals."""
+    queue, flags = _queue(), cl.mem_flags
+    buffers = [
+        cl.Buffer(queue.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=array if array.size else np.zeros(1))
+        for array in (*inputs, *results, *totals)
+    ]
+    threads = num_threads(spec.tile_size)
+    blocks = num_tiles * num_parts(spec.tile_size)
+    getattr(_program(spec), name)(queue, (blocks * threads,), (threads,), *buffers)
+    found = [np.array(array) for array in (*results, *totals)]
+    for array, buffer in zip(found, buffers[len(inputs) :], strict=True):
+        if array.size:
+            cl.enqueue_copy(queue, array, buffer)
+    return found
+
+
+def launch(spec, name, num_tiles, inputs, results, totals=()):
+    """As `kernels.cuda.launch.launch`."""
+    shapes = [*results, *(jax.ShapeDtypeStruct(total.shape, total.dtype) for total in totals)]
+
+    def call(inputs, totals):
+        contiguous = lambda arrays: [np.ascontiguousarray(array) for array in arrays]  # noqa: E731
+        unset = [np.full(result.shape, np.nan, result.dtype) for result in results]
+        return run(spec, name, num_tiles, contiguous(inputs), unset, contiguous(totals))
+
+    return jax.pure_callback(call, shapes, list(inputs), list(totals), vmap_method="sequential")
