@@ -19,7 +19,7 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of_native
 from a2tg_jax.rasterize.kernels.native import composite as native
@@ -144,8 +144,8 @@ def check_background(background: Any) -> None:
 
 
 @functools.cache
-def _jitted_render():
-    return jit(render_traced, static_argnums=(4,))
+def _jitted_render() -> Jitted[..., tuple[RenderOutput, Array]]:
+    return Jitted(render_traced, static_argnums=(4,))
 
 
 def render_traced(
@@ -220,7 +220,9 @@ def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOu
     return _output(compositing, channels, transmittance, background, jnp.asarray(False))
 
 
-def _output(compositing: CompositingSettings, channels, transmittance, background, overflow) -> RenderOutput:
+def _output(
+    compositing: CompositingSettings, channels: Array, transmittance: Array, background: Array, overflow: Array
+) -> RenderOutput:
     color = jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
     if not compositing.has_geometry:
@@ -310,11 +312,13 @@ def pairs_of_view(
 
 
 @functools.cache
-def _jitted_count():
-    return jit(_count_pairs, static_argnums=(3, 4))
+def _jitted_count() -> Jitted[..., Array]:
+    return Jitted(_count_pairs, static_argnums=(3, 4))
 
 
-def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
+def _count_pairs(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
+) -> Array:
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
@@ -343,7 +347,7 @@ def with_capacity(
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
-def _primal_value(x):
+def _primal_value(x: Any) -> Any:
     """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
     while isinstance(x, jax.core.Tracer):
         try:
