@@ -27,7 +27,7 @@ def vary_with(inputs: Any, results: Any) -> Any:
 
 
 def cotangent_of(primal: Any, cotangent: Any) -> Any:
-    """Sum the cotangent of each pytree over the devices that share its primal value."""
+    """Sum a cotangent over the devices that share its primal value, leaf by leaf."""
 
     def total(value: Any, cotangent: Any) -> Any:
         shared = tuple(sorted(_axes(cotangent) - _axes(value)))
