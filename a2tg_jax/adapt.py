@@ -243,7 +243,8 @@ def select(
         return _select_fraction(statistic, can_grow, fraction)
     if budget_bytes is not None:
         return within_budget(statistic, can_grow, added_bytes, budget_bytes)
-    return can_grow & (statistic > threshold)
+    chosen: np.ndarray = can_grow & (statistic > threshold)
+    return chosen
 
 
 def reallocate(

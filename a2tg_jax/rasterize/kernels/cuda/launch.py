@@ -1,6 +1,6 @@
 """Launching a kernel from a traced program: the only place that knows how XLA does it.
 
-XLA's GPU backend launches PTX that a custom call carries. The kernel gets pointers to the operands, then to the results.
+XLA's GPU backend launches PTX that a custom call carries. A kernel gets pointers to the operands, then to the results.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from jax import Array
 
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
 from a2tg_jax.rasterize.kernels.cuda.source import num_parts, num_threads, source
-from a2tg_jax.rasterize.kernels.native.traced import KernelSpec
+from a2tg_jax.rasterize.kernels.traced import KernelSpec
 
 TARGET = "__gpu$xla.gpu.ptx"
 DEFAULT_CAPABILITY = "9.0"
@@ -48,7 +48,7 @@ def launch(
       The results, then the totals.
     """
     program = nvrtc.ptx(source(spec, "cuda"), capability())
-    shapes = [*results, *(jax.ShapeDtypeStruct(total.shape, total.dtype) for total in totals)]
+    shapes = [*results, *(jax.typeof(total) for total in totals)]
     # XLA passes operands before results: an aliased operand and its result are one buffer, passed twice.
     aliases = {len(inputs) + k: len(results) + k for k in range(len(totals))}
     call = jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=aliases, vmap_method="sequential")

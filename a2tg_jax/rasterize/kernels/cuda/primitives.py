@@ -38,7 +38,8 @@ def literal(value: Any, dtype: np.dtype[Any]) -> str:
 
 
 def _dtype(equation: Any, operand: int = 0) -> np.dtype[Any]:
-    return np.dtype(equation.invars[operand].aval.dtype)
+    dtype: np.dtype[Any] = np.dtype(equation.invars[operand].aval.dtype)
+    return dtype
 
 
 def _is_float(equation: Any) -> bool:
@@ -54,8 +55,13 @@ def _call(name: str) -> Emitter:
 
 
 def _extreme(symbol: str) -> Emitter:
-    """The larger or smaller of two; NaN if one is NaN."""
-    return lambda x, equation: f"({x[0]} {symbol} {x[1]}{' || ' + _is_nan(x[0]) if _is_float(equation) else ''}) ? {x[0]} : {x[1]}"
+    """Make an emitter of the larger or smaller of two numbers; NaN if one is NaN."""
+
+    def emit(x: list[str], equation: Any) -> str:
+        or_nan = f" || {_is_nan(x[0])}" if _is_float(equation) else ""
+        return f"({x[0]} {symbol} {x[1]}{or_nan}) ? {x[0]} : {x[1]}"
+
+    return emit
 
 
 def _is_nan(x: str) -> str:
@@ -100,7 +106,8 @@ def _c_type(equation: Any) -> str:
 def _shift(symbol: str) -> Emitter:
     def emit(x: list[str], equation: Any) -> str:
         dtype = _dtype(equation)
-        width, signed, unsigned = dtype.itemsize * 8, C_TYPES[f"int{dtype.itemsize * 8}"], C_TYPES[f"uint{dtype.itemsize * 8}"]
+        width = dtype.itemsize * 8
+        signed, unsigned = C_TYPES[f"int{width}"], C_TYPES[f"uint{width}"]
         amount = f"({unsigned}){x[1]}"
         if symbol == "arithmetic":
             return f"({signed}){x[0]} >> ({amount} < {width} ? {amount} : {width - 1})"

@@ -4,30 +4,25 @@ A function of scalars is traced once to a jaxpr; what it computes, and its deriv
 arrays become one variable per entry. Each thread has its own branch: `cond` becomes `if`, `while` becomes `while`.
 """
 
-from collections.abc import Sequence
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from jax.extend import core
+from jax.typing import DTypeLike
 
 from a2tg_jax.rasterize.kernels.cuda.primitives import C_TYPES, PRIMITIVES, literal
-from a2tg_jax.rasterize.kernels.native.control_flow import (
-    CALLS,
-    MOST_ENTRIES,
-    STRUCTURE,
-    _scan_sizes,
+from a2tg_jax.rasterize.kernels.jaxprs import (
+    Equation,
+    Evaluator,
+    Untranslatable,
     array_of,
     entries,
     map_entries,
+    result_of,
 )
-from a2tg_jax.rasterize.kernels.native.vectors import Untranslatable
-
-SHAPES = ("broadcast_in_dim", "concatenate", "optimization_barrier", "reshape", "rev", "slice", "stack", "squeeze", "transpose")
-"""Primitives that move entries of arrays about."""
-REDUCTIONS = {
-    **{"reduce_and": "and", "reduce_or": "or", "reduce_max": "max", "reduce_min": "min"},
-    **{"reduce_prod": "mul", "reduce_sum": "add"},
-}
 
 
 class Argument:
@@ -75,135 +70,79 @@ def c_function(name: str, closed: core.ClosedJaxpr, inputs: Sequence[Argument], 
     return f"INLINE void {name}({parameters}) {{\n{body}\n}}\n"
 
 
-class _Printer:
-    """Lines of C that evaluate jaxprs."""
+class _Printer(Evaluator):
+    """Lines of C that evaluate jaxprs; a value is the name of a variable, or a literal."""
+
+    target = "GPU kernels"
 
     def __init__(self) -> None:
         self.lines: list[str] = []
-        self._count = 0
         self._types: dict[str, str] = {}
-
-    def run(self, jaxpr: Any, arguments: Sequence[Any]) -> list[Any]:
-        """Print a jaxpr, closed or without constants; return names of its results."""
-        consts = getattr(jaxpr, "consts", ())
-        jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
-        values: dict[core.Var, Any] = {}
-
-        def read(atom: Any) -> Any:
-            return _constant(atom.val, atom.aval) if isinstance(atom, core.Literal) else values[atom]
-
-        for variable, value in zip(jaxpr.constvars, consts, strict=True):
-            values[variable] = _constant(value, variable.aval)
-        values.update(zip(jaxpr.invars, arguments, strict=True))
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(atom) for atom in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+        """C type of each variable and literal."""
 
     def variable(self, dtype: Any, value: str | None = None) -> str:
         """Declare a variable; return its name."""
-        name = f"v{self._count}"
-        self._count += 1
-        self._types[name] = _c_type(dtype)
-        self.lines.append(f"{self._types[name]} {name}{'' if value is None else f' = {value}'};")
+        return self._declare(_c_type(dtype), "" if value is None else f" = {value}")
+
+    def _declare(self, c_type: str, value: str) -> str:
+        name = f"v{len(self._types)}"
+        self._types[name] = c_type
+        self.lines.append(f"{c_type} {name}{value};")
         return name
 
-    def _equation(self, equation: Any, operands: list[Any]) -> list[Any]:
-        name = equation.primitive.name
-        if name in CALLS:
-            params = equation.params
-            return self.run(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], operands)
-        if name in SHAPES:
-            return STRUCTURE[name](None, operands, equation)  # type: ignore[arg-type]
-        if name in REDUCTIONS:
-            return [self._reduction(REDUCTIONS[name], operands[0], equation)]
-        if name in ("cond", "while", "scan"):
-            return getattr(self, f"_{name}")(operands, equation)
+    def literal(self, number: Any, dtype: DTypeLike) -> str:
+        text = literal(number, np.dtype(dtype))
+        self._types[text] = _c_type(dtype)
+        return text
+
+    def check_dtype(self, dtype: DTypeLike) -> None:
+        _c_type(dtype)
+
+    def primitive(self, name: str) -> Callable[[list[str], Equation], str] | None:
         if name not in PRIMITIVES:
-            raise Untranslatable(f"GPU kernels have no translation for the primitive '{name}'")
-        return [map_entries(lambda numbers: self._one(name, numbers, equation), operands)]
+            return None
+        return lambda operands, equation: self.variable(result_of(equation).dtype, PRIMITIVES[name](operands, equation))
 
-    def _one(self, name: str, operands: list[str], equation: Any) -> str:
-        return self.variable(equation.outvars[0].aval.dtype, PRIMITIVES[name](operands, equation))
-
-    def _reduction(self, name: str, array: np.ndarray, equation: Any) -> Any:
-        axes, aval = equation.params["axes"], equation.outvars[0].aval
-        kept = np.moveaxis(array, axes, range(len(axes)))
-        columns = kept.reshape(int(np.prod(kept.shape[: len(axes)])), -1).T
-        totals = []
-        for column in columns:
-            # As XLA does, which shows if all that is summed is −0.
-            total, *rest = [literal(0, np.dtype(aval.dtype)), *column] if name == "add" else column
-            for number in rest:
-                total = self._one(name, [total, number], equation)
-            totals.append(total)
-        return array_of(totals, aval.shape)
-
-    def _cond(self, operands: list[Any], equation: Any) -> list[Any]:
-        index, *operands = operands
-        results, branches = self._rooms(equation.outvars), equation.params["branches"]
+    def branches(self, index: Any, branches: Sequence[Any], operands: list[Any], equation: Equation) -> list[Any]:
+        avals = [result_of(equation, k) for k in range(len(equation.outvars))]
+        results = [array_of([self.variable(a.dtype) for _ in range(math.prod(a.shape))], a.shape) for a in avals]
         for k, branch in enumerate(branches):
             symbol = "<=" if k == 0 else (">=" if k == len(branches) - 1 else "==")
-            self.lines.append(f"if ({index} {symbol} {k}) {{")
-            self._store(results, self.run(branch, operands))
-            self.lines.append("}")
+            with self._block(f"if ({index} {symbol} {k})"):
+                self._assign(results, self.run(branch, operands))
         return results
 
-    def _while(self, operands: list[Any], equation: Any) -> list[Any]:
-        params = equation.params
-        num_cond, num_body = params["cond_nconsts"], params["body_nconsts"]
-        cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
-        carry = self._rooms(equation.outvars)
-        self._store(carry, operands[num_cond + num_body :])
-        self.lines.append("while (1) {")
-        (goes_on,) = self.run(params["cond_jaxpr"], [*cond_consts, *carry])
-        self.lines.append(f"if (!{goes_on}) break;")
-        self._store(carry, self.run(params["body_jaxpr"], [*body_consts, *carry]))
+    def loop(
+        self, carry: list[Any], test: Callable[[list[Any]], str], step: Callable[[list[Any]], list[Any]]
+    ) -> list[Any]:
+        rooms = self._copies(carry)
+        with self._block("while (1)"):
+            self.lines.append(f"if (!{test(rooms)}) break;")
+            self._assign(rooms, step(rooms))
+        return rooms
+
+    def counted(self, length: int, carry: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
+        rooms, count = self._copies(carry), self.variable(np.int32, "0")
+        with self._block(f"for (; {count} < {length}; {count}++)"):
+            self._assign(rooms, step(rooms))
+        return rooms
+
+    @contextlib.contextmanager
+    def _block(self, head: str) -> Iterator[None]:
+        self.lines.append(f"{head} {{")
+        yield
         self.lines.append("}")
-        return carry
 
-    def _scan(self, operands: list[Any], equation: Any) -> list[Any]:
-        """A loop; unrolled if it reads or writes arrays."""
-        params, length = equation.params, equation.params["length"]
-        num_consts, num_carry = _scan_sizes(params)
-        consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
-        arrays, written_to = operands[num_consts + num_carry :], equation.outvars[num_carry:]
-        if not arrays and not written_to:
-            rooms, count = self._rooms(equation.outvars), f"i{self._count}"
-            self._count += 1
-            self._store(rooms, carry)
-            self.lines.append(f"for (int {count} = 0; {count} < {length}; {count}++) {{")
-            self._store(rooms, self.run(params["jaxpr"], [*consts, *rooms]))
-            self.lines.append("}")
-            return rooms
-        if length > MOST_ENTRIES:
-            raise Untranslatable(f"GPU kernels unroll a scan over arrays for {MOST_ENTRIES} steps at most; got {length}")
-        written: list[Any] = [None] * length
-        for step in reversed(range(length)) if params["reverse"] else range(length):
-            results = self.run(params["jaxpr"], [*consts, *carry, *(array[step] for array in arrays)])
-            carry, written[step] = results[:num_carry], results[num_carry:]
-        stacked = [
-            array_of([entry for row in written for entry in entries(row[k])], variable.aval.shape)
-            for k, variable in enumerate(written_to)
-        ]
-        return [*carry, *stacked]
-
-    def _rooms(self, variables: Sequence[Any]) -> list[Any]:
-        """Declare a variable for each entry of some results."""
-        return [
-            array_of([self.variable(v.aval.dtype) for _ in range(int(np.prod(v.aval.shape)))], v.aval.shape)
-            for v in variables
-        ]
-
-    def _store(self, rooms: Sequence[Any], values: Sequence[Any]) -> None:
-        """Assign values to declared variables; through copies, for a value may be one of the variables."""
+    def _assign(self, rooms: Sequence[Any], values: Sequence[Any]) -> None:
+        """Assign values to declared variables. Copies come first, for a value may be one of the variables."""
         names = [entry for room in rooms for entry in entries(room)]
-        numbers = [entry for value in values for entry in entries(value)]
-        copies = [f"c{self._count}_{k}" for k in range(len(names))]
-        self._count += 1
-        for name, number, copy in zip(names, numbers, copies, strict=True):
-            self.lines.append(f"const {self._types[name]} {copy} = {number};")
+        copies = [entry for value in self._copies(values) for entry in entries(value)]
         self.lines += [f"{name} = {copy};" for name, copy in zip(names, copies, strict=True)]
+
+    def _copies(self, values: Sequence[Any]) -> list[Any]:
+        """Declare a variable for each entry of some values, and set it to the entry."""
+        copy = lambda x: self._declare(self._types[x[0]], f" = {x[0]}")  # noqa: E731
+        return [map_entries(copy, [value]) for value in values]
 
 
 def _c_type(dtype: Any) -> str:

@@ -4,14 +4,13 @@ import functools
 from importlib import resources
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Corner, TextureRegion
 from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
-from a2tg_jax.rasterize.kernels.native.traced import Functions, KernelSpec
-from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.traced import Functions, KernelSpec
+from a2tg_jax.rasterize.kernels.tracing import example, trace
 
 Dialect = Literal["cuda", "opencl"]
 MOST_THREADS = 256
@@ -101,8 +100,8 @@ def _pixel_functions(spec: KernelSpec, functions: Functions) -> list[str]:
 
 
 def _texture_functions(spec: KernelSpec, region: Argument, position: Argument) -> list[str]:
-    number: Any = jax.ShapeDtypeStruct((), spec.dtype)
-    place: Any = TextureRegion(*[jax.ShapeDtypeStruct((), jnp.int32)] * 3)
+    number, integer = example(spec.dtype), example(jnp.int32)
+    place = TextureRegion(integer, integer, integer)
     empty = spec.rule.rule.empty
 
     def corners(region: TextureRegion, x: Any, y: Any) -> Any:
