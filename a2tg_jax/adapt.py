@@ -24,10 +24,8 @@ from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Shape,
 
 PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
-"""Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and what short stages need, where
-that would leave the statistic no time to settle."""
-
-
+"""Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and a longer one for short stages, in
+which the statistic needs more time to settle."""
 USUAL_SHARE = 0.25
 """Default share of the Gaussians that grow, for forecasts."""
 

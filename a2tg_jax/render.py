@@ -43,9 +43,9 @@ class RenderSettings:
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read when Gaussians and textures are given apart (`render_image`, `plan_render`, `evaluate`).
+    """Texture options for Gaussians and textures given apart (`render_image`, `plan_render`, `evaluate`).
 
-    A `Model` and a rule have options of their own, which win: this field is then not used."""
+    A `Model` and a rule have their own options; this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
     compositor: Literal["auto", "cuda", "native", "xla"] = "auto"
