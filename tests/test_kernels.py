@@ -143,6 +143,7 @@ def test_a_rule_without_translation_is_left_to_xla():
         show(compositor="native")
 
 
+@pytest.mark.usefixtures("gpu_kernels")
 @pytest.mark.parametrize(
     ("has_textures", "statistic"), [(False, "position"), (True, "position"), (False, "screen"), (False, "center")]
 )

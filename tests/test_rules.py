@@ -199,6 +199,7 @@ def test_every_leaf_against_differences(name, compositor):
         assert_gradients_close(gradient, differences(getattr(scene, leaf), moved), leaf)
 
 
+@pytest.mark.usefixtures("gpu_kernels")
 @pytest.mark.parametrize("name", ["glossy", "movable kernels", "billboards"])
 def test_gpu_kernels_are_those_of_xla(name):
     # In this scene no splat is seen so edge-on that the rule's v² would leave float32 three digits.
