@@ -19,9 +19,9 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.core.jit import jit
-from a2tg_jax.rasterize.compositor import composite
-from a2tg_jax.rasterize.kernels.choice import choose, instead_of_native
+from a2tg_jax.core.jit import Jitted
+from a2tg_jax.rasterize.compositor import composite, refusal
+from a2tg_jax.rasterize.kernels.choice import choose, instead_of
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, project_gaussians
@@ -43,14 +43,14 @@ class RenderSettings:
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read when Gaussians and textures are given apart (`render_image`, `plan_render`, `evaluate`).
+    """Texture options for Gaussians and textures given apart (`render_image`, `plan_render`, `evaluate`).
 
-    A `Model` and a rule have options of their own, which win: this field is then not used."""
+    A `Model` and a rule have their own options; this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
-    compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
-    """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
-    and XLA with a warning if native loops do not support the appearance rule."""
+    compositor: Literal["auto", "cuda", "native", "xla"] = "auto"
+    """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
+    and XLA with a warning if the others do not support the appearance rule."""
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
 
@@ -144,8 +144,8 @@ def check_background(background: Any) -> None:
 
 
 @functools.cache
-def _jitted_render():
-    return jit(render_traced, static_argnums=(4,))
+def _jitted_render() -> Jitted[..., tuple[RenderOutput, Array]]:
+    return Jitted(render_traced, static_argnums=(4,))
 
 
 def render_traced(
@@ -181,8 +181,9 @@ def render_traced(
         return _empty_view(compositing, background), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
-    if compositor == "native" and (reason := native.refusal(compositing, rule, splats)):
-        settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
+    if reason := refusal(compositing, rule, splats):
+        instead = instead_of(compositor, settings.compositor, type(rule), reason)
+        settings = dataclasses.replace(settings, compositor=instead)
         return render_traced(
             gaussians, camera, rule, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
@@ -220,7 +221,9 @@ def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOu
     return _output(compositing, channels, transmittance, background, jnp.asarray(False))
 
 
-def _output(compositing: CompositingSettings, channels, transmittance, background, overflow) -> RenderOutput:
+def _output(
+    compositing: CompositingSettings, channels: Array, transmittance: Array, background: Array, overflow: Array
+) -> RenderOutput:
     color = jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
     if not compositing.has_geometry:
@@ -310,11 +313,13 @@ def pairs_of_view(
 
 
 @functools.cache
-def _jitted_count():
-    return jit(_count_pairs, static_argnums=(3, 4))
+def _jitted_count() -> Jitted[..., Array]:
+    return Jitted(_count_pairs, static_argnums=(3, 4))
 
 
-def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
+def _count_pairs(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
+) -> Array:
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
@@ -343,7 +348,7 @@ def with_capacity(
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
-def _primal_value(x):
+def _primal_value(x: Any) -> Any:
     """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
     while isinstance(x, jax.core.Tracer):
         try:

@@ -38,3 +38,23 @@ def shared():
     if not SHARED.is_dir():
         pytest.skip(f"real scenes and LPIPS weights are not at {SHARED}")
     return SHARED
+
+
+@pytest.fixture
+def gpu_kernels(monkeypatch):
+    """Runs the GPU kernels on the CPU, as OpenCL."""
+    import opencl
+
+    from a2tg_jax.rasterize.kernels import choice
+    from a2tg_jax.rasterize.kernels.cuda import composite
+
+    opencl.queue()
+    monkeypatch.setattr(choice, "has_cuda", lambda: True)
+    monkeypatch.setattr(composite, "launch", opencl.launch)
+
+
+@pytest.fixture(autouse=True)
+def kernels_of_the_compositor(request):
+    """The kernels that a test's parameter `compositor` asks for."""
+    if getattr(request.node, "callspec", None) and request.node.callspec.params.get("compositor") == "cuda":
+        request.getfixturevalue("gpu_kernels")

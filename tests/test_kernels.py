@@ -143,10 +143,11 @@ def test_a_rule_without_translation_is_left_to_xla():
         show(compositor="native")
 
 
+@pytest.mark.usefixtures("gpu_kernels")
 @pytest.mark.parametrize(
     ("has_textures", "statistic"), [(False, "position"), (True, "position"), (False, "screen"), (False, "center")]
 )
-def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
+def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
     """Interpreted, on a small scene: the image, the gradient, and a statistic."""
     scene = draw_scene(4, num=16, width=19, height=13)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
@@ -161,7 +162,7 @@ def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)
     inputs = gaussians, textures, jnp.zeros((gaussians.num, 4))
     (_, expected), wanted = differentiate(*inputs, "xla")
-    (_, output), found = differentiate(*inputs, "pallas")
+    (_, output), found = differentiate(*inputs, "cuda")
     assert expected.alpha.max() > 0.5 and wanted[2][:, 3].max() > 10
     for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
@@ -169,7 +170,7 @@ def test_pallas_kernels_are_those_of_xla(has_textures, statistic):
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("options", [TextureOptions(), TextureOptions("align-corners", "identity", "unit")])
-@pytest.mark.parametrize("compositor", ["native", "xla", "pallas"])
+@pytest.mark.parametrize("compositor", ["native", "xla", "cuda"])
 def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
     """As one with a texel that changes nothing: the oracle's image, and the same gradients of all else."""
     scene = draw_scene(4, num=16, width=19, height=13)
@@ -249,7 +250,7 @@ def test_a_rule_defined_anew_is_compiled_anew():
     [
         ({"compositor": "XLA"}, "got 'XLA'"),
         ({"tile_size": 65}, "1..64"),
-        ({"compositor": "pallas", "tile_size": 12}, "power"),
+        ({"compositor": "cuda"}, "NVIDIA GPU and NVRTC"),
     ],
 )
 def test_compositors_that_cannot_be_are_refused(settings, words):

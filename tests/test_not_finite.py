@@ -11,7 +11,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 from a2tg_jax import RenderSettings, render_image
 from a2tg_jax.render import render_traced, rule_of
 
-COMPOSITORS = ("native", "xla", "pallas")
+COMPOSITORS = ("native", "xla", "cuda")
 SCENE = draw_scene(4, num=16, width=19, height=13)
 VISIBLE = 1
 """A splat of the scene that shows."""

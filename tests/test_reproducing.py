@@ -41,17 +41,17 @@ def test_what_ran_before_in_the_process_changes_nothing():
 @pytest.mark.parametrize(
     ("flags", "compositor"),
     [
-        ("", "pallas"),
+        ("", "cuda"),
         ("--xla_gpu_deterministic_ops=true", "xla"),
         ("--xla_dump_to=x --xla_gpu_exclude_nondeterministic_ops", "xla"),
-        ("--xla_gpu_deterministic_ops=true --xla_gpu_deterministic_ops=false", "pallas"),
+        ("--xla_gpu_deterministic_ops=true --xla_gpu_deterministic_ops=false", "cuda"),
     ],
 )
 def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministic(monkeypatch, flags, compositor):
     monkeypatch.setattr(choice, "has_native", lambda: False)
-    monkeypatch.setattr(choice, "has_pallas", lambda: True)
+    monkeypatch.setattr(choice, "has_cuda", lambda: True)
     monkeypatch.setenv("XLA_FLAGS", flags)
-    assert choice.choose("auto", 8) == compositor and choice.choose("pallas", 8) == "pallas"
+    assert choice.choose("auto", 8) == compositor and choice.choose("cuda", 8) == "cuda"
 
 
 def test_what_may_change_bits_is_told():

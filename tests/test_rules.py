@@ -199,8 +199,9 @@ def test_every_leaf_against_differences(name, compositor):
         assert_gradients_close(gradient, differences(getattr(scene, leaf), moved), leaf)
 
 
+@pytest.mark.usefixtures("gpu_kernels")
 @pytest.mark.parametrize("name", ["glossy", "movable kernels", "billboards"])
-def test_pallas_kernels_are_those_of_xla(name):
+def test_gpu_kernels_are_those_of_xla(name):
     # In this scene no splat is seen so edge-on that the rule's v² would leave float32 three digits.
     case, scene = CASES[name], draw_scene(1, num=16, width=19, height=13)
 
@@ -211,7 +212,7 @@ def test_pallas_kernels_are_those_of_xla(name):
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
     inputs = case.params(16, "float32"), as_gaussians(scene, "float32")
-    wanted, found = (jax.tree.leaves(differentiate(*inputs, compositor)) for compositor in ("xla", "pallas"))
+    wanted, found = (jax.tree.leaves(differentiate(*inputs, compositor)) for compositor in ("xla", "cuda"))
     for a, b in zip(wanted, found, strict=True):
         assert np.isfinite(a).all()
         np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
@@ -252,7 +253,7 @@ class TintedRule(PlainRule):
         return (u * self.tints,) * 3, None
 
 
-@pytest.mark.parametrize("compositor", ["native", "xla", "pallas"])
+@pytest.mark.parametrize("compositor", ["native", "xla", "cuda"])
 def test_arrays_in_elementwise_functions_are_refused(compositor):
     scene = draw_scene(4, num=3, width=8, height=8)
     with pytest.raises(ValueError, match=r"TintedRule\.tints is an array.*numbers\(\)"):

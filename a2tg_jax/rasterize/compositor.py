@@ -1,6 +1,6 @@
 """Front-to-back compositing of tiles, given any appearance rule, with an exact gradient in constant memory.
 
-`pixel` defines one pixel. A module of `kernels` computes all of them: `native` on CPUs, `pallas` on GPUs, or `xla`.
+`pixel` defines one pixel. A module of `kernels` computes all: `native` on CPUs, `cuda` on NVIDIA GPUs, or `xla`.
 Each has a `forward` and a `backward` with the same arguments and results.
 
 The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
@@ -8,12 +8,14 @@ The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so tha
 
 import functools
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, StaticRule
+from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
 from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
@@ -40,23 +42,40 @@ def composite(
     return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
 
 
+def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats) -> str | None:
+    """Return why the compositor of the settings cannot run a rule; None if it can."""
+    reason: str | None = _kernels(settings.compositor).refusal(settings, rule, splats)
+    return reason
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _composite_tiles(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
+def _composite_tiles(
+    settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group, P pixels a tile."""
-    return _kernels(settings.compositor).forward(settings, rule, splats, texels, regions, cutoff, lists)
+    shown: tuple[Array, Array] = _kernels(settings.compositor).forward(
+        settings, rule, splats, texels, regions, cutoff, lists
+    )
+    return shown
 
 
-def _composite_tiles_fwd(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
+def _composite_tiles_fwd(
+    settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
+) -> tuple[tuple[Array, Array], tuple[Any, ...]]:  # fmt: skip
     shown = _kernels(settings.compositor).forward(settings, rule, splats, texels, regions, cutoff, lists)
     return shown, (splats, texels, regions, cutoff, lists, jacobian, probe, *shown)
 
 
-def _composite_tiles_bwd(settings, rule, residuals, cotangents):
+def _composite_tiles_bwd(
+    settings: CompositingSettings, rule: StaticRule, residuals: tuple[Any, ...], cotangents: tuple[Array, Array]
+) -> tuple[Splats, Array, None, None, None, None, Array]:
     *arrays, channels, transmittance = residuals
     g, g_transmittance = cotangents
     suffix_sum = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
-    cotangents = _kernels(settings.compositor).backward(settings, rule, *arrays, g, suffix_sum)
-    d_splats, d_texels, d_probe = cotangent_of((arrays[0], arrays[1], arrays[-1]), cotangents)
+    found = _kernels(settings.compositor).backward(settings, rule, *arrays, g, suffix_sum)
+    d_splats, d_texels, d_probe = cotangent_of((arrays[0], arrays[1], arrays[-1]), found)
     return d_splats, d_texels, None, None, None, None, d_probe
 
 
@@ -64,15 +83,15 @@ _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
 def _kernels(compositor: Compositor) -> ModuleType:
-    """Return the compositing module, imported on first use, for Pallas changes JAX's settings on import."""
+    """Return the compositing module, imported on first use."""
     if compositor == "native":
         from a2tg_jax.rasterize.kernels.native import composite as native
 
         return native
-    if compositor == "pallas":
-        from a2tg_jax.rasterize.kernels import pallas
+    if compositor == "cuda":
+        from a2tg_jax.rasterize.kernels.cuda import composite as cuda
 
-        return pallas
+        return cuda
     from a2tg_jax.rasterize.kernels import xla
 
     return xla

@@ -17,8 +17,8 @@ from a2tg_jax.core.geometry import homographies
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid
 
-Compositor = Literal["native", "pallas", "xla"]
-"""Native loops (CPUs), Pallas kernels (GPUs) or XLA (everywhere)."""
+Compositor = Literal["cuda", "native", "xla"]
+"""Native loops (CPUs), CUDA kernels (NVIDIA GPUs) or XLA (everywhere)."""
 
 
 class Splats(NamedTuple):
@@ -48,7 +48,7 @@ class CompositingSettings(NamedTuple):
     statistic: Statistic | None
     """Statistic that densification reads from the backward pass, if any."""
     compositor: Compositor
-    """Native loops, Pallas kernels, or XLA."""
+    """Native loops, CUDA kernels, or XLA."""
     tile_batch: int
     """Number of tiles that XLA composites at once; 1 with the others."""
 

@@ -1,51 +1,58 @@
-"""Which compositor runs where."""
+"""Choice of the compositor."""
 
 import functools
 import importlib.util
 import os
 import warnings
-from types import ModuleType
+from collections.abc import Callable
 from typing import Literal
 
 import jax
 
-# It registers configuration that belongs to every trace's key: imported during the first trace (by `lanes`, on use), it
-# would have JAX trace and compile all of it a second time.
+# It registers configuration that belongs to every trace's key. `tracing` imports it on first use; if that were during
+# the first trace, JAX would trace and compile all of it a second time.
 import jax.extend.core
 
 from a2tg_jax.rasterize.splats import Compositor
 
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 MAX_TILE_SIZE = 64
-"""Native loops keep a tile on the stack."""
+"""Largest side of a tile in pixels; native loops keep a tile on the stack."""
+IS_COMPILED_AHEAD = False
+"""Set to compile for a GPU on a machine without one."""
+
+Wanted = Literal["auto", "cuda", "native", "xla"]
+REMEDIES = {
+    "cuda": "JAX on an NVIDIA GPU and NVRTC: pip install 'a2tg-jax[cuda13]'",
+    "native": "JAX on the CPU and llvmlite: pip install llvmlite",
+}
 
 
-def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -> Compositor:
-    """The compositor that is wanted, or with "auto" the fastest that JAX's default backend can run.
+def choose(wanted: Wanted, tile_size: int) -> Compositor:
+    """Return the compositor that is wanted, or with "auto" the fastest one for JAX's default backend.
 
     Raises:
       ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
     """
-    if wanted not in ("auto", "native", "pallas", "xla"):
-        raise ValueError(f"compositor must be 'auto', 'native', 'pallas' or 'xla'; got {wanted!r}")
+    if wanted not in ("auto", "cuda", "native", "xla"):
+        raise ValueError(f"compositor must be 'auto', 'cuda', 'native' or 'xla'; got {wanted!r}")
     if not 1 <= tile_size <= MAX_TILE_SIZE:
         raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
-    is_power_of_two = tile_size & (tile_size - 1) == 0
-    if wanted == "pallas" and not is_power_of_two:
-        raise ValueError(f"compositor='pallas' needs a tile_size that is a power of two; got {tile_size}")
-    if wanted == "native" and not has_native():
-        raise ValueError("compositor='native' needs JAX on the CPU and llvmlite: pip install llvmlite, or say 'auto'")
+    is_available: dict[str, Callable[[], bool]] = {"cuda": has_cuda, "native": has_native, "xla": lambda: True}
+    if wanted != "auto" and not is_available[wanted]():
+        raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or say 'auto'")
     if wanted != "auto":
         return wanted
     if has_native():
         return "native"
-    is_for_pallas = is_power_of_two and has_pallas() and not wants_determinism()
-    return "pallas" if is_for_pallas else "xla"
+    return "cuda" if has_cuda() and not wants_determinism() else "xla"
 
 
 def wants_determinism() -> bool:
-    """Whether the environment's XLA_FLAGS ask for a GPU that computes the same twice: Pallas' kernels do not, for they
-    add atomically."""
+    """Return whether XLA_FLAGS in the environment ask for reproducible results on GPUs.
+
+    The CUDA kernels add atomically, so that their results are not.
+    """
     asked = dict.fromkeys(DETERMINISM_FLAGS, False)
     for word in os.environ.get("XLA_FLAGS", "").split():
         flag, _, value = word.partition("=")
@@ -54,14 +61,14 @@ def wants_determinism() -> bool:
     return any(asked.values())
 
 
-def instead_of_native(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
-    """The compositor for a rule that native loops cannot run: XLA, with one warning per rule.
+def instead_of(compositor: Compositor, wanted: Wanted, rule: type, reason: str) -> Compositor:
+    """Return the compositor for a rule that kernels cannot run: XLA, with one warning per rule.
 
     Raises:
-      ValueError: if native loops were asked for.
+      ValueError: if the kernels are required.
     """
     if wanted != "auto":
-        raise ValueError(f"compositor='native' cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
+        raise ValueError(f"compositor={compositor!r} cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
     _warn_of_fallback(rule, reason)
     return "xla"
 
@@ -73,8 +80,8 @@ def _warn_of_fallback(rule: type, reason: str) -> None:
 
 @functools.cache
 def has_native() -> bool:
-    """Whether native loops can be made here: XLA runs on the CPU, and llvmlite is installed."""
-    return jax.default_backend() == "cpu" and _is_installed("llvmlite")
+    """Return whether native loops are available: XLA runs on the CPU, and llvmlite is installed."""
+    return jax.default_backend() == "cpu" and _is_installed("llvmlite") and not IS_COMPILED_AHEAD
 
 
 def _is_installed(name: str) -> bool:
@@ -85,23 +92,14 @@ def _is_installed(name: str) -> bool:
 
 
 @functools.cache
-def has_pallas() -> bool:
-    """Whether Pallas kernels can be compiled here: XLA runs on a GPU, and JAX still has the Triton backend."""
-    if jax.default_backend() != "gpu":
+def has_cuda() -> bool:
+    """Return whether CUDA kernels are available: XLA runs on an NVIDIA GPU, and NVRTC is installed."""
+    from a2tg_jax.rasterize.kernels.cuda import nvrtc
+
+    is_nvidia = jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version.lower()
+    if not is_nvidia and not IS_COMPILED_AHEAD:
         return False
-    if triton() is None:
-        warnings.warn(
-            "this JAX has no Triton backend of Pallas: compositing falls back to XLA, which is slower", stacklevel=2
-        )
+    if nvrtc.find() is None:
+        warnings.warn(f"compositing by XLA, which is slower: CUDA kernels need {REMEDIES['cuda']}", stacklevel=2)
         return False
     return True
-
-
-@functools.cache
-def triton() -> ModuleType | None:
-    """Pallas on Triton, or None where JAX has dropped it."""
-    try:
-        from jax.experimental.pallas import triton as module
-    except ImportError:
-        return None
-    return module if hasattr(module, "CompilerParams") else None

@@ -1,26 +1,37 @@
-"""The splats and their texture regions as plain arrays, as kernels read them; and their cotangents back again."""
+"""Splats and their texture regions as plain arrays for kernels, and cotangents back from such arrays."""
 
 import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.rasterize.splats import Splats
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.tiles import TileLists
+
+
+def pack_inputs(
+    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None, cutoff: Array,
+    lists: TileLists,
+) -> tuple[Array, ...]:  # fmt: skip
+    """Pack what kernels read: ids, starts, splats with the cutoff, regions, texels, and (columns, width, height)."""
+    packed = pack_splats(splats, settings.has_geometry, cutoff).astype(splats.M.dtype)
+    size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
+    return lists.ids, lists.starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size
 
 
 def num_numbers(has_geometry: bool) -> int:
-    """Numbers of every splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
+    """Return the numbers per splat: the 9 entries of M, opacity, colour, and with geometry the normal."""
     return 16 if has_geometry else 13
 
 
 def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
-    """[N, S] with one splat a row, in the order of `rasterize.pixel.Splat`, and further columns [N] after it."""
+    """Pack splats as [N, S], one per row in the order of `rasterize.pixel.Splat`, followed by further columns [N]."""
     columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
     columns += [splats.normals] if has_geometry else []
     return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
 
 
 def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
-    """Cotangents [N, S] as those of splats."""
+    """Unpack cotangents [N, S] as those of splats."""
     first = num_numbers(has_geometry)
     return Splats(
         M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
@@ -31,8 +42,8 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
     )
 
 
-def pack_regions(regions: TextureRegion | None, least_columns: int = 0) -> Array:
-    """[N, 3] int32 `TextureRegion` of every splat; without textures there is one row of `least_columns`."""
+def pack_regions(regions: TextureRegion | None) -> Array:
+    """Pack the `TextureRegion` of every splat as int32 [N, 3]; without textures [1, 0]."""
     if regions is None:
-        return jnp.zeros((1, least_columns), jnp.int32)
+        return jnp.zeros((1, 0), jnp.int32)
     return jnp.stack(regions, axis=1).astype(jnp.int32)

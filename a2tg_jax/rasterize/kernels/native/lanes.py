@@ -1,74 +1,57 @@
 """Scalar JAX functions as LLVM code, one lane a pixel.
 
-A function of scalars is traced once to a jaxpr; each of its primitives becomes one LLVM instruction (or a few) on
-vectors of L lanes, or on plain scalars. What is computed, and its derivative, is thus said once, in JAX. The
-primitives are in `primitives` and `control_flow`; docs/compiler.md tells more.
+A function of scalars is traced once to a jaxpr. Each primitive becomes one or a few LLVM instructions on vectors of L
+lanes, or on plain scalars, so that a function and its derivative are defined only once, in JAX. The primitives are in
+`primitives` and `control_flow`; docs/compiler.md explains more.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 from jax.extend import core
+from jax.typing import DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.native import dump
-from a2tg_jax.rasterize.kernels.native.control_flow import STRUCTURE, array_of, map_entries
+from a2tg_jax.rasterize.kernels.jaxprs import Equation, Evaluator
+from a2tg_jax.rasterize.kernels.native import control_flow, dump
 from a2tg_jax.rasterize.kernels.native.primitives import PRIMITIVES
-from a2tg_jax.rasterize.kernels.native.vectors import (
-    BOOL,
-    FLAGS,
-    INT,
-    Translator,
-    Untranslatable,
-    scalar_of,
-    scalar_type,
-)
+from a2tg_jax.rasterize.kernels.native.vectors import BOOL, FLAGS, INT, Translator, scalar_of, scalar_type
 
-__all__ = ["BOOL", "FLAGS", "INT", "Lanes", "Untranslatable", "scalar_of", "scalar_type"]
+__all__ = ["BOOL", "FLAGS", "INT", "Lanes", "scalar_of", "scalar_type"]
 
 
-class Lanes(Translator):
-    """Emits jaxprs of scalars at a builder's position on vectors of `width` lanes; `width` 1 means plain scalars."""
+class Lanes(Evaluator, Translator):
+    """Translator of jaxprs at a builder's position, on vectors of `width` lanes; `width` 1 means plain scalars."""
+
+    target = "native loops"
 
     def emit(self, closed: core.ClosedJaxpr, arguments: Sequence[ir.Value]) -> list[ir.Value]:
-        """The values of a jaxpr of scalars, given one LLVM value per argument.
+        """Emit a jaxpr of scalars, given one LLVM value per argument; return its values.
 
         Raises:
-          Untranslatable: where a primitive or a dtype has no translation.
+          Untranslatable: if a primitive or a dtype has no translation.
         """
         if dump.is_wanted():
             dump.write(self.builder.function.name, "jaxpr", f"{closed}\n\n", append=True)
         return self.run(closed, arguments)
 
-    def run(self, jaxpr: Any, arguments: Sequence[Any]) -> list[Any]:
-        """The values of a jaxpr, closed or without constants; arrays are as in `control_flow`."""
-        consts = getattr(jaxpr, "consts", ())
-        jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
-        values: dict[core.Var, Any] = {}
+    def literal(self, number: Any, dtype: DTypeLike) -> ir.Constant:
+        return self.constant(number, scalar_type(dtype))
 
-        def read(atom: Any) -> Any:
-            return self._constant(atom.val, atom.aval) if isinstance(atom, core.Literal) else values[atom]
+    def check_dtype(self, dtype: DTypeLike) -> None:
+        scalar_type(dtype)
 
-        for variable, value in zip(jaxpr.constvars, consts, strict=True):
-            values[variable] = self._constant(value, variable.aval)
-        values.update(zip(jaxpr.invars, arguments, strict=True))
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(atom) for atom in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+    def primitive(self, name: str) -> Callable[[list[Any], Equation], Any] | None:
+        return functools.partial(PRIMITIVES[name], self) if name in PRIMITIVES else None
 
-    def _constant(self, value: Any, aval: Any) -> Any:
-        scalar = scalar_type(aval.dtype)
-        numbers = np.asarray(value).reshape(-1)
-        return array_of([self.constant(number, scalar) for number in numbers], aval.shape)
+    def branches(self, index: Any, branches: Sequence[Any], operands: list[Any], equation: Equation) -> list[Any]:
+        return control_flow.branches(self, index, branches, operands)
 
-    def _equation(self, equation, operands: list[Any]) -> list[Any]:
-        name = equation.primitive.name
-        for variable in equation.outvars:
-            scalar_type(variable.aval.dtype)
-        if name in STRUCTURE:
-            return STRUCTURE[name](self, operands, equation)
-        if name not in PRIMITIVES:
-            raise Untranslatable(f"native loops have no translation for the primitive '{name}'")
-        return [map_entries(lambda numbers: PRIMITIVES[name](self, numbers, equation), operands)]
+    def loop(
+        self, carry: list[Any], test: Callable[[list[Any]], Any], step: Callable[[list[Any]], list[Any]]
+    ) -> list[Any]:
+        return control_flow.loop(self, carry, test, step)
+
+    def counted(self, length: int, carry: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
+        return control_flow.counted(self, length, carry, step)

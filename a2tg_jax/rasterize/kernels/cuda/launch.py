@@ -1,0 +1,60 @@
+"""Launching a kernel from a traced program: the only place that knows how XLA does it.
+
+XLA's GPU backend launches PTX that a custom call carries. A kernel gets pointers to the operands, then to the results.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from a2tg_jax.rasterize.kernels.cuda import nvrtc
+from a2tg_jax.rasterize.kernels.cuda.source import num_parts, num_threads, source
+from a2tg_jax.rasterize.kernels.traced import KernelSpec
+
+TARGET = "__gpu$xla.gpu.ptx"
+DEFAULT_CAPABILITY = "9.0"
+"""Compute capability that is compiled for if there is no GPU."""
+
+
+def capability() -> str:
+    """Return the least compute capability of this process's GPUs."""
+    devices = [device for device in jax.local_devices() if device.platform == "gpu"] if _has_gpu() else []
+    found = [device.compute_capability for device in devices]
+    return min(found, key=lambda text: [int(part) for part in text.split(".")], default=DEFAULT_CAPABILITY)
+
+
+def _has_gpu() -> bool:
+    return jax.default_backend() == "gpu"
+
+
+def launch(
+    spec: KernelSpec, name: str, num_tiles: int, inputs: Sequence[Array], results: Sequence[Any],
+    totals: Sequence[Array] = (),
+) -> list[Array]:  # fmt: skip
+    """Run a kernel of `source.source` on a GPU.
+
+    Args:
+      spec: what the kernel is made for.
+      name: the kernel's name; its parameters are pointers to inputs, then to results or totals.
+      num_tiles: tiles of the image.
+      inputs: arrays that it reads.
+      results: shapes and dtypes of the arrays that it writes whole.
+      totals: arrays that it adds to.
+
+    Returns:
+      The results, then the totals.
+    """
+    program = nvrtc.ptx(source(spec, "cuda"), capability())
+    shapes = [*results, *(jax.typeof(total) for total in totals)]
+    # XLA passes operands before results: an aliased operand and its result are one buffer, passed twice.
+    aliases = {len(inputs) + k: len(results) + k for k in range(len(totals))}
+    call = jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=aliases, vmap_method="sequential")
+    attributes = {f"{kind}_{axis}": np.int32(1) for kind in ("grid", "block") for axis in "xyz"}
+    attributes["grid_x"] = np.int32(num_tiles * num_parts(spec.tile_size))
+    attributes["block_x"] = np.int32(num_threads(spec.tile_size))
+    attributes["shared_mem_bytes"] = np.int32(0)
+    found = call(*inputs, *totals, name=name, kernel_type="ptx", kernel_data=program, **attributes)
+    return list(found)

@@ -1,0 +1,128 @@
+"""Specification of kernels (`KernelSpec`), and the scalar functions that they apply, as jaxprs."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import StaticRule
+from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
+from a2tg_jax.rasterize import pixel
+from a2tg_jax.rasterize.kernels.packing import num_numbers
+from a2tg_jax.rasterize.kernels.tracing import example, trace
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+
+
+@dataclasses.dataclass(frozen=True)
+class KernelSpec:
+    """Specification for which a forward and a backward pass are compiled; hashable."""
+
+    rule: StaticRule
+    """Appearance rule."""
+    num_rule_numbers: int
+    """Number K of numbers per splat of the rule."""
+    num_columns: int
+    """Number C of numbers per texel; 0 without textures."""
+    dtype: str
+    """Dtype of all computations: "float32" or "float64"."""
+    tile_size: int
+    """Side of a tile in pixels."""
+    near_plane: float
+    """Least depth of visible hits."""
+    has_geometry: bool
+    """Whether depth, squared depth and normals are composited beside the colour."""
+    statistic: pixel.Statistic | None
+    """Statistic that the backward pass computes for densification, if any."""
+
+    @property
+    def num_channels(self) -> int:
+        return 8 if self.has_geometry else 3
+
+    @property
+    def num_floats(self) -> int:
+        """Number S of floats per splat: its numbers, and the squared distance beyond which it is invisible."""
+        return num_numbers(self.has_geometry) + self.num_rule_numbers + 1
+
+    @staticmethod
+    def of(
+        settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None
+    ) -> "KernelSpec":
+        """Return the specification for these inputs of a compositor."""
+        return KernelSpec(
+            rule=rule,
+            num_rule_numbers=splats.numbers.shape[1],
+            num_columns=0 if regions is None else texels.shape[1],
+            dtype=np.dtype(splats.M.dtype).name,
+            tile_size=settings.grid.tile_size,
+            near_plane=settings.near_plane,
+            has_geometry=settings.has_geometry,
+            statistic=settings.statistic,
+        )
+
+
+class Functions:
+    """Jaxprs of scalars for one spec.
+
+    `prepare` and `prepare_vjp` run once per splat and tile; `reach`, `forward` and `backward` run at every pixel.
+    """
+
+    def __init__(self, spec: KernelSpec):
+        self._spec, self._rule = spec, spec.rule.rule
+        number, integer, flag = example(spec.dtype), example(jnp.int32), example(jnp.bool_)
+        triple = (number,) * 3
+        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
+        splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
+        values = (number,) * spec.num_columns
+        region = TextureRegion(integer, integer, integer) if values else None
+        lookup = Lookup(region, Sample(values, values, values)) if region else None
+
+        self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
+        self.num_planes = structure.num_leaves
+        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
+        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, number, number, planes)
+        self.reach, _ = trace(self._reach, planes, region, number, number)
+        at_pixel, channels = (number, number, number, flag), (number,) * spec.num_channels
+        self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
+        of_backward = number, channels, (number, number), (triple,) * 3
+        self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
+
+    def _reach(
+        self, planes: pixel.Planes, region: TextureRegion | None, x: Array, y: Array
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Return the squared distance ρ of the pixel, and the position of the texture lookup."""
+        hit = pixel.intersect(planes, x, y, self._spec.near_plane, self._rule.has_low_pass)
+        return hit.rho, () if region is None else self._rule.texel_position(region, hit.u, hit.v)
+
+    def _forward(
+        self, planes: pixel.Planes, splat: pixel.Splat, values: tuple[Array, ...], x: Array, y: Array,
+        transmittance: Array, is_live: Array, channels: tuple[Array, ...],
+    ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
+        """Return transmittance and liveness behind the splat, and the channels with it."""
+        at_pixel = planes, splat, values, x, y, transmittance, is_live
+        added, transmittance, is_live = pixel.blend(self._rule, self._spec.near_plane, *at_pixel)
+        return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
+
+    def _backward(
+        self, planes: pixel.Planes, splat: pixel.Splat, lookup: Lookup | None, x: Array, y: Array,
+        transmittance: Array, is_live: Array, suffix_sum: Array, g: tuple[Array, ...], center: tuple[Array, Array],
+        jacobian: pixel.Rows,
+    ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
+        """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
+        spec, rule = self._spec, self._rule
+        at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
+        state, weight, d = pixel.blend_vjp(rule, spec.near_plane, *at_pixel, spec.statistic is not None)
+        added: tuple[Array, ...] = ()
+        if spec.statistic and d.rho is not None:
+            added = pixel.positional_gradient(
+                spec.statistic, splat.M, x, y, *center, d.rho, jacobian, spec.near_plane, rule.has_low_pass
+            )
+        return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
+
+
+def _planes_vjp(M: pixel.Rows, x: Array, y: Array, d_planes: pixel.Planes) -> pixel.Rows:
+    """Return the cotangent of M, given that of its planes."""
+    d_M: pixel.Rows = jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+    return d_M
