@@ -1,6 +1,7 @@
 """The GPU kernels on the CPU: the same text as OpenCL C, run by PoCL."""
 
 import functools
+import math
 
 import jax
 import numpy as np
@@ -55,11 +56,26 @@ def run(spec, name, num_tiles, inputs, results, totals):
 
 def launch(spec, name, num_tiles, inputs, results, totals=()):
     """As `kernels.cuda.launch.launch`."""
-    shapes = [*results, *(jax.ShapeDtypeStruct(total.shape, total.dtype) for total in totals)]
+    given, wanted = _kinds([*inputs, *totals]), _kinds([*results, *totals])
 
-    def call(inputs, totals):
-        contiguous = lambda arrays: [np.ascontiguousarray(array) for array in arrays]  # noqa: E731
-        unset = [np.full(result.shape, np.nan, result.dtype) for result in results]
-        return run(spec, name, num_tiles, contiguous(inputs), unset, contiguous(totals))
+    def call(bits):
+        arrays = [
+            np.ascontiguousarray(x).view(dtype).reshape(shape) for x, (shape, dtype) in zip(bits, given, strict=True)
+        ]
+        unset = [np.full(shape, np.nan, dtype) for shape, dtype in wanted[: len(results)]]
+        found = run(spec, name, num_tiles, arrays[: len(inputs)], unset, arrays[len(inputs) :])
+        return [array.reshape(-1).view(np.uint32) for array in found]
 
-    return jax.pure_callback(call, shapes, list(inputs), list(totals), vmap_method="sequential")
+    # As bits: JAX would round float64, for the callback's thread is not in 64-bit mode.
+    words = [jax.ShapeDtypeStruct((math.prod(shape) * dtype.itemsize // 4,), np.uint32) for shape, dtype in wanted]
+    as_bits = [jax.lax.bitcast_convert_type(x, np.uint32).reshape(-1) for x in (*inputs, *totals)]
+    found = jax.pure_callback(call, words, as_bits, vmap_method="sequential")
+    return [_from_bits(bits, *kind) for bits, kind in zip(found, wanted, strict=True)]
+
+
+def _kinds(arrays):
+    return [(array.shape, np.dtype(array.dtype)) for array in arrays]
+
+
+def _from_bits(bits, shape, dtype):
+    return jax.lax.bitcast_convert_type(bits.reshape(-1, 2) if dtype.itemsize == 8 else bits, dtype).reshape(shape)
