@@ -2,11 +2,15 @@
 
 import functools
 import math
+from importlib import resources
 
 import jax
 import numpy as np
 import pytest
 
+from a2tg_jax.rasterize.kernels import cuda
+from a2tg_jax.rasterize.kernels.cuda.primitives import C_TYPES
+from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
 from a2tg_jax.rasterize.kernels.cuda.source import num_parts, num_threads, source
 
 cl = pytest.importorskip("pyopencl", reason="the GPU kernels run on CPUs as OpenCL: pip install 'pyopencl[pocl]'")
@@ -56,6 +60,7 @@ def run(spec, name, num_tiles, inputs, results, totals):
 
 def launch(spec, name, num_tiles, inputs, results, totals=()):
     """As `kernels.cuda.launch.launch`."""
+    _kernel(spec, name)  # Here, for the callback's thread is not in 64-bit mode, and would trace for float32.
     given, wanted = _kinds([*inputs, *totals]), _kinds([*results, *totals])
 
     def call(bits):
@@ -71,6 +76,33 @@ def launch(spec, name, num_tiles, inputs, results, totals=()):
     as_bits = [jax.lax.bitcast_convert_type(x, np.uint32).reshape(-1) for x in (*inputs, *totals)]
     found = jax.pure_callback(call, words, as_bits, vmap_method="sequential")
     return [_from_bits(bits, *kind) for bits, kind in zip(found, wanted, strict=True)]
+
+
+def evaluate(closed, real, *columns):
+    """The results, as float64, of a function of scalars that is printed as C, for each row of some columns."""
+    inputs = [Argument(f"x{k}", kind=real) for k in range(len(columns))]
+    outputs = [Argument(f"y{k}", kind=C_TYPES[aval.dtype.name]) for k, aval in enumerate(closed.out_avals)]
+    num, header = len(outputs), resources.files(cuda).joinpath("opencl.h").read_text(encoding="utf-8")
+    text = f"""#pragma OPENCL EXTENSION cl_khr_fp64 : enable
+    typedef {real} real;
+    #define IS_FLOAT {int(real == "float")}
+    #define THREADS 1
+    #define NUM_SUMS 1
+    #define NUM_COLUMNS 1
+    {header}
+    {c_function("f", closed, inputs, outputs)}
+    KERNEL(evaluate)({"".join(f"GLOBAL const real *x{k}, " for k in range(len(columns)))}GLOBAL double *result) {{
+      {"".join(f"{output.kind} y{k};" for k, output in enumerate(outputs))}
+      f({", ".join([f"x{k}[BLOCK]" for k in range(len(columns))] + [f"&y{k}" for k in range(num)])});
+      {"".join(f"result[BLOCK * {num} + {k}] = y{k};" for k in range(num))}
+    }}"""
+    kernel = cl.Kernel(cl.Program(queue().context, text).build(["-cl-std=CL1.2"]), "evaluate")
+    result = np.empty((len(columns[0]), num))
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+    buffers = [cl.Buffer(queue().context, flags, hostbuf=array) for array in (*columns, result)]
+    kernel(queue(), (len(result),), (1,), *buffers)
+    cl.enqueue_copy(queue(), result, buffers[-1])
+    return list(result.T)
 
 
 def _kinds(arrays):

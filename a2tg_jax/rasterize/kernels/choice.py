@@ -81,7 +81,14 @@ def _warn_of_fallback(rule: type, reason: str) -> None:
 @functools.cache
 def has_native() -> bool:
     """Return whether native loops are available: XLA runs on the CPU, and llvmlite is installed."""
-    return jax.default_backend() == "cpu" and _is_installed("llvmlite") and not IS_COMPILED_AHEAD
+    if jax.default_backend() != "cpu" or not _is_installed("llvmlite") or IS_COMPILED_AHEAD:
+        return False
+    from a2tg_jax.rasterize.kernels.native import ffi
+
+    reason = ffi.refusal()
+    if reason is not None:
+        warnings.warn(f"compositing by XLA, which is slower: {reason}; install a jax that was tried", stacklevel=2)
+    return reason is None
 
 
 def _is_installed(name: str) -> bool:

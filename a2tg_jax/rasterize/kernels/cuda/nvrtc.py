@@ -3,9 +3,12 @@
 import ctypes
 import functools
 import importlib.util
+import re
 from pathlib import Path
 
 OPTIONS = ("--std=c++17",)
+LEAST_ISA = {9: "8.1", 10: "8.8", 12: "8.8"}
+"""PTX version that the kernels need, by the major compute capability: 8.1 brought atomic sums of four floats."""
 
 
 class CompilationError(RuntimeError):
@@ -62,9 +65,15 @@ def ptx(source: str, capability: str) -> str:
         array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
         if library.nvrtcCompileProgram(program, len(options), array):
             raise CompilationError(f"NVRTC refused a kernel:\n{_text(program, 'ProgramLog')}")
-        return _text(program, "PTX")
+        return _declared(_text(program, "PTX"), capability)
     finally:
         library.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+def _declared(text: str, capability: str) -> str:
+    """Declare the PTX version that the kernels need, not NVRTC's own: a driver refuses versions newer than itself."""
+    least = LEAST_ISA.get(int(capability.split(".")[0]), "8.1")
+    return re.sub(r"^\.version \S+", f".version {least}", text, count=1, flags=re.MULTILINE)
 
 
 def _text(program: ctypes.c_void_p, what: str) -> str:

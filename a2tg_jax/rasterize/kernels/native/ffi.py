@@ -3,10 +3,12 @@
 import contextlib
 import ctypes
 import hashlib
+import re
 import signal
 import threading
 import traceback
 from collections.abc import Callable, Hashable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,6 +21,8 @@ from a2tg_jax.rasterize.kernels.manual_axes import vary_with
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
 """Function of arguments and results, views of XLA's buffers: it reads the arguments and fills the results."""
 
+VERSION = 0, 3
+"""Version of the interface, major and minor, from which the structures below were copied."""
 METADATA_EXTENSION = 1
 EXECUTE_STAGE = 3
 INTERNAL_ERROR = 13
@@ -91,6 +95,27 @@ _LOCK = threading.RLock()
 _AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
 ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # in use as long as the process lives
 _entries: dict[str, tuple[Hashable, object]] = {}
+
+
+def installed_version() -> tuple[int, int] | None:
+    """Return the version of the interface in the headers that jaxlib brings; None if it brings none."""
+    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    if not header.is_file():
+        return None
+    numbers = dict(re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", header.read_text(encoding="utf-8")))
+    return int(numbers["MAJOR"]), int(numbers["MINOR"])
+
+
+def refusal() -> str | None:
+    """Return why functions cannot be registered with this jaxlib; None if they can.
+
+    XLA keeps old minor versions working for a year, but no old major ones.
+    """
+    found = installed_version()
+    if found is None or (found[0] == VERSION[0] and found >= VERSION):
+        return None
+    own, other = (".".join(map(str, version)) for version in (VERSION, found))
+    return f"native loops speak version {own} of XLA's foreign function interface, and this jaxlib {other}"
 
 
 def registered(description: str, key: Hashable, make_handler: Callable[[], Handler]) -> str:
@@ -194,8 +219,8 @@ def _dispatch(frame: _CallFrame, handler: Handler) -> None:
     """Answer XLA's question for metadata, or execute the handler."""
     extension = frame.extension
     if extension and extension.contents.kind == METADATA_EXTENSION:
-        version, own = extension.contents.metadata.contents.version, frame.api.contents.version
-        version.major, version.minor = own.major, own.minor
+        version = extension.contents.metadata.contents.version
+        version.major, version.minor = VERSION
     elif frame.stage == EXECUTE_STAGE:
         handler(_arrays(frame.arguments), _arrays(frame.results))
 

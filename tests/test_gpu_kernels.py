@@ -1,0 +1,155 @@
+"""The GPU kernels without a GPU: NVRTC compiles them, ptxas counts registers, XLA takes them, OpenCL runs them."""
+
+import re
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene
+
+from a2tg_jax import RenderSettings, render_image
+from a2tg_jax.appearance import PlainRule, StaticRule, TextureOptions, textured_rule
+from a2tg_jax.rasterize.kernels import choice
+from a2tg_jax.rasterize.kernels.cuda import launch, nvrtc
+from a2tg_jax.rasterize.kernels.cuda.primitives import PRIMITIVES
+from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
+from a2tg_jax.rasterize.kernels.cuda.source import source
+from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
+from a2tg_jax.rasterize.kernels.native import primitives as of_native
+from a2tg_jax.rasterize.kernels.traced import KernelSpec
+from a2tg_jax.rasterize.kernels.tracing import example, trace
+
+NOT_PRINTED = {"clz", "population_count"}
+"""Primitives of native loops that GPU kernels lack; their names differ between CUDA and OpenCL."""
+
+
+def spec_of(has_textures=True, dtype="float32", tile_size=16, has_geometry=True, statistic="position"):
+    textures, layout = as_textures(draw_scene(4, num=8), "float32")
+    rule = textured_rule(textures, layout, TextureOptions()) if has_textures else PlainRule()
+    columns = 4 if has_textures else 0
+    return KernelSpec(StaticRule.of(rule), 0, columns, dtype, tile_size, 0.2, has_geometry, statistic)
+
+
+@pytest.fixture
+def has_nvrtc():
+    if nvrtc.find() is None:
+        pytest.skip("NVRTC is not installed: pip install nvidia-cuda-nvrtc")
+
+
+@pytest.mark.usefixtures("has_nvrtc", "x64")
+@pytest.mark.parametrize("has_textures", [False, True])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("tile_size", [5, 16, 24])
+def test_nvrtc_compiles_them(has_textures, dtype, tile_size):
+    text = source(spec_of(has_textures, dtype, tile_size), "cuda")
+    for capability in ("7.5", "9.0", "12.0"):
+        program = nvrtc.ptx(text, capability)
+        assert ".entry forward(" in program and ".entry backward(" in program
+        assert program.count("atom.global") + program.count("red.global") > 0
+
+
+@pytest.mark.usefixtures("has_nvrtc")
+@pytest.mark.parametrize(("has_textures", "most"), [(False, 96), (True, 128)])
+def test_they_fit_the_registers_of_two_blocks(tmp_path, has_textures, most):
+    """128 registers of 256 threads are half of those that an H200's processor has; none are spilled."""
+    if shutil.which("ptxas") is None:
+        pytest.skip("ptxas is not installed; it comes with CUDA's compiler")
+    (tmp_path / "tiles.ptx").write_text(nvrtc.ptx(source(spec_of(has_textures), "cuda"), "9.0"))
+    command = ["ptxas", "-v", "-arch=sm_90", "tiles.ptx", "-o", "tiles.cubin"]
+    told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stderr
+    assert max(map(int, re.findall(r"Used (\d+) registers", told))) <= most
+    assert set(re.findall(r"(\d+) bytes spill", told)) == {"0"}
+
+
+def test_nvrtc_tells_what_it_refuses(has_nvrtc):
+    with pytest.raises(nvrtc.CompilationError, match=r"(?s)NVRTC refused a kernel.*undefined"):
+        nvrtc.ptx('extern "C" __global__ void f(float *x) { *x = nothing; }', "9.0")
+
+
+@pytest.mark.usefixtures("has_nvrtc")
+def test_xla_takes_them(monkeypatch):
+    """A program for CUDA, lowered on a machine without it, launches one kernel each way, a thread a pixel."""
+    monkeypatch.setattr(choice, "has_cuda", lambda: True)
+    scene = draw_scene(4, num=8, width=40, height=24)
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+
+    def loss(gaussians):
+        settings = RenderSettings(compositor="cuda", tile_size=16, capacity=512)
+        return jnp.sum(render_image(gaussians, camera, settings=settings).color)
+
+    lowered = jax.jit(jax.grad(loss)).trace(gaussians).lower(lowering_platforms=("cuda",)).as_text()
+    calls = re.findall(rf"custom_call @{re.escape(launch.TARGET)}.*", lowered.replace('"', ""))
+    assert len(calls) == 2
+    for name, call in zip(("forward", "backward"), calls, strict=True):
+        assert f"name = {name}" in call and "block_x = 256" in call and "grid_x = 6 " in call
+
+
+@pytest.mark.usefixtures("gpu_kernels", "x64")
+@pytest.mark.parametrize(("num", "tile_size", "size"), [(300, 16, (33, 18)), (1, 5, (7, 9)), (90, 24, (24, 30))])
+def test_long_lists_and_odd_tiles(num, tile_size, size):
+    """More splats than a batch, tiles of several blocks, and tiles that no warp fills, with every texture size."""
+    scene = draw_scene(7, num=num, width=size[0], height=size[1])
+    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    textures, layout = as_textures(scene, "float64")
+
+    def loss(gaussians, textures, compositor):
+        settings = as_settings(compositor=compositor, tile_size=tile_size)
+        output = render_image(gaussians, camera, textures, layout, settings=settings)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
+
+    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    (_, expected), wanted = differentiate(gaussians, textures, "native")
+    (_, output), found = differentiate(gaussians, textures, "cuda")
+    for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-11 * max(1.0, float(jnp.abs(a).max(initial=0))))
+
+
+def test_every_primitive_of_native_loops_is_printed():
+    assert set(of_native.PRIMITIVES) - set(PRIMITIVES) == NOT_PRINTED
+    assert set(PRIMITIVES) <= set(of_native.PRIMITIVES)
+
+
+def program(x, y):
+    """Branches, loops, arrays, integers and bits."""
+    steps = lax.while_loop(lambda c: c[0] < 30, lambda c: (c[0] * 2 + 1, c[1] + 1), (abs(x) + 0.5, 0))[1]
+    branch = lax.switch(steps % 3, [lambda: x, lambda: y * 2, lambda: jnp.tanh(x)])
+    total = lax.fori_loop(0, 5, lambda k, t: t * y + k, x)
+    array = jnp.stack([x, y, branch])
+    bits = lax.bitcast_convert_type(x, jnp.int32 if x.dtype == jnp.float32 else jnp.int64)
+    scanned, rows = lax.scan(lambda c, row: (c + row, c * row), x, array)
+    return (
+        *(branch, total, jnp.sum(array), jnp.max(array), jnp.prod(array[::-1][:2]), scanned, jnp.sum(rows)),
+        *(jnp.clip(x, -1, y), lax.rem(x, y), jnp.sign(x), jnp.round(x * 8), x.astype(jnp.int32) // 3, bits >> 4),
+        *((bits << 3) ^ steps.astype(bits.dtype), jnp.isfinite(x / y), ~(x < y), lax.integer_pow(y, -3), x**2.5),
+        *(jnp.minimum(x, y), jnp.logical_xor(x > 0, y > 0), jnp.exp(x), jax.nn.sigmoid(y), lax.rsqrt(abs(x))),
+    )
+
+
+@pytest.mark.usefixtures("gpu_kernels", "x64")
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_printed_functions_compute_what_xla_does(dtype):
+    import opencl
+
+    numbers = [0.0, -0.0, 1.5, -2.75, 0.1, 31.0, -1e-3, np.inf, -np.inf, np.nan, 3e9, -3e9]
+    x, y = (np.array(pair, dtype) for pair in zip(*[(a, b) for a in numbers for b in numbers], strict=True))
+    closed, _ = trace(program, example(dtype), example(dtype))
+    real = {"float32": "float", "float64": "double"}[dtype]
+    wanted = jax.jit(jax.vmap(program))(x, y)
+    found = opencl.evaluate(closed, real, x, y)
+    for index, (a, b) in enumerate(zip(wanted, found, strict=True)):
+        tolerance = 1e-5 if dtype == "float32" else 1e-12
+        np.testing.assert_allclose(b, np.asarray(a, np.float64), rtol=tolerance, atol=tolerance, err_msg=str(index))
+
+
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [(lax.digamma, "'digamma'"), (lambda x: x.astype(jnp.bfloat16).astype(x.dtype), "bfloat16")],
+)
+def test_what_cannot_be_printed_is_named(function, words):
+    closed, _ = trace(function, example("float32"))
+    with pytest.raises(Untranslatable, match=words):
+        c_function("f", closed, [Argument("x")], [Argument("y")])
