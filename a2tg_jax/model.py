@@ -13,6 +13,7 @@ from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import short_repr
+from a2tg_jax.core.display import counted, html_table, in_bytes
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity
@@ -159,4 +160,22 @@ class Model:
         )
 
     def __repr__(self) -> str:
-        return short_repr(self)
+        try:
+            return f"Model({', '.join(text for _, text in self._facts())})"
+        except (TypeError, ValueError, AttributeError, IndexError):  # Leaves are not arrays, or have no values.
+            return short_repr(self)
+
+    def _repr_html_(self) -> str:
+        return html_table("Model", self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """Return what a reader asks about a model, by name (host)."""
+        kind, base = type(self.appearance).__name__, type(self.appearance.base).__name__
+        degree = self.gaussians.sh_degree
+        facts = [
+            ("Gaussians", counted(self.num, "Gaussian")),
+            ("view dependence", f"SH degrees {degree} to 3" if self.appearance.has_degrees else f"SH degree {degree}"),
+            ("appearance", kind if kind == base else f"{kind} around {base}"),
+            ("memory", in_bytes(self.num_bytes)),
+        ]
+        return facts if self.origin is None else [*facts, ("origin", repr(self.origin))]

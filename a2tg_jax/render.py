@@ -17,6 +17,7 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, AppearanceRule, PlainRule, TextureOptions, appearance_for
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import jit
@@ -79,6 +80,14 @@ class RenderOutput(NamedTuple):
     """Whether the capacity was too small; the image is then only the background and must not be used."""
     distortion: Array
     """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
+
+    def __repr__(self) -> str:
+        return short_tuple_repr(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the colour as a PNG file for notebooks; None for several views, or under a transformation."""
+        pixels = as_bytes(self.color)
+        return None if pixels is None else png(pixels)
 
 
 def render_image(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_camera
+from a2tg_jax.core.display import short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
@@ -36,6 +37,9 @@ class ViewGradients(NamedTuple):
     """The view; `output.overflow` says that the capacity did not suffice, and nothing here may be used."""
     num_pairs: Array
     """Number of pairs that a capacity must hold (`plan_render`)."""
+
+    def __repr__(self) -> str:
+        return short_tuple_repr(self)
 
 
 def view_gradients(
