@@ -76,7 +76,8 @@ def test_a_value_is_a_line(line):
 
 def test_checkpoint_is_a_line():
     state = types.SimpleNamespace(iteration=1200, model=small_model())
-    assert repr(Checkpoint(A2tg(), 1, state, some_history())) == "Checkpoint(A2tg, stage 2, iteration 1,200, 5 Gaussians)"
+    checkpoint = Checkpoint(A2tg(), 1, state, some_history())
+    assert repr(checkpoint) == "Checkpoint(A2tg, stage 2, iteration 1,200, 5 Gaussians)"
 
 
 def test_model_without_values_has_a_repr():
