@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, PlainRule, TextureOptions, appearance_for
+from a2tg_jax.appearance import Appearance, AppearanceRule, PlainRule, StaticRule, TextureOptions, appearance_for
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
@@ -22,10 +22,16 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import jit
 from a2tg_jax.rasterize.compositor import composite
-from a2tg_jax.rasterize.kernels.choice import choose, instead_of_native
+from a2tg_jax.rasterize.kernels.choice import choose, instead_of, pallas_refusal
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, project_gaussians
+from a2tg_jax.rasterize.splats import (
+    CompositingSettings,
+    Compositor,
+    Splats,
+    project_gaussians,
+    shading_arguments,
+)
 from a2tg_jax.rasterize.tiles import TileGrid, count_pairs, tile_lists
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
@@ -190,8 +196,8 @@ def render_traced(
         return _empty_view(compositing, background), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
-    if compositor == "native" and (reason := native.refusal(compositing, rule, splats)):
-        settings = dataclasses.replace(settings, compositor=instead_of_native(settings.compositor, type(rule), reason))
+    if reason := _refusal(compositing, rule, splats):
+        settings = dataclasses.replace(settings, compositor=instead_of(settings.compositor, type(rule), reason))
         return render_traced(
             gaussians, camera, rule, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
@@ -205,6 +211,16 @@ def render_traced(
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
     channels, transmittance = channels + taint, transmittance + taint
     return _output(compositing, channels, transmittance, background, lists.overflow), lists.num_pairs
+
+
+def _refusal(compositing: CompositingSettings, rule: AppearanceRule, splats: Splats) -> str | None:
+    """Return why the chosen compositor cannot run a rule; None if it can."""
+    if compositing.compositor == "native":
+        return native.refusal(compositing, rule, splats)
+    if compositing.compositor == "pallas":
+        arguments = shading_arguments(rule.texels, rule.regions, splats.numbers, splats.colors)
+        return pallas_refusal(StaticRule.of(rule), arguments)
+    return None
 
 
 def _compositing_settings(

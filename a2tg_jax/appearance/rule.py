@@ -186,8 +186,14 @@ class StaticRule:
         """Rule as its element-wise functions see it: every use of an array field raises."""
         numbered = jax.tree.unflatten(self.structure, range(self.structure.num_leaves))
         paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
-        name = self.classes[0].__name__
-        return jax.tree.unflatten(self.structure, [_LeftOut(name + jax.tree_util.keystr(path)) for path, _ in paths])
+        return jax.tree.unflatten(
+            self.structure, [_LeftOut(self.name + jax.tree_util.keystr(path)) for path, _ in paths]
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the rule's class."""
+        return self.classes[0].__name__
 
 
 class _LeftOut:
@@ -207,7 +213,9 @@ class _LeftOut:
             raise AttributeError(name)
         self._refuse()
 
-    __jax_array__ = __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
+    # A property: JAX asks whether there is such a method, and its own error would name neither field nor rule.
+    __jax_array__ = property(_refuse)
+    __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
     __add__ = __sub__ = __mul__ = __truediv__ = __pow__ = __neg__ = __abs__ = __matmul__ = _refuse
     __radd__ = __rsub__ = __rmul__ = __rtruediv__ = __rpow__ = __rmatmul__ = _refuse
     __lt__ = __le__ = __gt__ = __ge__ = _refuse

@@ -8,9 +8,11 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.appearance import AppearanceRule, Arguments, StaticRule, check_shading
+from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies
@@ -79,12 +81,13 @@ def project_gaussians(
       num_live: number of rows that exist; may be traced.
 
     Raises:
-      ValueError: if the rule gives opacities or numbers of another shape, or a `max_alpha` outside (0, 1).
+      ValueError: if the rule gives opacities, numbers or colours of another shape, or a `max_alpha` outside (0, 1),
+        or if its element-wise functions return something else than they must.
     """
     M, normals = homographies(gaussians, camera)
     opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
-    _check_rule(rule, opacities, numbers, gaussians.num)
     colors = rule.own_colors(gaussians, camera, sh_degree)
+    _check_rule(rule, opacities, numbers, colors, gaussians.num)
     # Not >=: a NaN depth counts as drawn, so that it is reported.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
@@ -99,14 +102,24 @@ def project_gaussians(
     return Splats(M, colors, opacities, normals, numbers), cutoff
 
 
-def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, num: int) -> None:
+def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, colors: Array, num: int) -> None:
+    name = type(rule).__name__
     if opacities.shape != (num,) or numbers.shape[:-1] != (num,):
         raise ValueError(
-            f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {type(rule).__name__} "
+            f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {name} "
             f"gave {opacities.shape} and {numbers.shape}"
         )
+    if colors.shape != (num, 3):
+        raise ValueError(f"a rule gives own_colors [N, 3] of N = {num} gaussians; {name} gave {colors.shape}")
     if not 0 < rule.max_alpha < 1:
-        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
+        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {name} is {rule.max_alpha}")
+    check_shading(StaticRule.of(rule), shading_arguments(rule.texels, rule.regions, numbers, colors))
+
+
+def shading_arguments(texels: Array, regions: TextureRegion | None, numbers: Array, colors: Array) -> Arguments:
+    """Return what the element-wise functions of a rule are called with, from the arrays of its splats."""
+    num_values = 0 if regions is None else texels.shape[1]
+    return Arguments(numbers.shape[1], num_values, colors.shape[1], np.dtype(colors.dtype).name)
 
 
 def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:

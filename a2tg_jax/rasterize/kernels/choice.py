@@ -13,6 +13,7 @@ import jax
 # would have JAX trace and compile all of it a second time.
 import jax.extend.core
 
+from a2tg_jax.appearance import Arguments, StaticRule, takes_arrays
 from a2tg_jax.rasterize.splats import Compositor
 
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
@@ -54,14 +55,14 @@ def wants_determinism() -> bool:
     return any(asked.values())
 
 
-def instead_of_native(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
-    """The compositor for a rule that native loops cannot run: XLA, with one warning per rule.
+def instead_of(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
+    """The compositor for a rule that native loops or Pallas kernels cannot run: XLA, with one warning per rule.
 
     Raises:
-      ValueError: if native loops were asked for.
+      ValueError: if a compositor was asked for by name.
     """
     if wanted != "auto":
-        raise ValueError(f"compositor='native' cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
+        raise ValueError(f"compositor={wanted!r} cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
     _warn_of_fallback(rule, reason)
     return "xla"
 
@@ -69,6 +70,13 @@ def instead_of_native(wanted: Literal["auto", "native", "pallas", "xla"], rule: 
 @functools.cache
 def _warn_of_fallback(rule: type, reason: str) -> None:
     warnings.warn(f"{rule.__name__} is composited by XLA, which is slower: {reason}", stacklevel=2)
+
+
+def pallas_refusal(static: StaticRule, arguments: Arguments) -> str | None:
+    """Why there can be no Pallas kernels for a rule; None if there are."""
+    if takes_arrays(static, arguments):
+        return None
+    return "Pallas kernels call a rule with arrays of pixels, and this one takes scalars only"
 
 
 @functools.cache

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import StaticRule
+from a2tg_jax.appearance import StaticRule, elementwise_rule
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Lookup, TextureRegion
 from a2tg_jax.core.numerics import pixel_sum, spread
 from a2tg_jax.rasterize import pixel
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats, shading_arguments
 from a2tg_jax.rasterize.tiles import TileLists
 
 BLOCK = 8
@@ -50,7 +50,8 @@ def forward(
       cutoff: [N] squared distance beyond which each splat need not be looked at; not used here.
       lists: the splats of each tile.
     """
-    rule, ids, dtype = static.rule, _padded_ids(lists), splats.M.dtype
+    rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
+    ids, dtype = _padded_ids(lists), splats.M.dtype
 
     def group(index):
         tiles, start = _tiles_of_group(settings, lists, index, dtype)
@@ -85,7 +86,8 @@ def backward(
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
     totals = packed, jnp.zeros_like(texels), jnp.zeros_like(probe)
-    rule, ids = static.rule, _padded_ids(lists)
+    rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
+    ids = _padded_ids(lists)
 
     def group(index, totals):
         tiles, start = _tiles_of_group(settings, lists, index, splats.M.dtype)

@@ -58,11 +58,12 @@ def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats)
 def _refusal(spec: "KernelSpec") -> str | None:
     from a2tg_jax.rasterize.kernels.native.lanes import Untranslatable
     from a2tg_jax.rasterize.kernels.native.loops import loops
+    from a2tg_jax.rasterize.kernels.native.traced import place_of
 
     try:
         loops(spec)
     except Untranslatable as error:
-        return str(error)
+        return str(error) + (place_of(error.primitive, spec) if error.primitive else "")
     return None
 
 

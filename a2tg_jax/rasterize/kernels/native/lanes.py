@@ -70,5 +70,5 @@ class Lanes(Translator):
         if name in STRUCTURE:
             return STRUCTURE[name](self, operands, equation)
         if name not in PRIMITIVES:
-            raise Untranslatable(f"native loops have no translation for the primitive '{name}'")
+            raise Untranslatable.of(name)
         return [map_entries(lambda numbers: PRIMITIVES[name](self, numbers, equation), operands)]

@@ -1,13 +1,14 @@
 """What native loops are made for (`KernelSpec`), and the scalar functions that they apply, traced to jaxprs."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import StaticRule
+from a2tg_jax.appearance import Arguments, StaticRule
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.kernels.native import llvm_modules
@@ -31,6 +32,11 @@ class KernelSpec:
     near_plane: float
     has_geometry: bool
     statistic: pixel.Statistic | None
+
+    @property
+    def arguments(self) -> Arguments:
+        """What the element-wise functions of the rule are called with."""
+        return Arguments(self.num_rule_numbers, self.num_columns, 3, self.dtype)
 
     @property
     def num_channels(self) -> int:
@@ -101,6 +107,35 @@ class Functions:
             moved = splat.M, x, y, *center, d.rho, jacobian
             added = pixel.positional_gradient(spec.statistic, *moved, spec.near_plane, rule.has_low_pass)
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
+
+
+def place_of(primitive: str, spec: KernelSpec) -> str:
+    """Return in which function of a rule a primitive occurs, as in " in MyRule.shade"; "" if in none."""
+    rule = spec.rule.rule
+    for name, given in spec.arguments.of(()).items():
+        function = getattr(rule, name)
+        if primitive in _primitives(trace(function, *given)[0]):
+            return f" in {spec.rule.name}.{name}"
+        if name != "texel_position" and primitive in _primitives(trace(_gradient_of(function), *given)[0]):
+            return f" in the gradient of {spec.rule.name}.{name}"
+    return ""
+
+
+def _gradient_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    def gradient(*given: Any) -> Any:
+        results, pull_back = jax.vjp(function, *given)
+        return pull_back(results)
+
+    return gradient
+
+
+def _primitives(jaxpr: Any) -> set[str]:
+    """Return the names of the primitives of a jaxpr and of the jaxprs within it."""
+    found: set[str] = set()
+    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        inner = [leaf for leaf in jax.tree.leaves(tuple(equation.params.values())) if hasattr(leaf, "eqns")]
+        found |= {equation.primitive.name}.union(*map(_primitives, inner))
+    return found
 
 
 def _planes_vjp(M, x, y, d_planes):

@@ -16,6 +16,16 @@ BOOL = ir.IntType(1)
 class Untranslatable(ValueError):
     """A function cannot become native loops; the message names what stands in the way."""
 
+    primitive: str | None = None
+    """Name of the primitive that has no translation, if it is one."""
+
+    @staticmethod
+    def of(primitive: str) -> "Untranslatable":
+        """Return the error of a primitive without a translation."""
+        error = Untranslatable(f"native loops have no translation for the primitive '{primitive}'")
+        error.primitive = primitive
+        return error
+
 
 def scalar_type(dtype) -> ir.Type:
     """The LLVM type of a scalar of a numpy dtype.
