@@ -7,7 +7,7 @@ the settings, which `plan_render` fills in.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from a2tg_jax.rasterize.splats import (
     CompositingSettings,
     Compositor,
     Splats,
+    Wanted,
     project_gaussians,
     shading_arguments,
 )
@@ -55,9 +56,10 @@ class RenderSettings:
     A `Model` and a rule have options of their own, which win: this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
-    compositor: Literal["auto", "native", "pallas", "xla"] = "auto"
+    compositor: Wanted = "auto"
     """Native loops (CPUs, with llvmlite), Pallas kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
-    and XLA with a warning if native loops do not support the appearance rule."""
+    and XLA with a warning if native loops do not support the appearance rule. These are differentiated once, in reverse
+    mode; "autodiff", slower and by XLA, in any mode and to any order."""
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
 
@@ -233,7 +235,7 @@ def _compositing_settings(
         has_geometry=has_geometry,
         statistic=statistic,
         compositor=compositor,
-        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
+        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor in ("xla", "autodiff") else 1,
     )
 
 

@@ -19,8 +19,10 @@ from a2tg_jax.core.geometry import homographies
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid
 
-Compositor = Literal["native", "pallas", "xla"]
-"""Native loops (CPUs), Pallas kernels (GPUs) or XLA (everywhere)."""
+Compositor = Literal["native", "pallas", "xla", "autodiff"]
+"""Native loops (CPUs), Pallas kernels (GPUs), XLA (everywhere), or XLA without a gradient of its own (everywhere)."""
+Wanted = Literal["auto", "native", "pallas", "xla", "autodiff"]
+"""A compositor, or the first of native, Pallas and XLA that runs here."""
 
 
 class Splats(NamedTuple):
@@ -50,9 +52,9 @@ class CompositingSettings(NamedTuple):
     statistic: Statistic | None
     """Statistic that densification reads from the backward pass, if any."""
     compositor: Compositor
-    """Native loops, Pallas kernels, or XLA."""
+    """Native loops, Pallas kernels, or XLA with or without a gradient of its own."""
     tile_batch: int
-    """Number of tiles that XLA composites at once; 1 with the others."""
+    """Number of tiles that XLA composites at once; 1 with native loops and Pallas kernels."""
 
     @property
     def num_channels(self) -> int:

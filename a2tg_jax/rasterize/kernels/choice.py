@@ -5,7 +5,6 @@ import importlib.util
 import os
 import warnings
 from types import ModuleType
-from typing import Literal
 
 import jax
 
@@ -14,21 +13,21 @@ import jax
 import jax.extend.core
 
 from a2tg_jax.appearance import Arguments, StaticRule, takes_arrays
-from a2tg_jax.rasterize.splats import Compositor
+from a2tg_jax.rasterize.splats import Compositor, Wanted
 
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 MAX_TILE_SIZE = 64
 """Native loops keep a tile on the stack."""
 
 
-def choose(wanted: Literal["auto", "native", "pallas", "xla"], tile_size: int) -> Compositor:
+def choose(wanted: Wanted, tile_size: int) -> Compositor:
     """The compositor that is wanted, or with "auto" the fastest that JAX's default backend can run.
 
     Raises:
       ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
     """
-    if wanted not in ("auto", "native", "pallas", "xla"):
-        raise ValueError(f"compositor must be 'auto', 'native', 'pallas' or 'xla'; got {wanted!r}")
+    if wanted not in ("auto", "native", "pallas", "xla", "autodiff"):
+        raise ValueError(f"compositor must be 'auto', 'native', 'pallas', 'xla' or 'autodiff'; got {wanted!r}")
     if not 1 <= tile_size <= MAX_TILE_SIZE:
         raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
     is_power_of_two = tile_size & (tile_size - 1) == 0
@@ -55,7 +54,7 @@ def wants_determinism() -> bool:
     return any(asked.values())
 
 
-def instead_of(wanted: Literal["auto", "native", "pallas", "xla"], rule: type, reason: str) -> Compositor:
+def instead_of(wanted: Wanted, rule: type, reason: str) -> Compositor:
     """The compositor for a rule that native loops or Pallas kernels cannot run: XLA, with one warning per rule.
 
     Raises:

@@ -24,7 +24,7 @@ from a2tg_jax.rasterize.tiles import TileLists
 BLOCK = 8
 
 
-class _Tile(NamedTuple):
+class Tiles(NamedTuple):
     """One tile, or G of them."""
 
     x: Array
@@ -51,21 +51,21 @@ def forward(
       lists: the splats of each tile.
     """
     rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
-    ids, dtype = _padded_ids(lists), splats.M.dtype
+    ids, dtype = padded_ids(lists), splats.M.dtype
 
     def group(index):
-        tiles, start = _tiles_of_group(settings, lists, index, dtype)
-        add_block = _over_tiles(functools.partial(_block, settings, rule, texels), settings.tile_batch)
+        tiles, start = tiles_of_group(settings, lists, index, dtype)
+        add_block = over_tiles(functools.partial(_block, settings, rule, texels), settings.tile_batch)
 
         def step(carry):
             at, transmittance, is_live, channels = carry
-            rows = _gather(splats, regions, _block_ids(ids, at))
+            rows = gather_rows(splats, regions, block_ids(ids, at))
             added, transmittance, is_live = add_block(rows, at, tiles, transmittance, is_live)
             return at + BLOCK, transmittance, is_live, channels + added
 
         shape = settings.tile_batch, settings.num_channels, settings.grid.tile_size**2
-        carry = (start, *_initial_state(settings, tiles), jnp.zeros(shape, dtype))
-        _, transmittance, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)
+        carry = (start, *initial_state(settings, tiles), jnp.zeros(shape, dtype))
+        _, transmittance, _, channels = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)
         return channels, transmittance
 
     return jax.lax.map(group, jnp.arange(settings.num_groups, dtype=jnp.int32))
@@ -87,21 +87,21 @@ def backward(
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
     totals = packed, jnp.zeros_like(texels), jnp.zeros_like(probe)
     rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
-    ids = _padded_ids(lists)
+    ids = padded_ids(lists)
 
     def group(index, totals):
-        tiles, start = _tiles_of_group(settings, lists, index, splats.M.dtype)
-        pull_back = _over_tiles(functools.partial(_block_vjp, settings, rule, texels, jacobian), settings.tile_batch)
+        tiles, start = tiles_of_group(settings, lists, index, splats.M.dtype)
+        pull_back = over_tiles(functools.partial(_block_vjp, settings, rule, texels, jacobian), settings.tile_batch)
 
         def step(carry):
             at, *state, totals = carry
-            block_ids = _block_ids(ids, at)
-            rows = _gather(splats, regions, block_ids)
+            in_block = block_ids(ids, at)
+            rows = gather_rows(splats, regions, in_block)
             *state, d_rows = pull_back(rows, at, tiles, *state, g[index])
-            return (at + BLOCK, *state, _accumulate(totals, block_ids, d_rows))
+            return (at + BLOCK, *state, _accumulate(totals, in_block, d_rows))
 
-        carry = (start, *_initial_state(settings, tiles), suffix_sum[index], totals)
-        return jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)[-1]
+        carry = (start, *initial_state(settings, tiles), suffix_sum[index], totals)
+        return jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)[-1]
 
     packed, d_texels, d_probe = jax.lax.fori_loop(jnp.int32(0), jnp.int32(settings.num_groups), group, totals)
     pieces = jnp.split(packed, np.cumsum(widths)[:-1], axis=1)
@@ -109,20 +109,20 @@ def backward(
     return d_splats, d_texels, d_probe
 
 
-def _initial_state(settings: CompositingSettings, tiles: _Tile) -> tuple[Array, Array]:
+def initial_state(settings: CompositingSettings, tiles: Tiles) -> tuple[Array, Array]:
     """Full transmittance [G, P], and which pixels are live: those of the border tiles outside the image never are."""
-    x, y = _pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
+    x, y = pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
     is_inside = (tiles.x[:, None] + x < settings.grid.width) & (tiles.y[:, None] + y < settings.grid.height)
     return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
 
 
-def _is_unfinished(ends: Array, carry) -> Array:
+def is_unfinished(ends: Array, carry) -> Array:
     """Whether some tile of a group has splats left, and pixels that they may reach."""
     at, _, is_live = carry[:3]
     return jnp.any((at < ends) & jnp.any(is_live, axis=1))
 
 
-def _over_tiles(function, num: int):
+def over_tiles(function, num: int):
     """`function` of one tile applied to a leading axis of `num` tiles; a single one needs no vmap."""
     if num > 1:
         return jax.vmap(function)
@@ -130,12 +130,12 @@ def _over_tiles(function, num: int):
     return lambda *args: jax.tree.map(put, function(*jax.tree.map(take, args)))
 
 
-def _padded_ids(lists: TileLists) -> Array:
+def padded_ids(lists: TileLists) -> Array:
     """The lists' splats, and a block more, so that every block can be read whole."""
     return jnp.concatenate([lists.ids, jnp.zeros(BLOCK, lists.ids.dtype)])
 
 
-def _tiles_of_group(settings: CompositingSettings, lists: TileLists, index: Array, dtype) -> tuple[_Tile, Array]:
+def tiles_of_group(settings: CompositingSettings, lists: TileLists, index: Array, dtype) -> tuple[Tiles, Array]:
     """The tiles of a group, and [G] where their lists begin; tiles past the last one have empty lists."""
     tile = index * settings.tile_batch + jnp.arange(settings.tile_batch, dtype=jnp.int32)
     size = settings.grid.tile_size
@@ -144,17 +144,17 @@ def _tiles_of_group(settings: CompositingSettings, lists: TileLists, index: Arra
     is_real = tile < settings.grid.num
     tile = jnp.minimum(tile, settings.grid.num - 1)
     start = lists.starts[tile]
-    return _Tile(x, y, jnp.where(is_real, lists.starts[tile + 1], start)), start
+    return Tiles(x, y, jnp.where(is_real, lists.starts[tile + 1], start)), start
 
 
-def _block_ids(ids: Array, at: Array) -> Array:
+def block_ids(ids: Array, at: Array) -> Array:
     """[G, B] splats of the blocks that start at `at` [G]."""
     if at.shape[0] == 1:
         return jax.lax.dynamic_slice(ids, (at[0],), (BLOCK,))[None]
     return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK, dtype=jnp.int32)[None, :], ids.shape[0] - 1)]
 
 
-def _gather(splats: Splats, regions: TextureRegion | None, ids: Array):
+def gather_rows(splats: Splats, regions: TextureRegion | None, ids: Array):
     """The splats [G, B, ...] of some ids [G, B], and their texture regions."""
     flat = ids.reshape(-1)
     rows = jax.tree.map(lambda x: x[flat], (splats, regions))
@@ -174,13 +174,13 @@ def _accumulate(totals, ids: Array, d_rows):
     return splats, texels, probe if d_probe is None else probe.at[flat].add(d_probe.reshape(flat.shape[0], -1))
 
 
-def _pixels_of_tile(size: int, dtype) -> tuple[Array, Array]:
+def pixels_of_tile(size: int, dtype) -> tuple[Array, Array]:
     """x and y of a tile's pixel centres from its centre, each [1, P]."""
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return jnp.asarray(x.reshape(1, -1), dtype), jnp.asarray(y.reshape(1, -1), dtype)
 
 
-def _split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
+def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
     """Splats [B, ...] as the numbers that `pixel` wants, each [B], or spread over [B, num] pixels."""
     put = (lambda x: x) if num is None else functools.partial(spread, num=num)
     several = lambda x: tuple(put(x[:, k]) for k in range(x.shape[1]))  # noqa: E731
@@ -190,15 +190,15 @@ def _split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.
     return pixel.Splat(M, put(splats.opacities), several(splats.colors), normal, numbers)  # type: ignore[arg-type]
 
 
-def _hits(settings: CompositingSettings, rule, splats: Splats, tile: _Tile) -> pixel.Hit:
+def _hits(settings: CompositingSettings, rule, splats: Splats, tile: Tiles) -> pixel.Hit:
     """Where the rays of a tile's pixels meet the splats of a block; each [B, P]."""
-    x, y = _pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
-    planes = pixel.planes_of(_split(splats, False).M, tile.x, tile.y)
+    x, y = pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
+    planes = pixel.planes_of(split(splats, False).M, tile.x, tile.y)
     planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
     return pixel.intersect(planes, x, y, settings.near_plane, rule.has_low_pass)
 
 
-def _look_up(rule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
+def look_up(rule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
     """What is read of the textures of B splats at P pixels, [B, P] each; None where the rule has no textures."""
     if regions is None:
         return None
@@ -209,14 +209,14 @@ def _look_up(rule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit)
     return Lookup(region, bilinear.or_empty(sample, region, rule.empty), corners)
 
 
-def _show(settings: CompositingSettings, rule, splats: Splats, hit: pixel.Hit, values, at, tile: _Tile, rho_probe=None):
+def _show(settings: CompositingSettings, rule, splats: Splats, hit: pixel.Hit, values, at, tile: Tiles, rho_probe=None):
     """`pixel.Shown` of a block at a tile's pixels, each [B, P]; entries past the end of the list show nothing."""
-    shown = pixel.show(rule, _split(splats, settings.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe)
+    shown = pixel.show(rule, split(splats, settings.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
 
-def _block(settings: CompositingSettings, rule, texels: Array, rows, at, tile: _Tile, transmittance, is_live):
+def _block(settings: CompositingSettings, rule, texels: Array, rows, at, tile: Tiles, transmittance, is_live):
     """Composites one block of B splats over one tile.
 
     Args:
@@ -230,17 +230,17 @@ def _block(settings: CompositingSettings, rule, texels: Array, rows, at, tile: _
     """
     splats, regions = rows
     hit = _hits(settings, rule, splats, tile)
-    shown = _show(settings, rule, splats, hit, _values(_look_up(rule, texels, regions, hit)), at, tile)
+    shown = _show(settings, rule, splats, hit, values_of(look_up(rule, texels, regions, hit)), at, tile)
 
     def add_splat(carry, alpha):
         weight, transmittance, is_live = pixel.absorb(alpha, *carry)
         return (transmittance, is_live), weight
 
     (transmittance, is_live), weights = jax.lax.scan(add_splat, (transmittance, is_live), shown.alpha)
-    return jnp.stack([_sum_rows(channel * weights) for channel in shown.channels]), transmittance, is_live
+    return jnp.stack([sum_rows(channel * weights) for channel in shown.channels]), transmittance, is_live
 
 
-def _sum_rows(x: Array) -> Array:
+def sum_rows(x: Array) -> Array:
     """Sum over the first axis, a power of two long, by halves: a reduction would not be vectorised over pixels."""
     while x.shape[0] > 1:
         half = x.shape[0] // 2
@@ -249,7 +249,7 @@ def _sum_rows(x: Array) -> Array:
 
 
 def _block_vjp(
-    settings: CompositingSettings, rule, texels: Array, jacobian, rows, at, tile: _Tile, transmittance, is_live,
+    settings: CompositingSettings, rule, texels: Array, jacobian, rows, at, tile: Tiles, transmittance, is_live,
     suffix_sum, g,
 ):  # fmt: skip
     """One block of the backward pass over one tile: the state after it, and the cotangents of its rows.
@@ -257,14 +257,14 @@ def _block_vjp(
     `suffix_sum` [P] is g·(what this block and all behind it add) + g_T·T_final; g is [D, P].
     """
     splats, regions = rows
-    lookup = _look_up(rule, texels, regions, _hits(settings, rule, splats, tile))
+    lookup = look_up(rule, texels, regions, _hits(settings, rule, splats, tile))
 
     def of_floats(splats, values, rho_probe):
         hit = _hits(settings, rule, splats, tile)
         return _show(settings, rule, splats, hit, pixel.values_at(rule, lookup, hit, values), at, tile, rho_probe)
 
     rho_probe = jnp.zeros((BLOCK, transmittance.shape[0]), transmittance.dtype) if settings.statistic else None
-    shown, pull_back = jax.vjp(of_floats, splats, _values(lookup), rho_probe)
+    shown, pull_back = jax.vjp(of_floats, splats, values_of(lookup), rho_probe)
     g = g[:, None]
     seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 
@@ -279,7 +279,7 @@ def _block_vjp(
     return *carry, (d_splats, d_probe, _texel_cotangents(lookup, d_values))
 
 
-def _values(lookup: Lookup | None) -> tuple[Array, ...]:
+def values_of(lookup: Lookup | None) -> tuple[Array, ...]:
     return () if lookup is None else lookup.sample.values
 
 
@@ -292,12 +292,12 @@ def _texel_cotangents(lookup: Lookup | None, d_values: tuple[Array, ...]) -> tup
 
 
 def _statistic(
-    settings: CompositingSettings, rule, jacobian, splats: Splats, tile: _Tile, d_rho: Array, weights: Array
+    settings: CompositingSettings, rule, jacobian, splats: Splats, tile: Tiles, d_rho: Array, weights: Array
 ) -> Array:
     """[B, 4]: Σ_pixels of the statistic, and the pixels composited."""
     assert settings.statistic is not None
-    x, y = _pixels_of_tile(settings.grid.tile_size, d_rho.dtype)
-    M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
+    x, y = pixels_of_tile(settings.grid.tile_size, d_rho.dtype)
+    M = jax.tree.map(lambda entry: entry[:, None], split(splats, False).M)
     at_pixel = M, x, y, tile.x, tile.y, d_rho, jacobian
     components = pixel.positional_gradient(settings.statistic, *at_pixel, settings.near_plane, rule.has_low_pass)
     return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_rho.dtype))], axis=1)
