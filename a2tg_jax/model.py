@@ -19,7 +19,7 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
-from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
+from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance, with_features
 from a2tg_jax.texture import AtlasLayout, Textures
 
 
@@ -167,6 +167,7 @@ class Model:
         self,
         camera: Camera,
         *,
+        features: Any = None,
         background: Any = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     ) -> RenderOutput:
@@ -174,12 +175,14 @@ class Model:
 
         Args:
           camera: the view.
-          background: [3] colour; None is the model's own.
+          features: [N, D] numbers to show in place of colours (`render_image`), one row for each allocated Gaussian.
+          background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
           settings: static options; `texture` is not used, for the appearance has options of its own.
         """
-        background = self.background if background is None else background
+        background = self.background if background is None and features is None else background
+        rule = with_features(self.rule, features, self.gaussians)
         return render_appearance(
-            self.gaussians, camera, self.rule, background=background, settings=settings, num_live=self.num_live
+            self.gaussians, camera, rule, background=background, settings=settings, num_live=self.num_live
         )
 
     def transform(self, similarity: Similarity) -> "Model":

@@ -14,9 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, PlainRule, StaticRule, TextureOptions, appearance_for
+from a2tg_jax.appearance import (
+    Appearance,
+    AppearanceRule,
+    Features,
+    PlainRule,
+    StaticRule,
+    TextureOptions,
+    appearance_for,
+)
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
 from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
@@ -77,7 +85,7 @@ class RenderOutput(NamedTuple):
     """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background."""
 
     color: Array
-    """[H, W, 3], background included, not clipped."""
+    """[H, W, 3], background included, not clipped; or [H, W, D] features."""
     alpha: Array
     """[H, W] in [0, 1], 1 − the final transmittance."""
     depth: Array
@@ -104,7 +112,8 @@ def render_image(
     textures: Textures | None = None,
     layout: AtlasLayout | None = None,
     *,
-    background: Any = (0, 0, 0),
+    features: Any = None,
+    background: Any = None,
     settings: RenderSettings = RenderSettings(),
 ) -> RenderOutput:
     """Render a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
@@ -113,7 +122,9 @@ def render_image(
       gaussians: N Gaussians.
       camera: the view.
       textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
-      background: [3] colour behind everything.
+      features: [N, D] numbers of each Gaussian to show in place of its colour, D >= 1, of either sign. They are
+        weighted as the colour is and not clipped: `color` is [H, W, D]. Of textures they see alpha only.
+      background: [3] colour, or [D] features, behind everything; None is 0.
       settings: static options. An eager call, also under `jax.grad`, needs no capacity and never overflows.
 
     Returns:
@@ -125,7 +136,7 @@ def render_image(
         has another number of Gaussians, or if an argument has a wrong shape.
     """
     check_gaussians(gaussians)
-    rule = rule_of(gaussians, textures, layout, settings)
+    rule = with_features(rule_of(gaussians, textures, layout, settings), features, gaussians)
     return render_appearance(gaussians, camera, rule, background=background, settings=settings)
 
 
@@ -134,14 +145,15 @@ def render_appearance(
     camera: Camera,
     rule: AppearanceRule,
     *,
-    background: Any = (0, 0, 0),
+    background: Any = None,
     settings: RenderSettings = RenderSettings(),
     num_live: Array | int | None = None,
 ) -> RenderOutput:
     """Render a view as `render_image` does, with an appearance rule; of the first `num_live` rows, if given."""
     check_gaussians(gaussians)
     check_camera(camera)
-    check_background(background)
+    background = (0,) * rule.num_colors if background is None else background
+    check_background(background, rule.num_colors)
     if num_live is not None:
         check_shape("num_live", num_live, ())
     settings = with_capacity(settings, gaussians, camera, rule, num_live)
@@ -150,14 +162,29 @@ def render_appearance(
     return output
 
 
-def check_background(background: Any) -> None:
-    """Raise ValueError unless the background is one colour."""
+def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> AppearanceRule:
+    """Return the rule that shows features [N, D] in place of colours; the same rule if features is None.
+
+    Raises:
+      ValueError: if the features are not floats [N, D] of the Gaussians' dtype, D >= 1.
+    """
+    if features is None:
+        return rule
+    check_floats("features", features, (gaussians.num, "D"))
+    if dtype_of(features) != gaussians.means.dtype or not np.shape(features)[1]:
+        found = f"{dtype_of(features)}{[*np.shape(features)]}"
+        raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
+    return Features(rule, jnp.asarray(features))
+
+
+def check_background(background: Any, num_colors: int = 3) -> None:
+    """Raise ValueError unless the background is one colour, of `num_colors` numbers."""
     if np.ndim(background) == 3:
         raise ValueError(
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
             "render on black and add (1 - output.alpha[..., None]) * image"
         )
-    check_shape("background", background, (3,))
+    check_shape("background", background, (num_colors,))
 
 
 @functools.cache
@@ -182,7 +209,7 @@ def render_traced(
 
     Args:
       gaussians, camera, rule: as for `render_appearance`.
-      background: [3] colour.
+      background: [3] colour, or as many numbers as the rule has colours.
       settings: static options, with a capacity.
       has_geometry: if False, depth, normal and distortion are zeros and cost nothing.
       sh_degree: replaces that of the settings; may be traced.
@@ -192,7 +219,7 @@ def render_traced(
     """
     compositor = choose(settings.compositor, settings.tile_size)
     compositing = _compositing_settings(
-        camera, settings, compositor, has_geometry, None if probe is None else statistic
+        camera, settings, compositor, has_geometry, None if probe is None else statistic, rule.num_colors
     )
     if gaussians.num == 0:
         return _empty_view(compositing, background), jnp.zeros((), jnp.float32)
@@ -226,7 +253,12 @@ def _refusal(compositing: CompositingSettings, rule: AppearanceRule, splats: Spl
 
 
 def _compositing_settings(
-    camera: Camera, settings: RenderSettings, compositor: Compositor, has_geometry: bool, statistic: Statistic | None
+    camera: Camera,
+    settings: RenderSettings,
+    compositor: Compositor,
+    has_geometry: bool,
+    statistic: Statistic | None,
+    num_colors: int,
 ) -> CompositingSettings:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     return CompositingSettings(
@@ -236,6 +268,7 @@ def _compositing_settings(
         statistic=statistic,
         compositor=compositor,
         tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor in ("xla", "autodiff") else 1,
+        num_colors=num_colors,
     )
 
 
@@ -248,13 +281,15 @@ def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOu
 
 
 def _output(compositing: CompositingSettings, channels, transmittance, background, overflow) -> RenderOutput:
-    color = jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
+    first = compositing.num_colors
+    color = jnp.moveaxis(channels[:first], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
     if not compositing.has_geometry:
         nothing = jnp.zeros_like(alpha)
-        return RenderOutput(color, alpha, nothing, jnp.zeros_like(color), overflow, nothing)
-    depth, squared = channels[3], channels[4]
-    normal = jnp.moveaxis(channels[5:8], 0, -1)
+        no_normal = jnp.zeros((*alpha.shape, 3), alpha.dtype)
+        return RenderOutput(color, alpha, nothing, no_normal, overflow, nothing)
+    depth, squared = channels[first], channels[first + 1]
+    normal = jnp.moveaxis(channels[first + 2 :], 0, -1)
     return RenderOutput(color, alpha, depth, normal, overflow, distortion=alpha * squared - depth * depth)
 
 

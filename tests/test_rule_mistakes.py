@@ -52,7 +52,9 @@ def test_other_results_are_named():
     with pytest.raises(ValueError, match=r"Wide.falloff must return one number.*it returned \(float32\[\], float32"):
         drawn(falloff)
     grey = register(type("Grey", (PlainRule,), {"own_colors": lambda self, gaussians, *_: gaussians.opacities}))()
-    with pytest.raises(ValueError, match=r"own_colors \[N, 3\] of N = 10 gaussians; Grey gave \(10,\)"):
+    with pytest.raises(
+        ValueError, match=r"own_colors \[N, 3\] of N = 10 gaussians, by its num_colors; Grey gave \(10,\)"
+    ):
         drawn(grey)
 
 

@@ -106,7 +106,6 @@ def test_pmap(monkeypatch):
 MODES = {
     "jvp": lambda f, x: jax.jvp(f, (x,), (x,)),
     "jvp under jit": lambda f, x: jax.jit(lambda x: jax.jvp(f, (x,), (x,)))(x),
-    "jacfwd": lambda f, x: jax.jacfwd(lambda factor: f(jax.tree.map(lambda leaf: factor * leaf, x)))(1.0),
     "linearize": lambda f, x: jax.linearize(f, x)[1](x),
     "forward over reverse": lambda f, x: jax.jvp(jax.grad(f), (x,), (x,)),
     "reverse over reverse": lambda f, x: jax.grad(lambda x: jnp.sum(jax.grad(f)(x).means))(x),
@@ -178,10 +177,8 @@ def test_derivatives_of_autodiff_are_those_of_differences():
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("order", ["reverse over forward", "reverse over reverse"])
-def test_all_orders_give_one_hessian(order):
-    camera = as_camera(SCENE, "float64")
-    gaussians = as_gaussians(SCENE, "float64")
+def test_gradient_of_a_gradient():
+    camera, gaussians = as_camera(SCENE, "float64"), as_gaussians(SCENE, "float64")
     parameters = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
     direction = jax.tree.map(jnp.sin, parameters)
 
@@ -189,13 +186,13 @@ def test_all_orders_give_one_hessian(order):
         settings = RenderSettings(capacity=64, compositor="autodiff", sh_degree=0)
         return jnp.sum(render_image(gaussians, camera, settings=settings).color ** 2)
 
-    wanted = jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (direction,))[1])(parameters)
-    inner = {
-        "reverse over forward": lambda x: jax.jvp(loss, (x,), (direction,))[1],
-        "reverse over reverse": lambda x: dot(jax.grad(loss)(x), direction),
-    }[order]
-    found = jax.jit(jax.grad(inner))(parameters)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-8, atol=1e-8), found, wanted)
+    found = jax.jit(jax.grad(lambda x: dot(jax.grad(loss)(x), direction)))(parameters)
+    gradient_of, step = jax.jit(jax.grad(loss)), 3e-6
+    ahead, behind = (gradient_of(moved(parameters, direction, by)) for by in (step, -step))
+    wanted = jax.tree.map(lambda a, b: (a - b) / (2 * step), ahead, behind)
+    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(wanted))
+    compare = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5 * largest)
+    jax.tree.map(compare, found, wanted)
 
 
 @pytest.mark.usefixtures("x64")

@@ -18,6 +18,7 @@ from a2tg_jax.appearance.options import TextureOptions as TextureOptions
 from a2tg_jax.appearance.plain import Plain as Plain
 from a2tg_jax.appearance.portable import appearance_for as appearance_for
 from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
+from a2tg_jax.appearance.rule import Features as Features
 from a2tg_jax.appearance.rule import GivenColors as GivenColors
 from a2tg_jax.appearance.rule import PlainRule as PlainRule
 from a2tg_jax.appearance.rule import RuleAround as RuleAround

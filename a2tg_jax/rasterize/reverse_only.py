@@ -1,7 +1,7 @@
 """The limits of the compositors that bring their own gradient, as errors that name the compositor to use.
 
 Native loops, Pallas kernels and the loops of XLA are differentiated once, in reverse mode. JAX's own errors in other
-modes name neither the renderer nor a remedy.
+modes name neither the renderer nor a remedy. (Under `vmap` of tangents, as in `jax.jacfwd`, JAX's error comes first.)
 """
 
 import functools

@@ -31,7 +31,7 @@ class Splats(NamedTuple):
     M: Array
     """[N, 3, 3] homographies from (u, v, 1) to pixels."""
     colors: Array
-    """[N, 3] colours of the spherical harmonics."""
+    """[N, D] own colours, or other features."""
     opacities: Array
     """[N] peak opacities."""
     normals: Array
@@ -56,15 +56,23 @@ class CompositingSettings(NamedTuple):
     tile_batch: int
     """Number of tiles that XLA composites at once; 1 with native loops and Pallas kernels."""
 
+    num_colors: int = 3
+    """Number D of colours of a splat."""
+
     @property
     def num_channels(self) -> int:
-        """Number D of channels: colour, and with geometry depth, depth² and normal."""
-        return 8 if self.has_geometry else 3
+        """Number of channels: colours, and with geometry depth, depth² and normal."""
+        return num_channels(self.has_geometry, self.num_colors)
 
     @property
     def num_groups(self) -> int:
         """Number of batches of tiles in the image."""
         return -(-self.grid.num // self.tile_batch)
+
+
+def num_channels(has_geometry: bool, num_colors: int) -> int:
+    """Return the number of composited channels: colours, and with geometry depth, depth² and normal."""
+    return num_colors + 5 if has_geometry else num_colors
 
 
 def project_gaussians(
@@ -111,8 +119,9 @@ def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, colors: 
             f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {name} "
             f"gave {opacities.shape} and {numbers.shape}"
         )
-    if colors.shape != (num, 3):
-        raise ValueError(f"a rule gives own_colors [N, 3] of N = {num} gaussians; {name} gave {colors.shape}")
+    if colors.shape != (num, rule.num_colors):
+        wanted = f"[N, {rule.num_colors}] of N = {num} gaussians, by its num_colors"
+        raise ValueError(f"a rule gives own_colors {wanted}; {name} gave {colors.shape}")
     if not 0 < rule.max_alpha < 1:
         raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {name} is {rule.max_alpha}")
     check_shading(StaticRule.of(rule), shading_arguments(rule.texels, rule.regions, numbers, colors))

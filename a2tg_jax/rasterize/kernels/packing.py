@@ -7,9 +7,9 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.rasterize.splats import Splats
 
 
-def num_numbers(has_geometry: bool) -> int:
-    """Numbers of every splat: the 9 entries of M, opacity, colour, and its normal where geometry is composited."""
-    return 16 if has_geometry else 13
+def num_numbers(has_geometry: bool, num_colors: int) -> int:
+    """Numbers of every splat: the 9 entries of M, opacity, colours, and its normal where geometry is composited."""
+    return 10 + num_colors + (3 if has_geometry else 0)
 
 
 def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
@@ -21,12 +21,13 @@ def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
 
 def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
     """Cotangents [N, S] as those of splats."""
-    first = num_numbers(has_geometry)
+    num_colors = like.colors.shape[1]
+    normal, first = 10 + num_colors, num_numbers(has_geometry, num_colors)
     return Splats(
         M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
         opacities=packed[:, 9].astype(like.opacities.dtype),
-        colors=packed[:, 10:13].astype(like.colors.dtype),
-        normals=packed[:, 13:16].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
+        colors=packed[:, 10:normal].astype(like.colors.dtype),
+        normals=packed[:, normal:first].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
         numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
     )
 

@@ -60,14 +60,15 @@ def _tile(grid: TileGrid, starts, dtype) -> _Tile:
     return _Tile(center_x, center_y, x, y, is_inside, starts[index], starts[index + 1])
 
 
-def _splat(splats, id_, has_geometry: bool) -> pixel.Splat:
+def _splat(splats, id_, settings: CompositingSettings) -> pixel.Splat:
     """A splat of those packed by `pack_splats`."""
-    first_of_rule = num_numbers(has_geometry)
+    has_geometry, normal_at = settings.has_geometry, 10 + settings.num_colors
+    first_of_rule = num_numbers(has_geometry, settings.num_colors)
     numbers = [splats[id_, k] for k in range(splats.shape[1])]
     M = tuple(tuple(numbers[3 * i : 3 * i + 3]) for i in range(3))
-    normal = tuple(numbers[13:16]) if has_geometry else None
+    normal = tuple(numbers[normal_at:first_of_rule]) if has_geometry else None
     of_rule = tuple(numbers[first_of_rule:])
-    return pixel.Splat(M, numbers[9], tuple(numbers[10:13]), normal, of_rule)  # type: ignore[arg-type]
+    return pixel.Splat(M, numbers[9], tuple(numbers[10:normal_at]), normal, of_rule)  # type: ignore[arg-type]
 
 
 def _look_up(
@@ -96,7 +97,7 @@ def _forward_kernel(settings: CompositingSettings, rule, ids, starts, splats, re
     def add_splat(carry):
         at, transmittance, live, channels = carry
         id_ = ids[at]
-        splat = _splat(splats, id_, settings.has_geometry)
+        splat = _splat(splats, id_, settings)
         planes = pixel.planes_of(splat.M, tile.center_x, tile.center_y)
         lookup = _look_up(settings, rule, regions, texels, id_, planes, tile)
         values = () if lookup is None else lookup.sample.values
@@ -125,7 +126,7 @@ def _backward_kernel(
     def add_splat(carry):
         at, transmittance, live, suffix_sum = carry
         id_ = ids[at]
-        splat = _splat(splats, id_, settings.has_geometry)
+        splat = _splat(splats, id_, settings)
         planes, to_M = jax.vjp(lambda M: pixel.planes_of(M, tile.center_x, tile.center_y), splat.M)
         lookup = _look_up(settings, rule, regions, texels, id_, planes, tile)
         # A number per pixel, so that each pixel has a cotangent of its own.

@@ -46,6 +46,7 @@ def _spec(
         near_plane=settings.near_plane,
         has_geometry=settings.has_geometry,
         statistic=settings.statistic,
+        num_colors=settings.num_colors,
     )
 
 

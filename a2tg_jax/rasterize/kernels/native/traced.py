@@ -14,6 +14,7 @@ from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.kernels.native import llvm_modules
 from a2tg_jax.rasterize.kernels.native.tracing import trace
 from a2tg_jax.rasterize.kernels.packing import num_numbers
+from a2tg_jax.rasterize.splats import num_channels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,20 +33,22 @@ class KernelSpec:
     near_plane: float
     has_geometry: bool
     statistic: pixel.Statistic | None
+    num_colors: int = 3
+    """D, colours of a splat."""
 
     @property
     def arguments(self) -> Arguments:
         """What the element-wise functions of the rule are called with."""
-        return Arguments(self.num_rule_numbers, self.num_columns, 3, self.dtype)
+        return Arguments(self.num_rule_numbers, self.num_columns, self.num_colors, self.dtype)
 
     @property
     def num_channels(self) -> int:
-        return 8 if self.has_geometry else 3
+        return num_channels(self.has_geometry, self.num_colors)
 
     @property
     def num_floats(self) -> int:
         """S: the splat's own numbers, and the squared distance beyond which it does not show."""
-        return num_numbers(self.has_geometry) + self.num_rule_numbers + 1
+        return num_numbers(self.has_geometry, self.num_colors) + self.num_rule_numbers + 1
 
     @property
     def lanes(self) -> int:
@@ -71,7 +74,7 @@ class Functions:
         flag = jax.ShapeDtypeStruct((), jnp.bool_)
         triple = (number,) * 3
         normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
-        splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
+        splat = pixel.Splat((triple,) * 3, number, (number,) * spec.num_colors, normal, numbers)
         values = (number,) * spec.num_columns
         region = TextureRegion(integer, integer, integer) if values else None
         lookup = Lookup(region, Sample(values, values, values)) if region else None
