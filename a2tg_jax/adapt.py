@@ -24,10 +24,8 @@ from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Shape,
 
 PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
-"""Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and what short stages need, where
-that would leave the statistic no time to settle."""
-
-
+"""Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and a longer one for short stages, in
+which the statistic needs more time to settle."""
 USUAL_SHARE = 0.25
 """Default share of the Gaussians that grow, for forecasts."""
 
@@ -243,7 +241,8 @@ def select(
         return _select_fraction(statistic, can_grow, fraction)
     if budget_bytes is not None:
         return within_budget(statistic, can_grow, added_bytes, budget_bytes)
-    return can_grow & (statistic > threshold)
+    chosen: np.ndarray = can_grow & (statistic > threshold)
+    return chosen
 
 
 def reallocate(

@@ -36,7 +36,8 @@ class Times(NamedTuple):
 
     def is_due(self, iteration: Array) -> Array:
         """Return whether the event follows this iteration."""
-        return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
+        is_due: Array = (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
+        return is_due
 
     def num_left(self, iteration: Any) -> Any:
         """Return the number of its times from an iteration on."""
@@ -44,13 +45,13 @@ class Times(NamedTuple):
 
     @property
     def last_time(self) -> int:
-        """The iteration of the last one (host)."""
-        return self.last - self.last % self.every
+        """Iteration of the last time (host)."""
+        return int(self.last - self.last % self.every)
 
     @property
     def num_times(self) -> int:
-        """How often it happens in all (host)."""
-        return max(0, self.num_left(max(1, self.first)))
+        """Number of all its times (host)."""
+        return max(0, int(self.num_left(max(1, self.first))))
 
 
 EVERY_ITERATION = Times(1, 2**31 - 1, 1)

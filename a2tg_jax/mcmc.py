@@ -295,7 +295,7 @@ class Noise(StepEvent):
 
 @event
 class Mcmc(StepEvent):
-    """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), of whatever appearance."""
+    """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance."""
 
     cap: int = static(default=500_000)
     """Largest number of Gaussians."""

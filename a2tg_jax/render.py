@@ -28,7 +28,7 @@ from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
 from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of, pallas_refusal
 from a2tg_jax.rasterize.kernels.native import composite as native
@@ -59,9 +59,9 @@ class RenderSettings:
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """How textures are read when Gaussians and textures are given apart (`render_image`, `plan_render`, `evaluate`).
+    """Texture options for Gaussians and textures given apart (`render_image`, `plan_render`, `evaluate`).
 
-    A `Model` and a rule have options of their own, which win: this field is then not used."""
+    A `Model` and a rule have their own options; this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
     compositor: Wanted = "auto"
@@ -188,8 +188,8 @@ def check_background(background: Any, num_colors: int = 3) -> None:
 
 
 @functools.cache
-def _jitted_render():
-    return jit(render_traced, static_argnums=(4,))
+def _jitted_render() -> Jitted[..., tuple[RenderOutput, Array]]:
+    return Jitted(render_traced, static_argnums=(4,))
 
 
 def render_traced(
@@ -280,7 +280,9 @@ def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOu
     return _output(compositing, channels, transmittance, background, jnp.asarray(False))
 
 
-def _output(compositing: CompositingSettings, channels, transmittance, background, overflow) -> RenderOutput:
+def _output(
+    compositing: CompositingSettings, channels: Array, transmittance: Array, background: Array, overflow: Array
+) -> RenderOutput:
     first = compositing.num_colors
     color = jnp.moveaxis(channels[:first], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
@@ -372,11 +374,13 @@ def pairs_of_view(
 
 
 @functools.cache
-def _jitted_count():
-    return jit(_count_pairs, static_argnums=(3, 4))
+def _jitted_count() -> Jitted[..., Array]:
+    return Jitted(_count_pairs, static_argnums=(3, 4))
 
 
-def _count_pairs(gaussians, camera, rule, tile_size, near_plane, num_live):
+def _count_pairs(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
+) -> Array:
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
@@ -405,7 +409,7 @@ def with_capacity(
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
-def _primal_value(x):
+def _primal_value(x: Any) -> Any:
     """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
     while isinstance(x, jax.core.Tracer):
         try:

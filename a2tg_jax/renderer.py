@@ -6,11 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
+from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.model import Model
 from a2tg_jax.render import (
     RenderOutput,
@@ -95,10 +96,10 @@ class Renderer:
             # A first view may see next to nothing; if all Gaussians are visible, each is in at least one tile.
             pairs = max(self._gaussians.num, *map(self._num_pairs, cameras))
             self.capacities[size] = capacity_for(pairs, FIRST_ROOM)
-        output, pairs = self._draw(camera)
+        output, needed = self._draw(camera)
         while bool(output.overflow):
-            self.capacities[size] = max(capacity_for(int(pairs)), GROWTH * self.capacities[size])
-            output, pairs = self._draw(camera)
+            self.capacities[size] = max(capacity_for(int(needed)), GROWTH * self.capacities[size])
+            output, needed = self._draw(camera)
         return output
 
     def _plan(self, cameras: list[Camera]) -> None:
@@ -111,19 +112,27 @@ class Renderer:
     def _num_pairs(self, camera: Camera) -> int:
         return pairs_of_view(self._gaussians, camera, self._rule, self._settings, self._num_live)
 
-    def _draw(self, camera: Camera):
+    def _draw(self, camera: Camera) -> tuple[RenderOutput, Array]:
         settings = dataclasses.replace(self._settings, capacity=self.capacities[camera.width, camera.height])
         draw = _jitted_draw()
         return draw(self._gaussians, self._num_live, camera, self._rule, self._background, settings, self._has_geometry)
 
 
 @functools.cache
-def _jitted_draw() -> jit:
+def _jitted_draw() -> Jitted[..., tuple[RenderOutput, Array]]:
     """Return the jitted drawing function; its cache counts the compilations."""
 
-    def draw(gaussians, num_live, camera, rule, background, settings, has_geometry):
+    def draw(
+        gaussians: Gaussians,
+        num_live: Array | None,
+        camera: Camera,
+        rule: AppearanceRule,
+        background: Array,
+        settings: RenderSettings,
+        has_geometry: bool,
+    ) -> tuple[RenderOutput, Array]:
         return render_traced(
             gaussians, camera, rule, background, settings, has_geometry=has_geometry, num_live=num_live
         )
 
-    return jit(draw, static_argnums=(5, 6))
+    return Jitted(draw, static_argnums=(5, 6))

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_floats, check_shape, short_repr
 
@@ -56,7 +57,8 @@ class AtlasLayout:
     @property
     def sizes(self) -> np.ndarray:
         """[N, 2] integers (Tv, Tu) (host)."""
-        return np.asarray(self.resolutions, np.int64).reshape(-1, 2)[np.asarray(self.bucket)]
+        sizes: np.ndarray = np.asarray(self.resolutions, np.int64).reshape(-1, 2)[np.asarray(self.bucket)]
+        return sizes
 
     @property
     def num_texels(self) -> int:
@@ -107,7 +109,7 @@ def bucket_capacity(count: int) -> int:
     """Return the rows allotted to `count` textures, rounded up to 1/16 of its power of two so that few shapes occur."""
     if count == 0:
         return 0
-    granule = max(1, 2 ** (count.bit_length() - 4))
+    granule: int = max(1, 2 ** (count.bit_length() - 4))
     return -(-count // granule) * granule
 
 
@@ -126,7 +128,7 @@ class Shape(NamedTuple):
         return sum(capacity * area for capacity, area in zip(self.capacities, areas, strict=True))
 
 
-def plan_layout(sizes, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[int, ...]]:
+def plan_layout(sizes: ArrayLike, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[int, ...]]:
     """Return the layout for textures of the given sizes, and the capacity of each bucket (host).
 
     Args:
@@ -172,7 +174,9 @@ def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape]) ->
     return min(fitting, key=lambda shape: shape.num_texels, default=new)
 
 
-def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Textures, AtlasLayout]:
+def allocate_textures(
+    sizes: ArrayLike, *, rgb: float = 0.0, dtype: DTypeLike = jnp.float32
+) -> tuple[Textures, AtlasLayout]:
     """Return textures of the given sizes with texels (rgb, rgb, rgb, 1); with rgb = 0 they change nothing.
 
     Args:
@@ -187,25 +191,25 @@ def allocate_textures(sizes, *, rgb: float = 0.0, dtype=jnp.float32) -> tuple[Te
     return Textures(buckets), layout
 
 
-def textures_from_arrays(arrays: Sequence) -> tuple[Textures, AtlasLayout]:
+def textures_from_arrays(arrays: Sequence[ArrayLike]) -> tuple[Textures, AtlasLayout]:
     """Make buckets from N arrays [Tv, Tu, 4] of one float dtype; the inverse of `texture_arrays`.
 
     Raises:
       ValueError: if an array is not floats [Tv, Tu, 4] with sides of 1 to 16, naming it.
     """
-    arrays = [np.asarray(array) for array in arrays]
-    for index, array in enumerate(arrays):
+    given = [np.asarray(array) for array in arrays]
+    for index, array in enumerate(given):
         if array.ndim != 3 or array.shape[2] != 4:
             raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(f"texture {index} must be floats; got {array.dtype}")
-    layout, capacities = plan_layout(np.array([a.shape[:2] for a in arrays], np.int64).reshape(-1, 2))
-    dtype = np.result_type(*arrays) if arrays else np.float32
+    layout, capacities = plan_layout(np.array([array.shape[:2] for array in given], np.int64).reshape(-1, 2))
+    dtype = np.result_type(*given) if given else np.float32
     filled = [
         np.tile(np.asarray(NEUTRAL_TEXEL, dtype), (capacity, *resolution, 1))
         for capacity, resolution in zip(capacities, layout.resolutions, strict=True)
     ]
-    for array, bucket, row in zip(arrays, np.asarray(layout.bucket), np.asarray(layout.row), strict=True):
+    for array, bucket, row in zip(given, np.asarray(layout.bucket), np.asarray(layout.row), strict=True):
         filled[bucket][row] = array
     return Textures(tuple(jnp.asarray(bucket) for bucket in filled)), layout
 

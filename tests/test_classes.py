@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.jit import classes_of, jit
+from a2tg_jax.core.jit import Jitted, classes_of
 from a2tg_jax.events import Change
 from a2tg_jax.mcmc import Noise
 from a2tg_jax.results.plan import fingerprint, plan_run
@@ -26,7 +26,7 @@ def numbered(index: int) -> type:
 
 def test_no_class_runs_the_program_of_another():
     """With `jax.jit`, about one in ten of so many does."""
-    function = jit(lambda rule, x: rule.value(x))
+    function = Jitted(lambda rule, x: rule.value(x))
     rules = [numbered(index)(2.0) for index in range(60)]
     assert [float(function(rule, jnp.float32(0))) for rule in rules] == list(range(60))
     assert function.num_compiled() == 60
@@ -42,7 +42,7 @@ def test_classes_are_those_of_all_nodes():
 
 
 def test_static_and_donated_arguments_are_counted_as_the_function_has_them():
-    function = jit(lambda name, x, y: x + y if name == "add" else x - y, static_argnums=(0,), donate_argnums=(2,))
+    function = Jitted(lambda name, x, y: x + y if name == "add" else x - y, static_argnums=(0,), donate_argnums=(2,))
     gone = jnp.ones(3)
     assert float(function("add", jnp.ones(3), gone)[0]) == 2 and gone.is_deleted()
     assert float(function("subtract", jnp.ones(3), jnp.ones(3))[0]) == 0

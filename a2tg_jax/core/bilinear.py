@@ -64,7 +64,7 @@ class Lookup(NamedTuple):
 def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
     """Return the texels above left, above right, below left and below right of (x, y); weight 0 without a texture."""
     right_most, bottom_most = jnp.maximum(region.width - 1, 0), jnp.maximum(region.height - 1, 0)
-    # Whatever x and y are, nothing outside of the texture is read.
+    # Clipped, so that no x or y reads outside the texture.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
     top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
     right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
@@ -83,7 +83,7 @@ def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
 def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ...]) -> Sample:
     """Return the sample, given the C numbers of each corner's texel."""
 
-    def weighed(weights):
+    def weighed(weights: list[Array]) -> tuple[Array, ...]:
         return tuple(
             sum(weight * number for weight, number in zip(weights, column, strict=True))
             for column in zip(*texels, strict=True)

@@ -63,5 +63,5 @@ def _fits(shape: tuple[int, ...], wanted: Wanted) -> bool:
     return all(sizes.setdefault(side, side if isinstance(side, int) else n) == n for n, side in zip(shape, wanted))  # noqa: B905
 
 
-def _written(shape: tuple) -> str:
+def _written(shape: tuple[int | str, ...]) -> str:
     return f"[{', '.join(str(side) for side in shape)}]"

@@ -4,12 +4,15 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 """
 
 import dataclasses
+import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.checks import check_floats, dtype_of, short_repr
@@ -61,9 +64,10 @@ class Gaussians:
         """[N] peak opacities in (0, 1)."""
         return jax.nn.sigmoid(self.logit_opacities)
 
-    def __getitem__(self, rows) -> "Gaussians":
+    def __getitem__(self, rows: Any) -> "Gaussians":
         """Return the Gaussians of the given rows (slice, mask or index array)."""
-        return jax.tree.map(lambda x: x[rows], self)
+        chosen: Gaussians = jax.tree.map(lambda x: x[rows], self)
+        return chosen
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -113,7 +117,13 @@ def logit(p: Array) -> Array:
 
 
 def init_from_points(
-    points, colors, num: int | None = None, seed: int = 0, *, opacity: float = INITIAL_OPACITY, sh_degree: int = 3
+    points: ArrayLike,
+    colors: ArrayLike,
+    num: int | None = None,
+    seed: int = 0,
+    *,
+    opacity: float = INITIAL_OPACITY,
+    sh_degree: int = 3,
 ) -> Gaussians:
     """Make initial Gaussians from the points of a sparse reconstruction.
 
@@ -154,7 +164,7 @@ def init_from_points(
     sh = np.zeros((count, NUM_BASES[sh_degree], 3))
     sh[:, 0] = (colors - 0.5) / SH_C0
     quats = rng.normal(size=(count, 4))
-    as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    as_float = functools.partial(jnp.asarray, dtype=jnp.float32)
     return Gaussians(
         means=as_float(points),
         quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),

@@ -5,6 +5,7 @@ matrix, M = K·[Rc·R₀·s_x | Rc·R₁·s_y | Rc·μ + t]. Its last row gives 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,6 +18,9 @@ from a2tg_jax.core.gaussians import Gaussians, rotation_columns
 POLYGON_SIDES = 8
 BOUND_SLACK = 1e-2
 """Margin of every bound for rounding, in squared pixels."""
+Triple = tuple[Array, Array, Array]
+Box = tuple[Array, Array, Array, Array]
+"""Left, top, right and bottom edge, in pixels."""
 
 
 def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
@@ -86,7 +90,7 @@ def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
     return ScreenBounds(left, top, right, bottom, bounds.outline)
 
 
-def unclipped_bounds(M, cutoff: Array, near_plane: float) -> ScreenBounds:
+def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: float) -> ScreenBounds:
     """Return `screen_bounds` of rows M[i][k]; element-wise. If the outline is clipped, the box is meaningless.
 
     M is shifted to the projected mean, which keeps float32 exact to a fraction of a pixel.
@@ -117,7 +121,7 @@ def unclipped_bounds(M, cutoff: Array, near_plane: float) -> ScreenBounds:
     )
 
 
-def clipped_box(M, outline: Outline, cutoff: Array, near_plane: float) -> tuple[Array, Array, Array, Array]:
+def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, near_plane: float) -> Box:
     """Return left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise.
 
     The result is valid only if the outline is clipped.
@@ -132,7 +136,7 @@ def clipped_box(M, outline: Outline, cutoff: Array, near_plane: float) -> tuple[
     mean_x, mean_y, radius = outline.mean_x, outline.mean_y, outline.radius
     box = mean_x, mean_y, mean_x, mean_y
 
-    def joined(box, is_valid, point):
+    def joined(box: Box, is_valid: Array, point: Sequence[Array]) -> Box:
         x, y, depth = point
         depth = jnp.where(is_valid, jnp.maximum(depth, near_plane), 1.0)
         x, y = jnp.where(is_valid, x / depth, mean_x), jnp.where(is_valid, y / depth, mean_y)

@@ -9,6 +9,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_floats, check_shape
 from a2tg_jax.core.numerics import safe_divide, safe_norm
@@ -44,7 +45,7 @@ class GradientStatistics:
     """[N] int32 number of views in which the Gaussian was composited at one or more pixels."""
 
     @staticmethod
-    def init(num: int, dtype=jnp.float32) -> "GradientStatistics":
+    def init(num: int, dtype: DTypeLike = jnp.float32) -> "GradientStatistics":
         """Return empty sums for `num` Gaussians."""
         return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
 

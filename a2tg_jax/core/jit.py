@@ -1,4 +1,4 @@
-"""A `jit` that tells programs apart by the classes of their arguments.
+"""`jax.jit` that tells programs apart by the classes of their arguments.
 
 JAX (0.10 to 0.12) considers the tree structures of two registered dataclasses equal if only their classes differ, such
 as a rule and a subclass that overrides `shade`. Their hashes differ, but `jax.jit` compares only seven bits of them, so
@@ -6,9 +6,12 @@ that one such pair in 128 would run each other's program.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import jax
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def classes_of(tree: Any) -> tuple[type, ...]:
@@ -23,17 +26,17 @@ def classes_of(tree: Any) -> tuple[type, ...]:
     return tuple(classes)
 
 
-class jit:
-    """`jax.jit` of a function, compiled anew for other classes of arguments."""
+class Jitted(Generic[P, R]):
+    """Function under `jax.jit`, compiled anew for other classes of arguments."""
 
     def __init__(
         self,
-        function: Callable,
+        function: Callable[P, R],
         *,
         static_argnums: tuple[int, ...] = (),
         donate_argnums: tuple[int, ...] = (),
     ):
-        def of_classes(classes, /, *args, **kwargs):
+        def of_classes(classes: tuple[type, ...], /, *args: P.args, **kwargs: P.kwargs) -> R:
             return function(*args, **kwargs)
 
         of_classes.__name__ = of_classes.__qualname__ = function.__name__  # shown in profiles
@@ -43,12 +46,13 @@ class jit:
             donate_argnums=tuple(number + 1 for number in donate_argnums),
         )
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self._jitted(classes_of((args, kwargs)), *args, **kwargs)
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        result: R = self._jitted(classes_of((args, kwargs)), *args, **kwargs)
+        return result
 
     def num_compiled(self) -> int:
         """Return the number of compiled programs of this function in this process."""
-        return self._jitted._cache_size()
+        return int(self._jitted._cache_size())
 
     def clear_cache(self) -> None:
         """Forget the compiled programs."""

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_shape
 
@@ -34,7 +35,7 @@ class AdamState:
     """int32 number of updates so far."""
 
 
-def adam_init(params) -> AdamState:
+def adam_init(params: Any) -> AdamState:
     """Return the state before the first update: zero moments.
 
     Args:
@@ -45,9 +46,9 @@ def adam_init(params) -> AdamState:
 
 
 def adam_update(
-    params, grads, state: AdamState, rates, *, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
+    params: Any, grads: Any, state: AdamState, rates: Any, *, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
 ) -> OptStep:
-    """Make one update of Adam (Kingma & Ba, 2015), bias-corrected; ε is added after the correction, as in PyTorch.
+    """Make one bias-corrected update of Adam (Kingma & Ba, 2015); ε is added after the correction, as in PyTorch.
 
     Args:
       params: pytree of float arrays.
@@ -71,12 +72,13 @@ def adam_update(
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
-    def step(rate, param, m, v):
+    def step(rate: Any, param: Array, m: Array, v: Array) -> Array:
         rate = jnp.asarray(rate, param.dtype)
         if rate.ndim and (rate.ndim != param.ndim or jnp.broadcast_shapes(rate.shape, param.shape) != param.shape):
             raise ValueError(f"rates must broadcast to {[*param.shape]} at equal rank; got {[*rate.shape]}")
         root = jnp.sqrt(v) / jnp.sqrt(_bias_correction(b2, count, param.dtype))
-        return param - rate / _bias_correction(b1, count, param.dtype) * (m / (root + eps))
+        change: Array = rate / _bias_correction(b1, count, param.dtype) * (m / (root + eps))
+        return param - change
 
     params = jax.tree.map(step, jax.tree.broadcast(rates, params), params, mu, nu)
     return OptStep(params=params, state=AdamState(mu, nu, count))
@@ -98,7 +100,7 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     return start * jnp.exp(math.log(final_factor) * progress)
 
 
-def _check_like(name: str, tree, params) -> None:
+def _check_like(name: str, tree: Any, params: Any) -> None:
     """Raise ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
     found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
     if found != wanted:
@@ -108,6 +110,6 @@ def _check_like(name: str, tree, params) -> None:
         check_shape(f"{name}{jax.tree_util.keystr(path)}", leaf, jnp.shape(param))
 
 
-def _bias_correction(decay: float, count: Array, dtype) -> Array:
+def _bias_correction(decay: float, count: Array, dtype: DTypeLike) -> Array:
     """Return 1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
     return -jnp.expm1(count.astype(dtype) * math.log(decay))

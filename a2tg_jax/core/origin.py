@@ -6,6 +6,7 @@ With an origin, a model can be rendered, flown past and moved without the photog
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -82,7 +83,7 @@ class Origin:
     # Arrays have no hash of their own, and jit asks for one of everything that is static.
 
     @functools.cached_property
-    def _content(self) -> tuple:
+    def _content(self) -> tuple[Any, ...]:
         arrays = (self.viewmats, self.Ks, self.sizes, self.is_test, self.transform.rotation, self.transform.translation)
         texts = tuple(np.ascontiguousarray(array).tobytes() for array in arrays)
         learned = tuple((name, rows.shape, rows.tobytes()) for name, rows in sorted(self.corrections.items()))

@@ -5,6 +5,7 @@ L = 16 bases, degree 0 first; (x, y, z) is a unit vector from the camera to the 
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from a2tg_jax.core.numerics import normalize
 
@@ -39,13 +40,13 @@ def sh_basis(directions: Array) -> Array:
     )
 
 
-def degree_mask(degree) -> Array:
+def degree_mask(degree: ArrayLike) -> Array:
     """Return a mask [16] of the bases up to `degree`, which may be traced."""
     degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
     return degrees <= jnp.asarray(degree, jnp.int32)
 
 
-def sh_sum(sh: Array, means: Array, center: Array, degree) -> Array:
+def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
     """Return the view-dependent sums [N, 3], Σ Y_l·sh_l; colours are max(sum + 0.5, 0).
 
     Args:

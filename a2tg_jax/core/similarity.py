@@ -21,7 +21,8 @@ class Similarity:
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Return positions [..., 3] in the new world; `scale` multiplies lengths, `rotation` directions."""
-        return self.scale * np.asarray(points) @ self.rotation.T + self.translation
+        moved: np.ndarray = self.scale * np.asarray(points) @ self.rotation.T + self.translation
+        return moved
 
     def apply_to_viewmat(self, viewmat: np.ndarray) -> np.ndarray:
         """Return the world-to-camera matrix [4, 4] of the new world for one of the old; again a rigid motion.
@@ -58,4 +59,5 @@ def check_similarity(similarity: Similarity, what: str) -> None:
 
 def camera_centers(viewmats: np.ndarray) -> np.ndarray:
     """Return the positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
-    return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers: np.ndarray = np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    return -centers

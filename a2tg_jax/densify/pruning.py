@@ -17,7 +17,7 @@ from jax import Array
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View, counted_pixels, views_by_size
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, gather_moments, gather_rows, static
@@ -99,8 +99,8 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
 
 
 @functools.cache
-def _jitted() -> jit:
-    return jit(_weights, static_argnums=(3,))
+def _jitted() -> Jitted[..., Array]:
+    return Jitted(_weights, static_argnums=(3,))
 
 
 def _weights(model: Model, cameras: Camera, counted: Array, settings: RenderSettings) -> Array:

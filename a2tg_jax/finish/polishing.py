@@ -18,7 +18,7 @@ from jax import Array
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
 from a2tg_jax.model import Model
@@ -76,8 +76,8 @@ def polish(
 
 
 @functools.cache
-def _jitted() -> jit:
-    return jit(_solve, static_argnums=(3, 4))
+def _jitted() -> Jitted[..., Colors]:
+    return Jitted(_solve, static_argnums=(3, 4))
 
 
 def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):

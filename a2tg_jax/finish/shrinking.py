@@ -20,7 +20,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.data import View
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model
@@ -223,8 +223,8 @@ def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textu
 
 
 @functools.cache
-def _jitted() -> jit:
-    return jit(_weights_in, static_argnums=(4,))
+def _jitted() -> Jitted[..., Textures]:
+    return Jitted(_weights_in, static_argnums=(4,))
 
 
 def _weights_in(model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings) -> Textures:

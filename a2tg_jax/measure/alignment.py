@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import View, view_image
@@ -99,8 +99,8 @@ def _aligned(view: View, model: Model, background: Array, settings: RenderSettin
 
 
 @functools.cache
-def _jitted_descent() -> jit:
-    return jit(_descent, static_argnums=(6, 7))
+def _jitted_descent() -> Jitted[..., _Best]:
+    return Jitted(_descent, static_argnums=(6, 7))
 
 
 def _descent(gaussians, rule, camera: Camera, target: Array, mask, background, settings, num_steps: int) -> _Best:

@@ -8,12 +8,14 @@ The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so tha
 
 import functools
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, StaticRule
+from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.rasterize.kernels import autodiff
 from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
 from a2tg_jax.rasterize.reverse_only import once, reverse_only
@@ -50,28 +52,37 @@ def composite(
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _composite_tiles(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
+def _composite_tiles(
+    settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group, P pixels a tile."""
     return _forward(settings, rule, splats, texels, regions, cutoff, lists)
 
 
-def _forward(settings, rule, *arrays):
+def _forward(settings: CompositingSettings, rule: StaticRule, *arrays: Any) -> tuple[Array, Array]:
     forward = functools.partial(_kernels(settings.compositor).forward, settings, rule)
-    return once(settings.compositor, forward, *arrays)
+    shown: tuple[Array, Array] = once(settings.compositor, forward, *arrays)
+    return shown
 
 
-def _composite_tiles_fwd(settings, rule, splats, texels, regions, cutoff, lists, jacobian, probe):
+def _composite_tiles_fwd(
+    settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
+) -> tuple[tuple[Array, Array], tuple[Any, ...]]:  # fmt: skip
     shown = _forward(settings, rule, splats, texels, regions, cutoff, lists)
     return shown, (splats, texels, regions, cutoff, lists, jacobian, probe, *shown)
 
 
-def _composite_tiles_bwd(settings, rule, residuals, cotangents):
+def _composite_tiles_bwd(
+    settings: CompositingSettings, rule: StaticRule, residuals: tuple[Any, ...], cotangents: tuple[Array, Array]
+) -> tuple[Splats, Array, None, None, None, None, Array]:
     *arrays, channels, transmittance = residuals
     g, g_transmittance = cotangents
     suffix_sum = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
     backward = functools.partial(_kernels(settings.compositor).backward, settings, rule)
-    cotangents = once(settings.compositor, backward, *arrays, g, suffix_sum)
-    d_splats, d_texels, d_probe = cotangent_of((arrays[0], arrays[1], arrays[-1]), cotangents)
+    found = once(settings.compositor, backward, *arrays, g, suffix_sum)
+    d_splats, d_texels, d_probe = cotangent_of((arrays[0], arrays[1], arrays[-1]), found)
     return d_splats, d_texels, None, None, None, None, d_probe
 
 

@@ -8,7 +8,8 @@ M₀, M₁, M₂ are the rows of the homography, T the transmittance in front of
 (`suffix_sum`) the sum over the splats from here to the last one of their products with g.
 """
 
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,10 @@ MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
 
 Triple = tuple[Array, Array, Array]
+Rows = tuple[Triple, Triple, Triple]
+"""Rows of a homography."""
+State = tuple[Array, Array, Array]
+"""Transmittance and liveness behind a splat, and `suffix_sum` of the splats behind it."""
 Statistic = Literal["position", "screen", "center"]
 """Statistics of densification, computed in the backward pass (`positional_gradient`)."""
 
@@ -29,7 +34,7 @@ Statistic = Literal["position", "screen", "center"]
 class Splat(NamedTuple):
     """Differentiable numbers of a splat, without its texture."""
 
-    M: tuple[Triple, Triple, Triple]
+    M: Rows
     """Rows of the homography from (u, v, 1) to pixels."""
     opacity: Array
     """Peak opacity, before the falloff."""
@@ -89,7 +94,7 @@ def _cross(a: Triple, b: Triple) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def planes_of(M: tuple[Triple, Triple, Triple], x: Array, y: Array) -> Planes:
+def planes_of(M: Rows, x: Array, y: Array) -> Planes:
     """Return the planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1)."""
     last = M[2]
     # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
@@ -155,7 +160,7 @@ def show(
       rho_probe: zero, added to ρ of the falloff to read the gradient there; or None.
     """
     residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
-    # The slope of a falloff at infinity need not be a number.
+    # The slope of a falloff at infinity may be NaN.
     rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
     rho = rho if rho_probe is None else rho + rho_probe
     a = splat.opacity * rule.falloff(splat.numbers, rho)
@@ -181,7 +186,9 @@ def absorb(alpha: Array, transmittance: Array, is_live: Array) -> Triple:
     return weight, transmittance - weight, is_live
 
 
-def absorb_vjp(alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, shown: Array):
+def absorb_vjp(
+    alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, shown: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return the results of `absorb` and ∂L/∂α, walking front to back.
 
     B = Σ g·c·α·T over the splats behind + g_T·T_final is linear in 1 − α of this splat, so that
@@ -215,7 +222,10 @@ class Cotangents(NamedTuple):
     """∂L/∂ρ through the falloff, if requested."""
 
 
-def blend(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values, x, y, transmittance, is_live):
+def blend(
+    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values: tuple[Array, ...], x: Array,
+    y: Array, transmittance: Array, is_live: Array,
+) -> tuple[tuple[Array, ...], Array, Array]:  # fmt: skip
     """Return the contribution of one splat at one pixel to the channels, and transmittance and liveness behind it."""
     shown = show(rule, splat, intersect(planes, x, y, near_plane, rule.has_low_pass), values)
     weight, transmittance, is_live = absorb(shown.alpha, transmittance, is_live)
@@ -223,9 +233,9 @@ def blend(rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat,
 
 
 def blend_vjp(
-    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x, y,
-    transmittance, is_live, suffix_sum, g, has_rho: bool,
-):  # fmt: skip
+    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x: Array, y: Array,
+    transmittance: Array, is_live: Array, suffix_sum: Array, g: Sequence[Array], has_rho: bool,
+) -> tuple[State, Array, Cotangents]:  # fmt: skip
     """Differentiate `blend`; `suffix_sum` and `g` are those of `absorb_vjp`, g channel by channel.
 
     Returns:
@@ -233,7 +243,10 @@ def blend_vjp(
       weight is positive; elsewhere they may not even be finite.
     """
 
-    def of_floats(planes, opacity, color, normal, numbers, values, rho_probe):
+    def of_floats(
+        planes: Planes, opacity: Array, color: Triple, normal: Triple | None, numbers: tuple[Array, ...],
+        values: tuple[Array, ...], rho_probe: Array | None,
+    ) -> Shown:  # fmt: skip
         hit = intersect(planes, x, y, near_plane, rule.has_low_pass)
         values = values_at(rule, lookup, hit, values)
         return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_probe)
@@ -242,16 +255,17 @@ def blend_vjp(
     values = () if lookup is None else lookup.sample.values
     floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, rho_probe
     shown, pull_back = jax.vjp(of_floats, *floats)
-    seen = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
-    state = transmittance, is_live, suffix_sum
-    weight, *state, d_alpha = absorb_vjp(shown.alpha, *state, seen)
+    seen: Any = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
+    weight, transmittance, is_live, suffix_sum, d_alpha = absorb_vjp(
+        shown.alpha, transmittance, is_live, suffix_sum, seen
+    )
     cotangents = Cotangents(*pull_back(Shown(d_alpha, tuple(weight * g_k for g_k in g))))
-    return tuple(state), weight, cotangents
+    return (transmittance, is_live, suffix_sum), weight, cotangents
 
 
 def positional_gradient(
-    statistic: Statistic, M, x: Array, y: Array, tile_x, tile_y, d_rho: Array, jacobian, near_plane: float,
-    has_low_pass: bool,
+    statistic: Statistic, M: Rows, x: Array, y: Array, tile_x: Array, tile_y: Array, d_rho: Array,
+    jacobian: Sequence[Sequence[Array]] | Array, near_plane: float, has_low_pass: bool,
 ) -> Triple:  # fmt: skip
     """Return a pixel's contribution to a statistic of densification, through the falloff only; zero where `d_rho` is.
 
@@ -271,8 +285,8 @@ def positional_gradient(
     axes = tuple((row[0], row[1]) for row in M)
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
 
-    def rho(mean):
-        rows = tuple((*axes[i], mean[i]) for i in range(3))
+    def rho(mean: Triple) -> tuple[Array, Array]:
+        rows: Any = tuple((*axes[i], mean[i]) for i in range(3))
         hit = intersect(planes_of(rows, tile_x, tile_y), x, y, near_plane, has_low_pass)
         return hit.rho, hit.is_ray
 

@@ -66,7 +66,10 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
 
 def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
     """Return the first tile along an axis with a pixel centre in [low, high], and the number of such tiles."""
-    as_pixels = lambda x: jnp.clip(x, -1.0, 1e6).astype(jnp.int32)  # noqa: E731
+
+    def as_pixels(x: Array) -> Array:
+        return jnp.clip(x, -1.0, 1e6).astype(jnp.int32)
+
     nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
     first = jnp.maximum(as_pixels(jnp.ceil(low - 0.5)), nothing)
     last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), last_pixel)
@@ -90,14 +93,14 @@ def total_pairs(counts: Array) -> Array:
 
 
 def exceeds(total: Array, capacity: int) -> Array:
-    """Return whether a number of pairs, known to about 2⁻²⁰ of itself, may exceed the capacity."""
+    """Return whether a number of pairs, known to a relative error of about 2⁻²⁰, may exceed the capacity."""
     return total + jnp.floor(total * 2.0**-20) > capacity
 
 
 def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:
     """Return whether an outline reaches a pixel centre of the tile with first pixel (x0, y0); element-wise."""
 
-    def distance_to_box(origin_x, origin_y):
+    def distance_to_box(origin_x: Array, origin_y: Array) -> tuple[Array, Array, Array, Array]:
         left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
         return left, left + (tile_size - 1), top, top + (tile_size - 1)
 
@@ -108,7 +111,7 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
     y_on_side = jnp.clip(xy / xx * x_side, top, bottom)
     x_on_side = jnp.clip(xy / yy * y_side, left, right)
 
-    def squared_distance(x, y):
+    def squared_distance(x: Array, y: Array) -> Array:
         return yy * x * x - 2 * xy * x * y + xx * y * y
 
     nearest = jnp.minimum(squared_distance(x_side, y_on_side), squared_distance(x_on_side, y_side))
@@ -119,12 +122,12 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
 
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
-    """Lists of the splats that touch each tile, ordered by depth, ties by index.
+    """List the splats that touch each tile, ordered by depth, ties by index.
 
     Args:
       M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
-      grid: the tiles.
-      capacity: how many pairs there is room for, before the outline test; `overflow` tells when it did not suffice.
+      grid: tiles of the image.
+      capacity: number of pairs that fit, before the outline test; `overflow` tells if there were more.
     """
     bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)

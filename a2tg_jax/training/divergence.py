@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt, attempt
 
@@ -39,8 +39,8 @@ def largest_loss(history: History) -> float:
 
 
 @functools.cache
-def _jitted_attempt() -> jit:
-    return jit(attempt, static_argnums=(0,))
+def _jitted_attempt() -> Jitted[..., Attempt]:
+    return Jitted(attempt, static_argnums=(0,))
 
 
 def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:

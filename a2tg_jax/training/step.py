@@ -16,7 +16,7 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
-from a2tg_jax.core.jit import jit
+from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, Times
@@ -112,9 +112,9 @@ class Attempt(NamedTuple):
 
 
 @functools.cache
-def jitted_step() -> jit:
-    """`train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
-    return jit(train_step, static_argnums=(0,), donate_argnums=(3,))
+def jitted_step() -> Jitted[..., tuple[TrainState, StepInfo]]:
+    """Return `train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
+    return Jitted(train_step, static_argnums=(0,), donate_argnums=(3,))
 
 
 def train_step(

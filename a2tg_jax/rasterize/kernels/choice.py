@@ -1,4 +1,4 @@
-"""Which compositor runs where."""
+"""Choice of the compositor."""
 
 import functools
 import importlib.util
@@ -8,8 +8,8 @@ from types import ModuleType
 
 import jax
 
-# It registers configuration that belongs to every trace's key: imported during the first trace (by `lanes`, on use), it
-# would have JAX trace and compile all of it a second time.
+# It registers configuration that is part of every trace's key. `lanes` imports it on use: during the first trace, it
+# would make JAX trace and compile everything a second time.
 import jax.extend.core
 
 from a2tg_jax.appearance import Arguments, StaticRule, takes_arrays
@@ -17,11 +17,11 @@ from a2tg_jax.rasterize.splats import Compositor, Wanted
 
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 MAX_TILE_SIZE = 64
-"""Native loops keep a tile on the stack."""
+"""Largest side of a tile in pixels; native loops keep a tile on the stack."""
 
 
 def choose(wanted: Wanted, tile_size: int) -> Compositor:
-    """The compositor that is wanted, or with "auto" the fastest that JAX's default backend can run.
+    """Return the compositor that is wanted, or with "auto" the fastest one for JAX's default backend.
 
     Raises:
       ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
@@ -44,8 +44,10 @@ def choose(wanted: Wanted, tile_size: int) -> Compositor:
 
 
 def wants_determinism() -> bool:
-    """Whether the environment's XLA_FLAGS ask for a GPU that computes the same twice: Pallas' kernels do not, for they
-    add atomically."""
+    """Return whether XLA_FLAGS in the environment ask for reproducible results on GPUs.
+
+    The Pallas kernels add atomically, so that their results are not.
+    """
     asked = dict.fromkeys(DETERMINISM_FLAGS, False)
     for word in os.environ.get("XLA_FLAGS", "").split():
         flag, _, value = word.partition("=")
@@ -55,10 +57,10 @@ def wants_determinism() -> bool:
 
 
 def instead_of(wanted: Wanted, rule: type, reason: str) -> Compositor:
-    """The compositor for a rule that native loops or Pallas kernels cannot run: XLA, with one warning per rule.
+    """Return the compositor for a rule that native loops or Pallas kernels cannot run: XLA, with a warning per rule.
 
     Raises:
-      ValueError: if a compositor was asked for by name.
+      ValueError: if a compositor is required by name.
     """
     if wanted != "auto":
         raise ValueError(f"compositor={wanted!r} cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
@@ -72,7 +74,7 @@ def _warn_of_fallback(rule: type, reason: str) -> None:
 
 
 def pallas_refusal(static: StaticRule, arguments: Arguments) -> str | None:
-    """Why there can be no Pallas kernels for a rule; None if there are."""
+    """Return why there can be no Pallas kernels for a rule; None if there can."""
     if takes_arrays(static, arguments):
         return None
     return "Pallas kernels call a rule with arrays of pixels, and this one takes scalars only"
@@ -80,7 +82,7 @@ def pallas_refusal(static: StaticRule, arguments: Arguments) -> str | None:
 
 @functools.cache
 def has_native() -> bool:
-    """Whether native loops can be made here: XLA runs on the CPU, and llvmlite is installed."""
+    """Return whether native loops are available: XLA runs on the CPU, and llvmlite is installed."""
     return jax.default_backend() == "cpu" and _is_installed("llvmlite")
 
 
@@ -93,7 +95,7 @@ def _is_installed(name: str) -> bool:
 
 @functools.cache
 def has_pallas() -> bool:
-    """Whether Pallas kernels can be compiled here: XLA runs on a GPU, and JAX still has the Triton backend."""
+    """Return whether Pallas kernels are available: XLA runs on a GPU, and JAX has the Triton backend."""
     if jax.default_backend() != "gpu":
         return False
     if triton() is None:
@@ -106,7 +108,7 @@ def has_pallas() -> bool:
 
 @functools.cache
 def triton() -> ModuleType | None:
-    """Pallas on Triton, or None where JAX has dropped it."""
+    """Return JAX's module of Pallas on Triton; None if this JAX has none."""
     try:
         from jax.experimental.pallas import triton as module
     except ImportError:

@@ -1,4 +1,4 @@
-"""The splats and their texture regions as plain arrays, as kernels read them; and their cotangents back again."""
+"""Splats and their texture regions as plain arrays for kernels, and cotangents back from such arrays."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -8,19 +8,19 @@ from a2tg_jax.rasterize.splats import Splats
 
 
 def num_numbers(has_geometry: bool, num_colors: int) -> int:
-    """Numbers of every splat: the 9 entries of M, opacity, colours, and its normal where geometry is composited."""
+    """Return the numbers per splat: the 9 entries of M, opacity, colours, and with geometry the normal."""
     return 10 + num_colors + (3 if has_geometry else 0)
 
 
 def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
-    """[N, S] with one splat a row, in the order of `rasterize.pixel.Splat`, and further columns [N] after it."""
+    """Pack splats as [N, S], one per row in the order of `rasterize.pixel.Splat`, followed by further columns [N]."""
     columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
     columns += [splats.normals] if has_geometry else []
     return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
 
 
 def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
-    """Cotangents [N, S] as those of splats."""
+    """Unpack cotangents [N, S] as those of splats."""
     num_colors = like.colors.shape[1]
     normal, first = 10 + num_colors, num_numbers(has_geometry, num_colors)
     return Splats(
@@ -33,7 +33,7 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
 
 
 def pack_regions(regions: TextureRegion | None, least_columns: int = 0) -> Array:
-    """[N, 3] int32 `TextureRegion` of every splat; without textures there is one row of `least_columns`."""
+    """Pack the `TextureRegion` of every splat as int32 [N, 3]; without textures [1, least_columns]."""
     if regions is None:
         return jnp.zeros((1, least_columns), jnp.int32)
     return jnp.stack(regions, axis=1).astype(jnp.int32)

@@ -1,19 +1,20 @@
-"""Compositing by XLA, on every device: what the kernels beside it do, said with array operations only.
+"""Compositing by XLA on every device, with array operations only; tests compare `native` and `pallas` with it.
 
-G tiles at a time, P pixels a tile, B splats a block, D channels (colour, then depth and normal where asked for). Tests
-compare `native` and `pallas` with it.
+G tiles at a time, P pixels a tile, B splats a block, D channels (colour, then depth, depth² and normal with geometry).
 """
 
 import functools
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
-from a2tg_jax.appearance import StaticRule, elementwise_rule
+from a2tg_jax.appearance import AppearanceRule, StaticRule, elementwise_rule
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Lookup, TextureRegion
 from a2tg_jax.core.numerics import pixel_sum, spread
@@ -22,42 +23,54 @@ from a2tg_jax.rasterize.splats import CompositingSettings, Splats, shading_argum
 from a2tg_jax.rasterize.tiles import TileLists
 
 BLOCK = 8
+"""Number B of splats that are composited at once."""
+
+Totals = tuple[Array, Array, Array]
+"""Cotangents of all splats, packed as [N, S], of the texels [T, C], and of the probe [N, 4]."""
+
+
+Block = tuple[Splats, TextureRegion | None]
+"""Splats of a block [..., B], and their texture regions."""
+TexelAddends = tuple[Array, Array]
+"""Indices of texels [corners, B, P], and addends to their cotangents [corners, B, P, C]."""
+BlockCotangents = tuple[Splats, Array | None, TexelAddends | None]
+"""Cotangents of a block's splats, of the probe [B, 4], and of the texels."""
 
 
 class Tiles(NamedTuple):
     """One tile, or G of them."""
 
     x: Array
-    """Its centre, in pixels of the image."""
+    """Horizontal coordinate of its centre, in pixels of the image."""
     y: Array
-    """Its centre's other coordinate."""
+    """Vertical coordinate of its centre."""
     end: Array
-    """Where its list ends."""
+    """End of its list."""
 
 
 def forward(
     settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group.
+    """Return channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group.
 
     Args:
-      settings: static choices.
-      static: the appearance rule, without its arrays.
+      settings: static options.
+      static: appearance rule without its arrays.
       splats: N splats.
-      texels: [T, C] of the rule.
-      regions: [N] each, of the rule; None without textures.
-      cutoff: [N] squared distance beyond which each splat need not be looked at; not used here.
-      lists: the splats of each tile.
+      texels: [T, C] texels of the rule.
+      regions: [N] texture regions of the rule; None without textures.
+      cutoff: [N] squared distance beyond which each splat is invisible; not used here.
+      lists: splats of each tile.
     """
     rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
     ids, dtype = padded_ids(lists), splats.M.dtype
 
-    def group(index):
+    def group(index: Array) -> tuple[Array, Array]:
         tiles, start = tiles_of_group(settings, lists, index, dtype)
         add_block = over_tiles(functools.partial(_block, settings, rule, texels), settings.tile_batch)
 
-        def step(carry):
+        def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             at, transmittance, is_live, channels = carry
             rows = gather_rows(splats, regions, block_ids(ids, at))
             added, transmittance, is_live = add_block(rows, at, tiles, transmittance, is_live)
@@ -68,20 +81,21 @@ def forward(
         _, transmittance, _, channels = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)
         return channels, transmittance
 
-    return jax.lax.map(group, jnp.arange(settings.num_groups, dtype=jnp.int32))
+    shown: tuple[Array, Array] = jax.lax.map(group, jnp.arange(settings.num_groups, dtype=jnp.int32))
+    return shown
 
 
 def backward(
     settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
 ) -> tuple[Splats, Array, Array]:  # fmt: skip
-    """The cotangents of splats, texels and probe.
+    """Return the cotangents of splats, texels and probe.
 
     Args:
       settings, static, splats, texels, regions, cutoff, lists: as for `forward`.
       jacobian, probe: as for `rasterize.compositor.composite`.
       g: [groups, G, D, P] cotangents of the channels.
-      suffix_sum: [groups, G, P] what they make of the whole list (`rasterize.pixel.absorb_vjp`).
+      suffix_sum: [groups, G, P] B of the whole list (`rasterize.pixel.absorb_vjp`).
     """
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
@@ -89,11 +103,11 @@ def backward(
     rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
     ids = padded_ids(lists)
 
-    def group(index, totals):
+    def group(index: Array, totals: Totals) -> Totals:
         tiles, start = tiles_of_group(settings, lists, index, splats.M.dtype)
         pull_back = over_tiles(functools.partial(_block_vjp, settings, rule, texels, jacobian), settings.tile_batch)
 
-        def step(carry):
+        def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
             at, *state, totals = carry
             in_block = block_ids(ids, at)
             rows = gather_rows(splats, regions, in_block)
@@ -101,7 +115,8 @@ def backward(
             return (at + BLOCK, *state, _accumulate(totals, in_block, d_rows))
 
         carry = (start, *initial_state(settings, tiles), suffix_sum[index], totals)
-        return jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)[-1]
+        totals = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)[-1]
+        return totals
 
     packed, d_texels, d_probe = jax.lax.fori_loop(jnp.int32(0), jnp.int32(settings.num_groups), group, totals)
     pieces = jnp.split(packed, np.cumsum(widths)[:-1], axis=1)
@@ -110,20 +125,20 @@ def backward(
 
 
 def initial_state(settings: CompositingSettings, tiles: Tiles) -> tuple[Array, Array]:
-    """Full transmittance [G, P], and which pixels are live: those of the border tiles outside the image never are."""
+    """Return transmittance 1 [G, P], and the live pixels [G, P]; those outside the image never are."""
     x, y = pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
     is_inside = (tiles.x[:, None] + x < settings.grid.width) & (tiles.y[:, None] + y < settings.grid.height)
     return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
 
 
-def is_unfinished(ends: Array, carry) -> Array:
-    """Whether some tile of a group has splats left, and pixels that they may reach."""
+def is_unfinished(ends: Array, carry: tuple[Any, ...]) -> Array:
+    """Return whether a tile of a group has splats left, and live pixels."""
     at, _, is_live = carry[:3]
     return jnp.any((at < ends) & jnp.any(is_live, axis=1))
 
 
-def over_tiles(function, num: int):
-    """`function` of one tile applied to a leading axis of `num` tiles; a single one needs no vmap."""
+def over_tiles(function: Callable[..., Any], num: int) -> Callable[..., Any]:
+    """Map a function of one tile over a leading axis of `num` tiles; a single one needs no vmap."""
     if num > 1:
         return jax.vmap(function)
     take, put = (lambda x: x[0]), (lambda x: x[None])
@@ -131,12 +146,14 @@ def over_tiles(function, num: int):
 
 
 def padded_ids(lists: TileLists) -> Array:
-    """The lists' splats, and a block more, so that every block can be read whole."""
+    """Return the lists' splats and one block of padding, so that every block can be read whole."""
     return jnp.concatenate([lists.ids, jnp.zeros(BLOCK, lists.ids.dtype)])
 
 
-def tiles_of_group(settings: CompositingSettings, lists: TileLists, index: Array, dtype) -> tuple[Tiles, Array]:
-    """The tiles of a group, and [G] where their lists begin; tiles past the last one have empty lists."""
+def tiles_of_group(
+    settings: CompositingSettings, lists: TileLists, index: Array, dtype: DTypeLike
+) -> tuple[Tiles, Array]:
+    """Return the tiles of a group, and the starts of their lists [G]; tiles past the last one have empty lists."""
     tile = index * settings.tile_batch + jnp.arange(settings.tile_batch, dtype=jnp.int32)
     size = settings.grid.tile_size
     x = (tile % settings.grid.columns).astype(dtype) * size + size / 2
@@ -148,21 +165,22 @@ def tiles_of_group(settings: CompositingSettings, lists: TileLists, index: Array
 
 
 def block_ids(ids: Array, at: Array) -> Array:
-    """[G, B] splats of the blocks that start at `at` [G]."""
+    """Return the splats [G, B] of the blocks that start at `at` [G]."""
     if at.shape[0] == 1:
         return jax.lax.dynamic_slice(ids, (at[0],), (BLOCK,))[None]
     return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK, dtype=jnp.int32)[None, :], ids.shape[0] - 1)]
 
 
-def gather_rows(splats: Splats, regions: TextureRegion | None, ids: Array):
-    """The splats [G, B, ...] of some ids [G, B], and their texture regions."""
+def gather_rows(splats: Splats, regions: TextureRegion | None, ids: Array) -> Block:
+    """Return the splats [G, B, ...] of some ids [G, B], and their texture regions."""
     flat = ids.reshape(-1)
     rows = jax.tree.map(lambda x: x[flat], (splats, regions))
-    return jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
+    block: Block = jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
+    return block
 
 
-def _accumulate(totals, ids: Array, d_rows):
-    """Adds the cotangents of one block a tile to the totals; those of the splats are packed in one row each."""
+def _accumulate(totals: Totals, ids: Array, d_rows: BlockCotangents) -> Totals:
+    """Add the cotangents of one block per tile to the totals; those of the splats are packed in one row each."""
     flat = ids.reshape(-1)
     splats, texels, probe = totals
     d_splats, d_probe, d_texels = d_rows
@@ -174,32 +192,37 @@ def _accumulate(totals, ids: Array, d_rows):
     return splats, texels, probe if d_probe is None else probe.at[flat].add(d_probe.reshape(flat.shape[0], -1))
 
 
-def pixels_of_tile(size: int, dtype) -> tuple[Array, Array]:
-    """x and y of a tile's pixel centres from its centre, each [1, P]."""
+def pixels_of_tile(size: int, dtype: DTypeLike) -> tuple[Array, Array]:
+    """Return x and y of a tile's pixel centres, relative to its centre, each [1, P]."""
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return jnp.asarray(x.reshape(1, -1), dtype), jnp.asarray(y.reshape(1, -1), dtype)
 
 
 def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
-    """Splats [B, ...] as the numbers that `pixel` wants, each [B], or spread over [B, num] pixels."""
-    put = (lambda x: x) if num is None else functools.partial(spread, num=num)
-    several = lambda x: tuple(put(x[:, k]) for k in range(x.shape[1]))  # noqa: E731
-    M = tuple(tuple(splats.M[:, i, k] for k in range(3)) for i in range(3))
+    """Split splats [B, ...] into numbers for `pixel`, each [B], or spread over [B, num] pixels."""
+
+    def put(x: Array) -> Array:
+        return x if num is None else spread(x, num=num)
+
+    def several(x: Array) -> Any:
+        return tuple(put(x[:, k]) for k in range(x.shape[1]))
+
+    M: Any = tuple(tuple(splats.M[:, i, k] for k in range(3)) for i in range(3))
     normal = several(splats.normals) if has_geometry else None
     numbers = several(splats.numbers)
-    return pixel.Splat(M, put(splats.opacities), several(splats.colors), normal, numbers)  # type: ignore[arg-type]
+    return pixel.Splat(M, put(splats.opacities), several(splats.colors), normal, numbers)
 
 
-def _hits(settings: CompositingSettings, rule, splats: Splats, tile: Tiles) -> pixel.Hit:
-    """Where the rays of a tile's pixels meet the splats of a block; each [B, P]."""
+def _hits(settings: CompositingSettings, rule: AppearanceRule, splats: Splats, tile: Tiles) -> pixel.Hit:
+    """Return the hits of a tile's pixels with the splats of a block, [B, P] each."""
     x, y = pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
     planes = pixel.planes_of(split(splats, False).M, tile.x, tile.y)
     planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
     return pixel.intersect(planes, x, y, settings.near_plane, rule.has_low_pass)
 
 
-def look_up(rule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
-    """What is read of the textures of B splats at P pixels, [B, P] each; None where the rule has no textures."""
+def look_up(rule: AppearanceRule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
+    """Look up the textures of B splats at P pixels, [B, P] each; None if the rule has no textures."""
     if regions is None:
         return None
     region = jax.tree.map(lambda x: x[:, None], regions)
@@ -209,30 +232,40 @@ def look_up(rule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) 
     return Lookup(region, bilinear.or_empty(sample, region, rule.empty), corners)
 
 
-def _show(settings: CompositingSettings, rule, splats: Splats, hit: pixel.Hit, values, at, tile: Tiles, rho_probe=None):
-    """`pixel.Shown` of a block at a tile's pixels, each [B, P]; entries past the end of the list show nothing."""
+def _show(
+    settings: CompositingSettings, rule: AppearanceRule, splats: Splats, hit: pixel.Hit, values: tuple[Array, ...],
+    at: Array, tile: Tiles, rho_probe: Array | None = None,
+) -> pixel.Shown:  # fmt: skip
+    """Return what a block shows at a tile's pixels, [B, P] each; entries past the end of the list show nothing."""
     shown = pixel.show(rule, split(splats, settings.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
 
-def _block(settings: CompositingSettings, rule, texels: Array, rows, at, tile: Tiles, transmittance, is_live):
-    """Composites one block of B splats over one tile.
+def _block(
+    settings: CompositingSettings, rule: AppearanceRule, texels: Array, rows: Block, at: Array, tile: Tiles,
+    transmittance: Array, is_live: Array,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Composite one block of B splats over one tile.
 
     Args:
-      rows: the block's splats, and their texture regions.
+      settings: static options.
+      rule: appearance rule.
+      texels: [T, C] texels of the rule.
+      rows: splats of the block, and their texture regions.
       at: position of the block in the list; entries past the tile's end are left out.
+      tile: the tile.
       transmittance: [P] before the block.
       is_live: [P] pixels that have not stopped.
 
     Returns:
-      Channels added [D, P], and transmittance and live pixels after the block.
+      Added channels [D, P], and transmittance and live pixels after the block.
     """
     splats, regions = rows
     hit = _hits(settings, rule, splats, tile)
     shown = _show(settings, rule, splats, hit, values_of(look_up(rule, texels, regions, hit)), at, tile)
 
-    def add_splat(carry, alpha):
+    def add_splat(carry: tuple[Array, Array], alpha: Array) -> tuple[tuple[Array, Array], Array]:
         weight, transmittance, is_live = pixel.absorb(alpha, *carry)
         return (transmittance, is_live), weight
 
@@ -241,7 +274,7 @@ def _block(settings: CompositingSettings, rule, texels: Array, rows, at, tile: T
 
 
 def sum_rows(x: Array) -> Array:
-    """Sum over the first axis, a power of two long, by halves: a reduction would not be vectorised over pixels."""
+    """Sum the first axis, a power of two long, by halves: a reduction would not be vectorised over pixels."""
     while x.shape[0] > 1:
         half = x.shape[0] // 2
         x = x[:half] + x[half:]
@@ -249,28 +282,28 @@ def sum_rows(x: Array) -> Array:
 
 
 def _block_vjp(
-    settings: CompositingSettings, rule, texels: Array, jacobian, rows, at, tile: Tiles, transmittance, is_live,
-    suffix_sum, g,
-):  # fmt: skip
-    """One block of the backward pass over one tile: the state after it, and the cotangents of its rows.
+    settings: CompositingSettings, rule: AppearanceRule, texels: Array, jacobian: Array, rows: Block, at: Array,
+    tile: Tiles, transmittance: Array, is_live: Array, suffix_sum: Array, g: Array,
+) -> tuple[Array, Array, Array, BlockCotangents]:  # fmt: skip
+    """Differentiate `_block`: return the state after the block, and the cotangents of its rows.
 
-    `suffix_sum` [P] is g·(what this block and all behind it add) + g_T·T_final; g is [D, P].
+    `suffix_sum` [P] is g·(channels added by this block and all behind it) + g_T·T_final; g is [D, P].
     """
     splats, regions = rows
     lookup = look_up(rule, texels, regions, _hits(settings, rule, splats, tile))
 
-    def of_floats(splats, values, rho_probe):
+    def of_floats(splats: Splats, values: tuple[Array, ...], rho_probe: Array | None) -> pixel.Shown:
         hit = _hits(settings, rule, splats, tile)
         return _show(settings, rule, splats, hit, pixel.values_at(rule, lookup, hit, values), at, tile, rho_probe)
 
     rho_probe = jnp.zeros((BLOCK, transmittance.shape[0]), transmittance.dtype) if settings.statistic else None
     shown, pull_back = jax.vjp(of_floats, splats, values_of(lookup), rho_probe)
     g = g[:, None]
-    seen = sum(channel * g[k] for k, channel in enumerate(shown.channels))
+    seen: Any = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 
-    def add_splat(carry, splat):
-        weight, *carry, d_alpha = pixel.absorb_vjp(splat[0], *carry, splat[1])
-        return tuple(carry), (weight, d_alpha)
+    def add_splat(carry: pixel.State, splat: tuple[Array, Array]) -> tuple[pixel.State, tuple[Array, Array]]:
+        weight, *after, d_alpha = pixel.absorb_vjp(splat[0], carry[0], carry[1], carry[2], splat[1])
+        return (after[0], after[1], after[2]), (weight, d_alpha)
 
     carry, (weights, d_alpha) = jax.lax.scan(add_splat, (transmittance, is_live, suffix_sum), (shown.alpha, seen))
     d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(settings.num_channels)))
@@ -283,8 +316,8 @@ def values_of(lookup: Lookup | None) -> tuple[Array, ...]:
     return () if lookup is None else lookup.sample.values
 
 
-def _texel_cotangents(lookup: Lookup | None, d_values: tuple[Array, ...]) -> tuple[Array, Array] | None:
-    """Indices of texels [corners, B, P], and what is added to their cotangents [corners, B, P, C]."""
+def _texel_cotangents(lookup: Lookup | None, d_values: tuple[Array, ...]) -> TexelAddends | None:
+    """Return the addends to the cotangents of the texels, from the cotangents of the values."""
     if lookup is None:
         return None
     per_corner = [jnp.stack([corner.weight * d_value for d_value in d_values], axis=-1) for corner in lookup.corners]
@@ -292,12 +325,14 @@ def _texel_cotangents(lookup: Lookup | None, d_values: tuple[Array, ...]) -> tup
 
 
 def _statistic(
-    settings: CompositingSettings, rule, jacobian, splats: Splats, tile: Tiles, d_rho: Array, weights: Array
-) -> Array:
-    """[B, 4]: Σ_pixels of the statistic, and the pixels composited."""
+    settings: CompositingSettings, rule: AppearanceRule, jacobian: Array, splats: Splats, tile: Tiles, d_rho: Array,
+    weights: Array,
+) -> Array:  # fmt: skip
+    """Return Σ_pixels of the statistic, and the number of pixels composited, [B, 4]."""
     assert settings.statistic is not None
     x, y = pixels_of_tile(settings.grid.tile_size, d_rho.dtype)
     M = jax.tree.map(lambda entry: entry[:, None], split(splats, False).M)
-    at_pixel = M, x, y, tile.x, tile.y, d_rho, jacobian
-    components = pixel.positional_gradient(settings.statistic, *at_pixel, settings.near_plane, rule.has_low_pass)
+    components = pixel.positional_gradient(
+        settings.statistic, M, x, y, tile.x, tile.y, d_rho, jacobian, settings.near_plane, rule.has_low_pass
+    )
     return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_rho.dtype))], axis=1)

@@ -1,15 +1,14 @@
-"""Tile lists and compositing by native loops on CPUs: what `tiles` and `compositor` do with XLA, faster, on all cores.
+"""Tile lists and compositing by native loops on CPUs: a faster form of `tiles` and `kernels.xla`, on all cores.
 
-Tiles are dealt to threads in contiguous parts of about as many pairs each. Results do not depend on timing, only, in
-the last bits, on the number of threads (`sums`).
+Each thread takes a contiguous part of the tiles, with about as many pairs as the others. Results do not depend on
+timing; the last bits of gradients depend on the number of threads (`sums`).
 """
 
 import functools
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -17,24 +16,24 @@ from jax import Array
 from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import Outline
-from a2tg_jax.rasterize.kernels.manual_axes import vary_with
 from a2tg_jax.rasterize.kernels.native import ffi, sums, threads
 from a2tg_jax.rasterize.kernels.packing import pack_regions, pack_splats, unpack_splats
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 if TYPE_CHECKING:
-    from a2tg_jax.rasterize.kernels.native.lists import ListLoops
+    from a2tg_jax.rasterize.kernels.native.lists import ListFunctions
+    from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
     from a2tg_jax.rasterize.kernels.native.traced import KernelSpec
 
 PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
-"""Fewer than these are not worth another thread."""
+"""Least numbers of pairs and of splats that are worth another thread."""
 
 
 def _spec(
     settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None
 ) -> "KernelSpec":
-    """What the loops for these inputs are compiled for."""
+    """Return the specification of the passes for these inputs."""
     from a2tg_jax.rasterize.kernels.native.traced import KernelSpec
 
     return KernelSpec(
@@ -51,18 +50,18 @@ def _spec(
 
 
 def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats) -> str | None:
-    """Why there can be no native loops for a rule; None where there are, which are then compiled."""
+    """Return why a rule cannot run in native loops; None if it can, after compiling them."""
     return _refusal(_spec(settings, StaticRule.of(rule), splats, rule.texels, rule.regions))
 
 
 @functools.cache
 def _refusal(spec: "KernelSpec") -> str | None:
     from a2tg_jax.rasterize.kernels.native.lanes import Untranslatable
-    from a2tg_jax.rasterize.kernels.native.loops import loops
+    from a2tg_jax.rasterize.kernels.native.passes import compiled_passes
     from a2tg_jax.rasterize.kernels.native.traced import place_of
 
     try:
-        loops(spec)
+        compiled_passes(spec)
     except Untranslatable as error:
         return str(error) + (place_of(error.primitive, spec) if error.primitive else "")
     return None
@@ -72,13 +71,13 @@ def forward(
     settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """As `xla.forward`: channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
+    """Return channels [tiles, 1, D, P] and transmittance [tiles, 1, P], as `xla.forward` does."""
     spec = _spec(settings, static, splats, texels, regions)
     name = _registered(spec, "forward", _forward_handler)
-    shape = jax.ShapeDtypeStruct((settings.grid.num, spec.num_channels + 1, spec.tile_size**2), splats.M.dtype)
-    call = jax.ffi.ffi_call(name, shape, vmap_method="sequential")
+    shape = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
     inputs = _inputs(spec, settings, splats, texels, regions, cutoff, lists)
-    image = vary_with(inputs, call(*inputs))[:, None]
+    (image,) = ffi.call(name, [(shape, splats.M.dtype)], *inputs)
+    image = image[:, None]
     return image[:, :, :-1], image[:, :, -1]
 
 
@@ -86,19 +85,14 @@ def backward(
     settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
 ) -> tuple[Splats, Array, Array]:  # fmt: skip
-    """As `xla.backward`."""
+    """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
     spec = _spec(settings, static, splats, texels, regions)
     name = _registered(spec, "backward", _backward_handler)
     dtype, num = splats.M.dtype, splats.M.shape[0]
-    shapes = (
-        jax.ShapeDtypeStruct((num, spec.num_floats), dtype),
-        jax.ShapeDtypeStruct(texels.shape, dtype),
-        jax.ShapeDtypeStruct(probe.shape if spec.statistic else (1, 4), dtype),
-    )
-    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
+    shapes = (num, spec.num_floats), texels.shape, probe.shape if spec.statistic else (1, 4)
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
     inputs = (*_inputs(spec, settings, splats, texels, regions, cutoff, lists), *cotangents)
-    packed, d_texels, d_probe = vary_with(inputs, call(*inputs))
+    packed, d_texels, d_probe = ffi.call(name, [(shape, dtype) for shape in shapes], *inputs)
     d_splats = unpack_splats(packed, splats, spec.has_geometry)
     d_probe = d_probe.astype(probe.dtype) if spec.statistic else jnp.zeros_like(probe)
     return d_splats, d_texels.astype(texels.dtype), d_probe
@@ -106,32 +100,27 @@ def backward(
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
     """List the splats of each tile; arguments and result are those of `rasterize.tiles.tile_lists`."""
-    from a2tg_jax.rasterize.kernels.native.lists import list_loops
+    from a2tg_jax.rasterize.kernels.native.lists import list_functions
 
     key = str(M.dtype), grid.tile_size, near_plane
-    name = ffi.registered(f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_loops(*key)))
-    shapes = (
-        jax.ShapeDtypeStruct((capacity,), jnp.int32),
-        jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32),
-        jax.ShapeDtypeStruct((), jnp.float32),
-        jax.ShapeDtypeStruct((), jnp.bool_),
+    name = ffi.registered(
+        f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
     )
+    results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
     size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)
-    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    inputs = M, cutoff.astype(M.dtype), size
-    return TileLists(*vary_with(inputs, call(*inputs)))
+    return TileLists(*ffi.call(name, results, M, cutoff.astype(M.dtype), size))
 
 
-def _list_handler(loops: "ListLoops", arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+def _list_handler(functions: "ListFunctions", arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    """List the splats of each tile, on all threads."""
     M, cutoff, size = arguments
     ids, starts, total, overflow = results
     columns, width, height = map(int, size)
     num = len(cutoff)
     outlines, rectangles = np.empty((num, len(Outline._fields)), M.dtype), np.empty((num, 4), np.int32)
-    address = lambda *arrays: [array.ctypes.data for array in arrays]  # noqa: E731
 
     def bound(first: int, last: int, _: int) -> None:
-        loops.bound(*address(M, cutoff, outlines, rectangles), first, last, width, height)
+        functions.bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)
 
     threads.run_spans(bound, threads.even_spans(num, SPLATS_PER_THREAD))
     room = int(rectangles[:, 3].sum(dtype=np.int64))
@@ -140,7 +129,7 @@ def _list_handler(loops: "ListLoops", arguments: list[np.ndarray], results: list
     if overflow:
         return
     order = _depth_order(M[:, 2, 2], np.flatnonzero(rectangles[:, 3]))
-    # Every thread lists the pairs of a range of splats, and moves them behind those of the ranges in front of it.
+    # Each thread lists the pairs of a range of splats, and places them behind those of nearer ranges.
     begins = np.concatenate([[0], np.cumsum(rectangles[order, 3], dtype=np.int64)])
     spans = _parts(begins)
     counts = np.zeros((len(spans), len(starts) - 1), np.int32)
@@ -148,7 +137,8 @@ def _list_handler(loops: "ListLoops", arguments: list[np.ndarray], results: list
 
     def find(first: int, last: int, index: int) -> None:
         found = tiles[begins[first] :], splats[begins[first] :]
-        loops.find(*address(order[first:], rectangles, outlines, counts[index], *found), last - first, columns)
+        buffers = order[first:], rectangles, outlines, counts[index], *found
+        functions.find(*_addresses(*buffers), last - first, columns)
 
     threads.run_spans(find, spans)
     np.cumsum(counts.sum(axis=0), out=starts[1:])
@@ -156,17 +146,17 @@ def _list_handler(loops: "ListLoops", arguments: list[np.ndarray], results: list
 
     def place(first: int, _: int, index: int) -> None:
         found = tiles[begins[first] :], splats[begins[first] :]
-        loops.place(*address(*found, cursors[index], ids), int(counts[index].sum()))
+        functions.place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
 
     threads.run_spans(place, spans)
 
 
 def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """The visible splats by depth, ties by index: int32. float32 depths are sorted by radix, 16 bits at a time."""
+    """Sort the visible splats by depth, ties by index; int32. float32 depths are sorted by radix, 16 bits at a time."""
     depths = depths[visible]
     if depths.dtype != np.float32:
         return visible[np.argsort(depths, kind="stable")].astype(np.int32)
-    # Depths of what is visible are positive, and then ordered as their bits are.
+    # Depths of visible splats are positive, and positive floats are ordered as their bits.
     bits = depths.view(np.uint32)
     order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     order = order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]
@@ -177,24 +167,33 @@ def _inputs(
     spec: "KernelSpec", settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists,
 ) -> tuple[Array, ...]:  # fmt: skip
-    """ids, starts, splats, regions, texels, and (columns, width, height)."""
+    """Return ids, starts, splats, regions, texels, and (columns, width, height)."""
     packed = pack_splats(splats, spec.has_geometry, cutoff).astype(spec.dtype)
     size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
     return lists.ids, lists.starts, packed, pack_regions(regions), texels.astype(spec.dtype), size
 
 
-def _registered(spec: "KernelSpec", which: str, make_handler: Callable[[Any], ffi.Handler]) -> str:
-    """The name under which XLA knows the loops that a spec describes."""
-    from a2tg_jax.rasterize.kernels.native.loops import loops
+def _registered(
+    spec: "KernelSpec", which: Literal["forward", "backward"], make_handler: Callable[["CompiledFunction"], ffi.Handler]
+) -> str:
+    """Return the name under which XLA knows a pass of a spec."""
+    from a2tg_jax.rasterize.kernels.native.passes import compiled_passes
 
-    return ffi.registered(f"{which} {spec!r}", (which, spec), lambda: make_handler(getattr(loops(spec), which)))
+    def handler() -> ffi.Handler:
+        return make_handler(getattr(compiled_passes(spec), which))
+
+    return ffi.registered(f"{which} {spec!r}", (which, spec), handler)
 
 
-def _forward_handler(run: Callable) -> ffi.Handler:
+def _addresses(*arrays: np.ndarray) -> list[int]:
+    return [array.ctypes.data for array in arrays]
+
+
+def _forward_handler(run: "CompiledFunction") -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size = arguments
         starts = inputs[1]
-        pointers = [array.ctypes.data for array in (*inputs, results[0])]
+        pointers = _addresses(*inputs, results[0])
 
         def part(first: int, last: int, _: int) -> None:
             run(*pointers, first, last, *map(int, size))
@@ -204,17 +203,16 @@ def _forward_handler(run: Callable) -> ffi.Handler:
     return handler
 
 
-def _backward_handler(run: Callable) -> ffi.Handler:
+def _backward_handler(run: "CompiledFunction") -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size, g, suffix_sum, jacobian = arguments
         starts = inputs[1]
         parts = _parts(starts)
         room = sums.SumsOfParts(inputs[0], starts, inputs[3], results, parts)
-        given = [array.ctypes.data for array in (*inputs, g, suffix_sum, jacobian)]
+        given = _addresses(*inputs, g, suffix_sum, jacobian)
 
         def part(first: int, last: int, index: int) -> None:
-            outputs = [array.ctypes.data for array in room.outputs(index)]
-            run(*given, *outputs, first, last, *map(int, size))
+            run(*given, *_addresses(*room.outputs(index)), first, last, *map(int, size))
 
         threads.run_spans(part, parts)
         room.add_up()
@@ -223,9 +221,10 @@ def _backward_handler(run: Callable) -> ffi.Handler:
 
 
 def _parts(starts: np.ndarray) -> list[threads.Span]:
-    """Ranges of tiles, or of splats, with about as many pairs each, one per thread that is worth starting.
+    """Split tiles, or splats, into ranges with about as many pairs each, one per thread that is worth starting.
 
-    `starts` [items + 1] is where the pairs of each begin.
+    Args:
+      starts: [items + 1] start of each item's pairs.
     """
     num_items, num_pairs = len(starts) - 1, int(starts[-1])
     count = max(1, min(threads.num_threads(), num_pairs // PAIRS_PER_THREAD))

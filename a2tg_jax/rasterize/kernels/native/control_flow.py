@@ -1,8 +1,8 @@
-"""What of a jaxpr is no arithmetic: calls, branches, loops, and the shapes of small arrays.
+"""Calls, branches and loops of jaxprs, and operations on the shapes of small arrays.
 
-A value is an LLVM value, or, where JAX has an array, a numpy array of such: one for each entry. Lanes have
-nothing to do with each other, so that a branch is taken by some and a loop left by some: every branch is run, and its
-results chosen; a loop runs until the last lane has left it.
+A value is an LLVM value; an array is a numpy array of LLVM values, one per entry. Lanes are independent, so that some
+may take a branch or leave a loop while others do not. Every branch runs, and its results are chosen lane by lane; a
+loop runs until the last lane has left it.
 """
 
 import contextlib
@@ -15,31 +15,43 @@ import numpy as np
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native.primitives import PRIMITIVES
-from a2tg_jax.rasterize.kernels.native.vectors import BOOL, INT, Translator, Untranslatable, scalar_type
+from a2tg_jax.rasterize.kernels.native.vectors import (
+    BOOL,
+    INT,
+    Equation,
+    Translator,
+    Untranslatable,
+    result_of,
+    scalar_type,
+)
 
 MOST_ENTRIES = 256
-"""Of an array, and steps of a loop that reads or writes one: each is code of its own."""
+"""Largest number of entries of an array, and of steps of a scan over arrays, for which code is unrolled."""
+Params = dict[str, Any]
+"""Parameters of an equation."""
+Emitter = Callable[[Translator, list[Any], Equation], list[Any]]
+"""Function of (lanes, operands, equation) that emits code and returns its results."""
 CALLS = (
     *("jit", "pjit", "closed_call", "core_call", "call", "remat", "remat2", "checkpoint"),
     *("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"),
 )
-"""Primitives that run their jaxpr once, under the names of all versions of JAX from 0.10 on."""
+"""Primitives that run their jaxpr once, by their names in all versions of JAX from 0.10 on."""
 
 
 def entries(value: Any) -> list[ir.Value]:
-    """All the LLVM values of a value."""
+    """Return all LLVM values of a value."""
     return list(value.flat) if isinstance(value, np.ndarray) else [value]
 
 
 def like(value: Any, new: Iterator[ir.Value]) -> Any:
-    """A value of the same shape made of the next LLVM values."""
+    """Make a value of the same shape from the next LLVM values."""
     if not isinstance(value, np.ndarray):
         return next(new)
     return array_of([next(new) for _ in range(value.size)], value.shape)
 
 
 def array_of(values: Sequence[Any], shape: Sequence[int]) -> Any:
-    """LLVM values as a value of a shape."""
+    """Make a value of a shape from its LLVM values."""
     if math.prod(shape) > MOST_ENTRIES:
         raise Untranslatable(f"native loops take functions of scalars; an array has shape {tuple(shape)}")
     array = np.empty(len(values), object)
@@ -48,7 +60,7 @@ def array_of(values: Sequence[Any], shape: Sequence[int]) -> Any:
 
 
 def map_entries(emit: Callable[[list[ir.Value]], ir.Value], operands: Sequence[Any]) -> Any:
-    """An element-wise primitive: of scalars, or entry by entry of arrays, axes of length 1 broadcast."""
+    """Emit an element-wise primitive on scalars, or entry by entry on arrays; axes of length 1 broadcast."""
     shapes = [operand.shape for operand in operands if isinstance(operand, np.ndarray)]
     if not shapes:
         return emit(list(operands))
@@ -57,13 +69,13 @@ def map_entries(emit: Callable[[list[ir.Value]], ir.Value], operands: Sequence[A
     return array_of([emit(list(numbers)) for numbers in zip(*rows, strict=True)], shape)
 
 
-def call(lanes: Translator, operands: list, equation) -> list:
+def _call(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
     params = equation.params
     return lanes.run(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], operands)
 
 
-def _branches(lanes: Translator, operands: list, equation) -> list:
-    """cond and switch: each branch is run by all lanes, of which some take part."""
+def _branches(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
+    """Emit `cond` or `switch`: all lanes run every branch, and some take part in it."""
     index, *operands = operands
     branches, b = equation.params["branches"], lanes.builder
     chosen: list[Any] = []
@@ -83,7 +95,7 @@ def _choose(lanes: Translator, condition: ir.Value, if_true: Any, if_false: Any)
 
 @contextlib.contextmanager
 def _taking_part(lanes: Translator, mask: ir.Value) -> Iterator[None]:
-    """Only these of the lanes that take part already keep loops within going."""
+    """Restrict the lanes that take part, for which inner loops continue, to those of a mask."""
     before = lanes.taking_part
     lanes.taking_part = mask if before is None else lanes.builder.and_(before, mask)
     yield
@@ -104,7 +116,7 @@ class _Carry:
         for entry, room in zip(flat, self.rooms, strict=True):
             self.lanes.builder.store(entry, room)
 
-    def load(self) -> list:
+    def load(self) -> list[Any]:
         loaded = [self.lanes.builder.load(room, typ=type_) for room, type_ in zip(self.rooms, self.types, strict=True)]
         remaining = iter(loaded)
         return [like(value, remaining) for value in self.values]
@@ -112,7 +124,7 @@ class _Carry:
 
 @contextlib.contextmanager
 def _loop(lanes: Translator, make_condition: Callable[[], ir.Value]) -> Iterator[None]:
-    """while condition: what is emitted within."""
+    """Write a loop that repeats the code emitted inside while the condition holds."""
     b = lanes.builder
     test, body, after = (b.append_basic_block(name) for name in ("test", "body", "after"))
     b.branch(test)
@@ -124,7 +136,7 @@ def _loop(lanes: Translator, make_condition: Callable[[], ir.Value]) -> Iterator
     b.position_at_end(after)
 
 
-def _while(lanes: Translator, operands: list, equation) -> list:
+def _while(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
     params, b = equation.params, lanes.builder
     num_cond, num_body = params["cond_nconsts"], params["body_nconsts"]
     cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
@@ -147,8 +159,8 @@ def _while(lanes: Translator, operands: list, equation) -> list:
     return carry.load()
 
 
-def _scan(lanes: Translator, operands: list, equation) -> list:
-    """A loop; unrolled where it reads or writes arrays."""
+def _scan(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
+    """Emit a loop, unrolled if it reads or writes arrays."""
     params, length = equation.params, equation.params["length"]
     num_consts, num_carry = _scan_sizes(params)
     consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
@@ -162,21 +174,22 @@ def _scan(lanes: Translator, operands: list, equation) -> list:
         results = lanes.run(params["jaxpr"], [*consts, *carry, *(array[step] for array in arrays)])
         carry, written[step] = results[:num_carry], results[num_carry:]
     stacked = []
-    for k, variable in enumerate(equation.outvars[num_carry:]):
+    for k in range(num_written):
         flat = [entry for row in written for entry in entries(row[k])]
-        stacked.append(array_of(flat, variable.aval.shape))
+        stacked.append(array_of(flat, result_of(equation, num_carry + k).shape))
     return [*carry, *stacked]
 
 
-def _scan_sizes(params) -> tuple[int, int]:
-    """How many constants and how many carried values a scan has."""
+def _scan_sizes(params: Params) -> tuple[int, int]:
+    """Return the numbers of constants and of carried values of a scan."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     consts, carry, _ = params["ft_in"].unpack()  # JAX 0.12
     return len(list(consts)), len(list(carry))
 
 
-def _counted(lanes: Translator, length: int, values: list, step: Callable[[list], list]) -> list:
+def _counted(lanes: Translator, length: int, values: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
+    """Emit a loop of a fixed number of steps."""
     b, carry, count = lanes.builder, _Carry(lanes, values), _Carry(lanes, [INT(0)])
     with _loop(lanes, lambda: b.icmp_signed("<", count.load()[0], INT(length))):
         carry.store(step(carry.load()))
@@ -184,7 +197,7 @@ def _counted(lanes: Translator, length: int, values: list, step: Callable[[list]
     return carry.load()
 
 
-def _broadcast(operand: Any, params) -> Any:
+def _broadcast(operand: Any, params: Params) -> Any:
     shape, dimensions = params["shape"], params["broadcast_dimensions"]
     if not isinstance(operand, np.ndarray):
         return array_of([operand] * math.prod(shape), shape)
@@ -194,50 +207,54 @@ def _broadcast(operand: Any, params) -> Any:
     return np.broadcast_to(operand.reshape(inner), shape)
 
 
-def _slice(operand: Any, params) -> Any:
+def _slice(operand: Any, params: Params) -> Any:
     starts, limits = params["start_indices"], params["limit_indices"]
     strides = params["strides"] or (1,) * len(starts)
     return operand[tuple(map(slice, starts, limits, strides))]
 
 
-def _shaped(make: Callable[[Any, Any], Any]):
-    """A primitive that moves the entries of one array about."""
+def _shaped(make: Callable[[Any, Params], Any]) -> Emitter:
+    """Make an emitter of a primitive that rearranges the entries of one array."""
 
-    def emit(lanes: Translator, operands: list, equation) -> list:
-        shape = equation.outvars[0].aval.shape
+    def emit(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
         result = make(operands[0], equation.params)
-        return [array_of(entries(result), shape)]
+        return [array_of(entries(result), result_of(equation).shape)]
 
     return emit
 
 
-def _concatenate(lanes: Translator, operands: list, equation) -> list:
+def _concatenate(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
     return [np.concatenate(operands, axis=equation.params["dimension"])]
 
 
-def _stack(lanes: Translator, operands: list, equation) -> list:
-    shape, axis = equation.outvars[0].aval.shape, equation.params["axis"]
+def _stack(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
+    shape, axis = result_of(equation).shape, equation.params["axis"]
     flat = [entry for operand in operands for entry in entries(operand)]
     first = [len(operands), *np.delete(shape, axis).tolist()]
     return [np.moveaxis(array_of(flat, first), 0, axis)]
 
 
-def _reduction(name: str):
-    def emit(lanes: Translator, operands: list, equation) -> list:
+def _reduction(name: str) -> Emitter:
+    """Make an emitter that reduces axes by an element-wise primitive."""
+
+    def emit(lanes: Translator, operands: list[Any], equation: Equation) -> list[Any]:
         (array,), axes = operands, equation.params["axes"]
-        combine = lambda x, y: PRIMITIVES[name](lanes, [x, y], equation)  # noqa: E731
+
+        def combine(x: ir.Value, y: ir.Value) -> ir.Value:
+            return PRIMITIVES[name](lanes, [x, y], equation)
+
         kept = np.moveaxis(array, axes, range(len(axes)))
         rows = kept.reshape(math.prod(kept.shape[: len(axes)]), -1)
-        shape, dtype = equation.outvars[0].aval.shape, equation.outvars[0].aval.dtype
-        # As XLA does, which shows where all that is summed is −0.
-        first = [lanes.constant(0, scalar_type(dtype))] if name == "add" else []
-        return [array_of([functools.reduce(combine, [*first, *column]) for column in rows.T], shape)]
+        result = result_of(equation)
+        # Sums begin with 0 as in XLA, which matters if all addends are −0.
+        first = [lanes.constant(0, scalar_type(result.dtype))] if name == "add" else []
+        return [array_of([functools.reduce(combine, [*first, *column]) for column in rows.T], result.shape)]
 
     return emit
 
 
-STRUCTURE: dict[str, Callable[[Translator, list, Any], list]] = {
-    **dict.fromkeys(CALLS, call),
+STRUCTURE: dict[str, Emitter] = {
+    **dict.fromkeys(CALLS, _call),
     "broadcast_in_dim": _shaped(_broadcast),
     "concatenate": _concatenate,
     "cond": _branches,
@@ -257,3 +274,4 @@ STRUCTURE: dict[str, Callable[[Translator, list, Any], list]] = {
     "transpose": _shaped(lambda operand, params: np.transpose(operand, params["permutation"])),
     "while": _while,
 }
+"""Emitters by the name of the primitive."""

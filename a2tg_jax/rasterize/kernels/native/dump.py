@@ -1,11 +1,11 @@
-"""What becomes of a compiled function, written to the folder that the environment variable A2TG_DUMP names."""
+"""Dumps of compiled functions, into the folder that the environment variable A2TG_DUMP names."""
 
 import os
 from pathlib import Path
 
 
 def write(name: str, kind: str, text: str, *, append: bool = False) -> None:
-    """Writes <folder>/<name>.<kind>; nothing without the variable."""
+    """Write <folder>/<name>.<kind>, or nothing without the variable."""
     if not (folder := os.environ.get("A2TG_DUMP")):
         return
     path = Path(folder) / f"{name}.{kind}"
@@ -15,4 +15,5 @@ def write(name: str, kind: str, text: str, *, append: bool = False) -> None:
 
 
 def is_wanted() -> bool:
+    """Return whether the variable is set."""
     return bool(os.environ.get("A2TG_DUMP"))

@@ -1,9 +1,9 @@
-"""Elementary functions of float32 in terms of arithmetic, as JAX functions: traced once, then translated as any other.
+"""Elementary functions of float32 from arithmetic, as JAX functions: traced once, then translated as all others.
 
-Errors are in units in the last place (ulp), measured against float64 over the whole range. Results below 2⁻¹²⁵ may come
-out as zero, and arguments below 2⁻¹²⁶ count as zero, which is what XLA makes of subnormal numbers on CPUs.
+Errors are in units in the last place (ulp), measured against float64 over the whole range. Results below 2⁻¹²⁵ may be
+zero, and arguments below 2⁻¹²⁶ count as zero, as XLA flushes subnormal numbers on CPUs.
 
-The coefficients are least-maximum fits of ours.
+The coefficients are minimax fits of this project.
 """
 
 import math
@@ -13,15 +13,15 @@ import numpy as np
 from jax import Array, lax
 
 LN2_HIGH, LN2_LOW = 0.693359375, -2.12194440e-4
-"""ln 2, the first part with trailing zeros: its product with a small integer is exact."""
+"""ln 2 in two parts; the first has trailing zeros, so that its product with a small integer is exact."""
 HALF_PI = [float(np.float32(part)) for part in (1.5703125, 4.837512969970703e-4, 7.549790126404332e-8)]
-"""π/2 in the same way, in three parts."""
+"""π/2 in three parts, the first two with trailing zeros."""
 LARGEST_ANGLE = 3000.0
-"""Up to which `sin` and `cos` hold."""
+"""Largest |x| for which the bounds of `sin`, `cos` and `tan` hold."""
 
 
 def _polynomial(x: Array, *coefficients: float) -> Array:
-    """Σ coefficients[k]·xᵏ."""
+    """Return Σ coefficients[k]·xᵏ."""
     total = coefficients[-1] * jnp.ones_like(x)
     for coefficient in coefficients[-2::-1]:
         total = total * x + coefficient
@@ -29,32 +29,32 @@ def _polynomial(x: Array, *coefficients: float) -> Array:
 
 
 def _round(x: Array, bias: int = 0) -> tuple[Array, Array]:
-    """The nearest integer n, |n| < 2²², as a float, and bits whose lowest are those of n + bias."""
+    """Return the nearest integer n, |n| < 2²², as a float, and bits whose lowest ones are those of n + bias."""
     magic = 1.5 * 2**23 + bias
     shifted = x + magic
     return shifted - magic, lax.bitcast_convert_type(shifted, jnp.int32)
 
 
 def _half_power(bits: Array) -> Array:
-    """2^(n − 1), or 0 for n = −126, of the bits of `_round` with bias 126."""
+    """Return 2^(n − 1), or 0 for n = −126, from the bits of `_round` with bias 126."""
     return lax.bitcast_convert_type(bits << 23, jnp.float32)
 
 
 def _hold(x: Array, low: float, high: float) -> Array:
-    """x in [low, high]; not a number where x is not."""
+    """Return x clipped to [low, high]; NaN stays NaN."""
     x = jnp.where(x < low, low, x)
     return jnp.where(x > high, high, x)
 
 
 def _twice_exp(r: Array) -> Array:
-    """2·exp(r) for |r| <= ln 2 / 2."""
+    """Return 2·exp(r) for |r| <= ln 2 / 2."""
     tail = _polynomial(r, 0.99999988079, 0.33333042264, 0.08333677798, 0.01673742011, 0.00276292209)
     return (tail * r + 2.0) * r + 2.0
 
 
 def exp(x: Array) -> Array:
-    """0.9 ulp: 2ⁿ·exp(r) with r = x − n·ln 2."""
-    # Held where the result has become 0 or ∞.
+    """Return exp(x) to 0.9 ulp: 2ⁿ·exp(r) with r = x − n·ln 2."""
+    # Beyond these limits the result is 0 or ∞.
     x = _hold(x, -87.5, 89.0)
     n, bits = _round(x * math.log2(math.e), bias=126)
     r = (x - n * LN2_HIGH) - n * LN2_LOW
@@ -62,14 +62,14 @@ def exp(x: Array) -> Array:
 
 
 def exp2(x: Array) -> Array:
-    """0.9 ulp."""
+    """Return 2ˣ to 0.9 ulp."""
     x = _hold(x, -126.0, 129.0)
     n, bits = _round(x, bias=126)
     return _twice_exp((x - n) * math.log(2)) * _half_power(bits)
 
 
 def expm1(x: Array) -> Array:
-    """1.4 ulp: 2ⁿ·(exp(r) − 1) + (2ⁿ − 1)."""
+    """Return exp(x) − 1 to 1.4 ulp: 2ⁿ·(exp(r) − 1) + (2ⁿ − 1)."""
     held = _hold(x, -20.0, 89.0)
     n, bits = _round(held * math.log2(math.e), bias=126)
     r = (held - n * LN2_HIGH) - n * LN2_LOW
@@ -80,7 +80,7 @@ def expm1(x: Array) -> Array:
 
 
 def _log_of_parts(f: Array, n: Array, correction: Array | float) -> Array:
-    """log(2ⁿ·(1 + f)) + correction for 1 + f in [√½, √2]."""
+    """Return log(2ⁿ·(1 + f)) + correction for 1 + f in [√½, √2]."""
     tail = _polynomial(
         f, 0.33333313465, -0.25000008941, 0.20002119243, -0.16667996347, 0.14219550789,
         -0.12405591458, 0.11888174713, -0.11675640941, 0.06746601313,
@@ -91,25 +91,25 @@ def _log_of_parts(f: Array, n: Array, correction: Array | float) -> Array:
 
 
 def _parts(x: Array) -> tuple[Array, Array]:
-    """f and n with x = 2ⁿ·(1 + f), 1 + f in [√½, √2], for positive x."""
+    """Return f and n with x = 2ⁿ·(1 + f), 1 + f in [√½, √2], for positive x."""
     bits = lax.bitcast_convert_type(x, jnp.int32)
     exponent = (bits - 0x3F3504F3) >> 23
     return lax.bitcast_convert_type(bits - (exponent << 23), jnp.float32) - 1.0, exponent.astype(jnp.float32)
 
 
 def _log_at_ends(x: Array, result: Array) -> Array:
-    """A logarithm with what it is at 0, at ∞, below 0 and for NaN put in."""
+    """Return a logarithm with its values at 0, at ∞, below 0 and for NaN put in."""
     result = jnp.where(x < np.finfo(np.float32).tiny, jnp.where(x < 0, np.nan, -np.inf), result)
     return jnp.where(x < np.inf, result, x)
 
 
 def log(x: Array) -> Array:
-    """1 ulp."""
+    """Return the natural logarithm to 1 ulp."""
     return _log_at_ends(x, _log_of_parts(*_parts(x), 0.0))
 
 
 def log1p(x: Array) -> Array:
-    """1 ulp: log(u) and the rest of 1 + x over u, with u = 1 + x rounded."""
+    """Return log(1 + x) to 1 ulp: log(u) plus the rounding error of u = 1 + x, divided by u."""
     u = 1.0 + x
     rest = jnp.where(x > 1, 1.0 - (u - x), x - (u - 1.0)) / u
     result = _log_at_ends(u, _log_of_parts(*_parts(u), rest))
@@ -117,7 +117,7 @@ def log1p(x: Array) -> Array:
 
 
 def tanh(x: Array) -> Array:
-    """1.5 ulp."""
+    """Return tanh(x) to 1.5 ulp."""
     size, square = jnp.abs(x), x * x
     tail = _polynomial(
         square, -0.33333331347, 0.13333210349, -0.05394720286, 0.02170296758, -0.00818267372, 0.00214753696
@@ -128,7 +128,7 @@ def tanh(x: Array) -> Array:
 
 
 def _sine_and_cosine(x: Array) -> tuple[Array, Array, Array]:
-    """Of x − n·π/2, and bits whose lowest are those of n."""
+    """Return sine and cosine of x − n·π/2, and bits whose lowest ones are those of n."""
     n, bits = _round(x * (2 / math.pi))
     r = ((x - n * HALF_PI[0]) - n * HALF_PI[1]) - n * HALF_PI[2]
     square = r * r
@@ -138,28 +138,28 @@ def _sine_and_cosine(x: Array) -> tuple[Array, Array, Array]:
 
 
 def sin(x: Array) -> Array:
-    """1.6 ulp for |x| <= LARGEST_ANGLE."""
+    """Return sin(x) to 1.6 ulp for |x| <= LARGEST_ANGLE."""
     sine, cosine, n = _sine_and_cosine(x)
     result = jnp.where((n & 1) != 0, cosine, sine)
     return jnp.where(x == 0, x, jnp.where((n & 2) != 0, -result, result))
 
 
 def cos(x: Array) -> Array:
-    """As `sin`."""
+    """Return cos(x), with the bound of `sin`."""
     sine, cosine, n = _sine_and_cosine(x)
     result = jnp.where((n & 1) != 0, sine, cosine)
     return jnp.where(((n + 1) & 2) != 0, -result, result)
 
 
 def tan(x: Array) -> Array:
-    """3.5 ulp for |x| <= LARGEST_ANGLE."""
+    """Return tan(x) to 3.5 ulp for |x| <= LARGEST_ANGLE."""
     sine, cosine, n = _sine_and_cosine(x)
     is_odd = (n & 1) != 0
     return jnp.where(x == 0, x, jnp.where(is_odd, -cosine, sine) / jnp.where(is_odd, sine, cosine))
 
 
 def atan(x: Array) -> Array:
-    """2.5 ulp: the argument is brought below tan(π/8)."""
+    """Return atan(x) to 2.5 ulp; the argument is reduced to below tan(π/8)."""
     size = jnp.abs(x)
     is_large, is_medium = size > 1 + math.sqrt(2), size > math.sqrt(2) - 1
     above, below = jnp.where(is_large, -1.0, size - 1.0), jnp.where(is_large, size, size + 1.0)
@@ -172,7 +172,7 @@ def atan(x: Array) -> Array:
 
 
 def erf(x: Array) -> Array:
-    """2.5 ulp."""
+    """Return erf(x) to 2.5 ulp."""
     square = x * x
     near = x * _polynomial(
         square, 1.1283792257, -0.3761263788, 0.1128378212, -0.02686540037, 0.00522094546, -0.00084828287,

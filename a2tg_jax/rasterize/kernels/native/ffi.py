@@ -1,4 +1,4 @@
-"""Functions on numpy arrays that XLA calls on the CPU, through its foreign function interface (xla/ffi/api/c_api.h)."""
+"""Functions on numpy arrays that XLA calls on CPUs, through its foreign function interface (xla/ffi/api/c_api.h)."""
 
 import contextlib
 import ctypes
@@ -6,13 +6,18 @@ import hashlib
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from a2tg_jax.rasterize.kernels.manual_axes import vary_with
 
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
-"""Reads the arguments and fills the results, all of them views of XLA's buffers."""
+"""Function of arguments and results, views of XLA's buffers: it reads the arguments and fills the results."""
 
 METADATA_EXTENSION = 1
 EXECUTE_STAGE = 3
@@ -84,15 +89,15 @@ class _CallFrame(ctypes.Structure):
 _Entry = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_CallFrame))
 _LOCK = threading.RLock()
 _AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
-ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # used as long as the process lives
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # in use as long as the process lives
 _entries: dict[str, tuple[Hashable, object]] = {}
 
 
 def registered(description: str, key: Hashable, make_handler: Callable[[], Handler]) -> str:
-    """The name by which `jax.ffi.ffi_call` calls, on the CPU, the handler for a key.
+    """Return the name by which `call` reaches the handler for a key; make and register the handler if there is none.
 
-    It is the same in every process for the same description, for XLA's compilation cache; but where another key has the
-    same description, such as a function that was defined anew, it is another one.
+    The same description gives the same name in every process, for XLA's compilation cache. If another key already has
+    that description, such as a function that was defined again, the name differs.
     """
     name = f"a2tg_{hashlib.sha256(description.encode()).hexdigest()[:20]}"
     with _LOCK:
@@ -105,14 +110,31 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
     return name
 
 
-def _capsule(address: int | None, destructor: int | None = None):
+def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *inputs: Array) -> list[Array]:
+    """Call a registered handler inside a computation.
+
+    Args:
+      name: name from `registered`.
+      results: shape and dtype of each result.
+      inputs: arguments of the handler.
+
+    Returns:
+      The results, varying over devices as the inputs do.
+    """
+    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in results]  # type: ignore[no-untyped-call]
+    outputs: list[Array] = vary_with(inputs, jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs))
+    return outputs
+
+
+def _capsule(address: int | None, destructor: int | None = None) -> object:
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (_pointer, ctypes.c_char_p, _pointer)
-    return new(address, None, destructor)
+    capsule: object = new(address, None, destructor)
+    return capsule
 
 
-def _gated(entry) -> int:
-    """The address of an entry behind the gate that the end of the program closes."""
+def _gated(entry: Any) -> int:
+    """Return the address of an entry behind the gate, which closes when the program ends."""
     from a2tg_jax.rasterize.kernels.native import gate
 
     address = ctypes.cast(entry, _pointer).value or 0
@@ -121,24 +143,24 @@ def _gated(entry) -> int:
 
 
 def _entry(handler: Handler) -> Callable[..., int | None]:
-    """What XLA calls: it returns None where all went well, else the address of an error.
+    """Return the function that XLA calls; it returns None on success, else the address of an error.
 
-    Nothing may be raised through C: it would be lost, and what the results happened to hold would count as computed.
+    No exception may pass through C: it would be lost, and the unfilled results would count as computed.
     """
 
-    def enter(frame) -> int | None:
+    def enter(frame: Any) -> int | None:
         interrupts: list[int] = []
-        dropped_last = []
+        dropped_last: list[object] = []
         try:
             with _interrupts_noted(interrupts):
-                _call(frame.contents, handler)
+                _dispatch(frame.contents, handler)
             if interrupts:
                 dropped_last.append(_interrupt_once_dropped())
         except BaseException as error:
             if interrupts or isinstance(error, KeyboardInterrupt):
                 dropped_last.append(_interrupt_once_dropped())
             failure = _failure(frame.contents, error)
-            error.with_traceback(None)  # it would keep the variables of this function
+            error.with_traceback(None)  # a traceback would keep this function's variables alive
             return failure
         return None
 
@@ -147,7 +169,7 @@ def _entry(handler: Handler) -> Callable[..., int | None]:
 
 @contextlib.contextmanager
 def _interrupts_noted(interrupts: list[int]) -> Iterator[None]:
-    """Ctrl-C does not stop what runs here on the main thread, the only one that signals reach; it is appended."""
+    """Append Ctrl-C to a list instead of raising it, on the main thread, the only one that signals reach."""
     before = signal.getsignal(signal.SIGINT)
     if threading.get_ident() != threading.main_thread().ident or not callable(before):
         yield
@@ -159,14 +181,17 @@ def _interrupts_noted(interrupts: list[int]) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _interrupt_once_dropped():
-    """An object whose end is a Ctrl-C, which the main thread meets in Python's next step: with the last reference in
-    the variables of a function that XLA calls, only when that has returned."""
+def _interrupt_once_dropped() -> object:
+    """Return an object that raises Ctrl-C in the main thread once it is deleted.
+
+    If a variable of a function that XLA calls holds the last reference, that is after the function has returned.
+    """
     interrupt = ctypes.cast(ctypes.pythonapi.PyErr_SetInterrupt, _pointer).value
     return _capsule(interrupt, interrupt)
 
 
-def _call(frame: _CallFrame, handler: Handler) -> None:
+def _dispatch(frame: _CallFrame, handler: Handler) -> None:
+    """Answer XLA's question for metadata, or execute the handler."""
     extension = frame.extension
     if extension and extension.contents.kind == METADATA_EXTENSION:
         version, own = extension.contents.metadata.contents.version, frame.api.contents.version
@@ -176,12 +201,13 @@ def _call(frame: _CallFrame, handler: Handler) -> None:
 
 
 def _failure(frame: _CallFrame, error: BaseException) -> int:
-    """XLA's error that says what was raised, and where."""
+    """Make XLA's error, with the exception and its traceback; return its address."""
     what = "".join(traceback.format_exception_only(error))
     where = "".join(traceback.format_tb(error.__traceback__)[2:])
     message = f"{what}raised, most recent call last, at\n{where}".encode(errors="replace")
     arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
-    return frame.api.contents.create_error(ctypes.byref(arguments))
+    address: int = frame.api.contents.create_error(ctypes.byref(arguments))
+    return address
 
 
 def _arrays(buffers: _Buffers) -> list[np.ndarray]:

@@ -1,8 +1,8 @@
-"""The way from XLA's threads into Python, closed before Python ends.
+"""Gate between XLA's threads and Python, closed before Python ends.
 
-XLA may still compute when a program ends, on threads of its own. One that asks for Python's lock then never gets it:
-the program crashes or hangs. So these threads pass a gate, in native code. At the end it is closed; whoever comes later
-goes back with an error, and whoever is inside is waited for.
+XLA may still compute on its own threads when a program ends. A thread that then asks for Python's GIL never gets it:
+the program crashes or hangs. So these threads pass a gate in native code, which closes at the end. Threads that come
+later return with an error; the gate waits for those inside.
 """
 
 import atexit
@@ -21,13 +21,13 @@ _num_inside, _is_closed = ctypes.c_int32(0), ctypes.c_int32(0)
 
 
 def gated(entry: int, path: tuple[int, int], message: int) -> int:
-    """The address of a function frame → error that calls `entry`, or makes an error where the gate is closed.
+    """Return the address of a function frame → error that calls `entry`, or makes an error if the gate is closed.
 
     Args:
-      entry: the address of a function of this kind.
-      path: where the function that makes an error is found: at the first offset in the frame lies the address of a
-        structure, at the second offset in that the function's.
-      message: the pointer that this is called with.
+      entry: address of a function of this kind.
+      path: offsets that lead to the function that makes an error. The first one, in the frame, holds the address of a
+        structure; the second one, in that structure, holds the address of the function.
+      message: pointer that this function is called with.
     """
     module, name = ir.Module("gate"), llvm_modules.unique("gate")
     function = ir.Function(module, SIGNATURE, name)
@@ -64,15 +64,15 @@ def _empty() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_empty)  # the parent's threads do not come along
+    os.register_at_fork(after_in_child=_empty)  # the child has none of the parent's threads
 
 
 @atexit.register
 def _close() -> None:
-    """Closes the gate and waits until nobody is inside."""
+    """Close the gate and wait until no thread is inside."""
     _is_closed.value = 1
     while _num_inside.value:
         time.sleep(1e-3)
-    # What the gate consists of is used as long as the process lives, longer than Python's objects.
+    # The gate is used as long as the process lives, so that its parts must outlive Python's shutdown.
     for kept in (_num_inside, _is_closed, llvm_modules._engine()):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))

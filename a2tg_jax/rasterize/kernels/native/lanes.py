@@ -1,8 +1,8 @@
 """Scalar JAX functions as LLVM code, one lane a pixel.
 
-A function of scalars is traced once to a jaxpr; each of its primitives becomes one LLVM instruction (or a few) on
-vectors of L lanes, or on plain scalars. What is computed, and its derivative, is thus said once, in JAX. The
-primitives are in `primitives` and `control_flow`; docs/compiler.md tells more.
+A function of scalars is traced once to a jaxpr. Each primitive becomes one or a few LLVM instructions on vectors of L
+lanes, or on plain scalars, so that a function and its derivative are defined only once, in JAX. The primitives are in
+`primitives` and `control_flow`; docs/compiler.md explains more.
 """
 
 from collections.abc import Sequence
@@ -19,8 +19,10 @@ from a2tg_jax.rasterize.kernels.native.vectors import (
     BOOL,
     FLAGS,
     INT,
+    Equation,
     Translator,
     Untranslatable,
+    result_of,
     scalar_of,
     scalar_type,
 )
@@ -29,20 +31,20 @@ __all__ = ["BOOL", "FLAGS", "INT", "Lanes", "Untranslatable", "scalar_of", "scal
 
 
 class Lanes(Translator):
-    """Emits jaxprs of scalars at a builder's position on vectors of `width` lanes; `width` 1 means plain scalars."""
+    """Translator of jaxprs at a builder's position, on vectors of `width` lanes; `width` 1 means plain scalars."""
 
     def emit(self, closed: core.ClosedJaxpr, arguments: Sequence[ir.Value]) -> list[ir.Value]:
-        """The values of a jaxpr of scalars, given one LLVM value per argument.
+        """Emit a jaxpr of scalars, given one LLVM value per argument; return its values.
 
         Raises:
-          Untranslatable: where a primitive or a dtype has no translation.
+          Untranslatable: if a primitive or a dtype has no translation.
         """
         if dump.is_wanted():
             dump.write(self.builder.function.name, "jaxpr", f"{closed}\n\n", append=True)
         return self.run(closed, arguments)
 
     def run(self, jaxpr: Any, arguments: Sequence[Any]) -> list[Any]:
-        """The values of a jaxpr, closed or without constants; arrays are as in `control_flow`."""
+        """Emit a jaxpr, closed or without constants, and return its values; arrays are those of `control_flow`."""
         consts = getattr(jaxpr, "consts", ())
         jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
         values: dict[core.Var, Any] = {}
@@ -63,10 +65,10 @@ class Lanes(Translator):
         numbers = np.asarray(value).reshape(-1)
         return array_of([self.constant(number, scalar) for number in numbers], aval.shape)
 
-    def _equation(self, equation, operands: list[Any]) -> list[Any]:
+    def _equation(self, equation: Equation, operands: list[Any]) -> list[Any]:
         name = equation.primitive.name
-        for variable in equation.outvars:
-            scalar_type(variable.aval.dtype)
+        for index in range(len(equation.outvars)):
+            scalar_type(result_of(equation, index).dtype)
         if name in STRUCTURE:
             return STRUCTURE[name](self, operands, equation)
         if name not in PRIMITIVES:

@@ -1,4 +1,4 @@
-"""The C library's mathematics, called lane by lane where there is no vector code of ours."""
+"""Functions of the C library's libm, called lane by lane if `elementary` has no vector code."""
 
 import ctypes
 import ctypes.util
@@ -12,7 +12,7 @@ from a2tg_jax.rasterize.kernels.native.vectors import INT, Vectors, num_bits, sc
 
 
 def call(lanes: Vectors, name: str, operands: list[ir.Value]) -> ir.Value:
-    """libm's function, such as "erf", of floats; each correct to about one unit in the last place."""
+    """Call a function of libm, such as "erf", on floats; its error is about one unit in the last place."""
     name = f"{name}f" if num_bits(operands[0].type) == 32 else name
     if lanes.width == 1:
         return lanes.call(_symbol(name), operands[0].type, operands)
@@ -20,7 +20,7 @@ def call(lanes: Vectors, name: str, operands: list[ir.Value]) -> ir.Value:
 
 
 def _of_vectors(lanes: Vectors, name: str, operands: list[ir.Value]) -> ir.Function:
-    """A function of the module that applies libm's to each lane; one copy, however often it is called."""
+    """Return the function of the module that applies one of libm to each lane, written on first use."""
     module, type_ = lanes.builder.module, operands[0].type
     key = f"{name}.{lanes.width}"
     if key in module.globals:
@@ -39,7 +39,7 @@ def _of_vectors(lanes: Vectors, name: str, operands: list[ir.Value]) -> ir.Funct
 
 @functools.cache
 def _symbol(name: str) -> str:
-    """The name under which compiled code finds a function of libm."""
+    """Return the name under which compiled code finds a function of libm."""
     address = ctypes.cast(getattr(_library(), name), ctypes.c_void_p).value
     llvm.add_symbol(f"libm.{name}", address)
     return f"libm.{name}"

@@ -1,33 +1,32 @@
-"""Native loops that list the splats of each tile: a counting sort, in time proportional to the pairs.
+"""Native functions that list the splats of each tile: a counting sort, in time proportional to the pairs.
 
     bound(M, cutoff, outlines, rectangles; first, last, width, height)
     find(order, rectangles, outlines, counts, tiles, splats; num_splats, columns)
     place(tiles, splats, cursors, ids; num_pairs)
 
-`bound` writes the outlines of the splats from `first` up to `last`, and which tiles their boxes cover. `find` goes
-through the splats in the given order, front to back, and writes down every pair whose outline touches its tile; `place`
-moves them tile by tile, in the same order.
+`bound` writes the outlines of the splats first..last − 1, and the rectangles of tiles that their boxes cover. `find`
+visits the splats in the given order, front to back, and writes every pair whose outline touches its tile; `place` moves
+the pairs to their tiles' lists, in the same order.
 
 Buffers: M [N, 9], cutoff [N], outlines [N, 9], rectangles [N, 4] (x0, y0, columns, count); order [splats], counts
-[tiles]; tiles and splats [pairs]; ids [capacity]; cursors [tiles], where each tile's list begins, and in the end where
-it ends.
+[tiles]; tiles and splats [pairs]; ids [capacity]; cursors [tiles], the start of each tile's list before the call and
+its end afterwards.
 """
 
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 from llvmlite import ir
 
 from a2tg_jax.core.geometry import Outline, ScreenBounds, clipped_box, unclipped_bounds
 from a2tg_jax.rasterize.kernels.native import llvm_modules
 from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
-from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
+from a2tg_jax.rasterize.kernels.native.tracing import example, trace
 from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
-from a2tg_jax.rasterize.tiles import TileGrid, outline_touches, tile_rectangles
+from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, outline_touches, tile_rectangles
 
 BOUND = ("M", "cutoff", "outlines", "rectangles")
 FIND = ("order", "rectangles", "outlines", "counts", "tiles", "splats")
@@ -36,22 +35,19 @@ NUM_NUMBERS = len(Outline._fields)
 
 
 def _example_outline(dtype: str) -> Outline:
-    number: Any = jax.ShapeDtypeStruct((), dtype)
-    flag: Any = jax.ShapeDtypeStruct((), jnp.bool_)
-    return Outline._make([number] * (NUM_NUMBERS - 1) + [flag])
+    return Outline._make([example(dtype)] * (NUM_NUMBERS - 1) + [example(jnp.bool_)])
 
 
 class _Bound(Writer):
     def __init__(self, module: ir.Module, name: str, dtype: str, tile_size: int, near_plane: float):
         super().__init__(module, name, BOUND, ("first", "last", "width", "height"), dtype)
-        number: Any = jax.ShapeDtypeStruct((), dtype)
-        integer = jax.ShapeDtypeStruct((), jnp.int32)
+        number, integer = example(dtype), example(jnp.int32)
         M = ((number,) * 3,) * 3
         outline = _example_outline(dtype)
         self.bounds, _ = trace(functools.partial(unclipped_bounds, near_plane=near_plane), M, number)
         self.clipped, _ = trace(functools.partial(clipped_box, near_plane=near_plane), M, outline, number)
 
-        def rectangle(bounds, width, height):
+        def rectangle(bounds: ScreenBounds, width: int, height: int) -> Rectangles:
             return tile_rectangles(bounds, TileGrid(width, height, tile_size))
 
         bounds = ScreenBounds(number, number, number, number, outline)
@@ -87,9 +83,8 @@ class _Find(Writer):
     def __init__(self, module: ir.Module, name: str, dtype: str, tile_size: int):
         super().__init__(module, name, FIND, ("num_splats", "columns"), dtype)
         self.tile_size = tile_size
-        number: Any = jax.ShapeDtypeStruct((), dtype)
         touches = functools.partial(outline_touches, tile_size=tile_size)
-        self.touches, _ = trace(touches, _example_outline(dtype), number, number)
+        self.touches, _ = trace(touches, _example_outline(dtype), example(dtype), example(dtype))
 
     def write(self) -> None:
         b, given = self.b, self.arguments
@@ -143,24 +138,24 @@ class _Place(Writer):
 
 
 @dataclasses.dataclass(frozen=True)
-class ListLoops:
-    """Compiled loops; each releases the GIL."""
+class ListFunctions:
+    """Compiled functions `bound`, `find` and `place`."""
 
-    bound: Any
-    find: Any
-    place: Any
+    bound: CompiledFunction
+    find: CompiledFunction
+    place: CompiledFunction
 
 
 @functools.cache
-def list_loops(dtype: str, tile_size: int, near_plane: float) -> ListLoops:
-    """The loops for homographies of a dtype and tiles of a size, compiled at the first call."""
+def list_functions(dtype: str, tile_size: int, near_plane: float) -> ListFunctions:
+    """Return the functions for homographies of a dtype and tiles of a size, compiled at the first call."""
     module = ir.Module("lists")
     bound, find, place = (llvm_modules.unique(name) for name in ("bound", "find", "place"))
     _Bound(module, bound, dtype, tile_size, near_plane).write()
     _Find(module, find, dtype, tile_size).write()
     _Place(module, place).write()
     addresses = llvm_modules.compile_module(module)
-    return ListLoops(
+    return ListFunctions(
         bound=llvm_modules.as_function(addresses[bound], len(BOUND), 4),
         find=llvm_modules.as_function(addresses[find], len(FIND), 2),
         place=llvm_modules.as_function(addresses[place], len(PLACE), 1),

@@ -4,12 +4,15 @@ import ctypes
 import functools
 import itertools
 import threading
+from collections.abc import Callable
 
 import llvmlite.binding as llvm
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import dump
 
+CompiledFunction = Callable[..., None]
+"""Compiled function void(pointer…, int32…), which releases the GIL as it runs."""
 _LOCK = threading.Lock()
 
 
@@ -29,7 +32,7 @@ def _engine() -> llvm.ExecutionEngine:
 
 @functools.cache
 def vector_bytes() -> int:
-    """How wide the processor's vectors are: 64 with AVX-512, 32 with AVX, else 16."""
+    """Return the width of the processor's vectors in bytes: 64 with AVX-512, 32 with AVX, else 16."""
     features = llvm.get_host_cpu_features()
     if features.get("avx512f"):
         return 64
@@ -40,12 +43,12 @@ _numbers = itertools.count()
 
 
 def unique(name: str) -> str:
-    """A name for a function that no other function has: all modules share one space of names."""
+    """Return a unique name for a function: all modules share one namespace."""
     return f"{name}_{next(_numbers)}"
 
 
 def compile_module(module: ir.Module) -> dict[str, int]:
-    """The addresses of a module's functions, optimised and compiled; they stay valid for the life of the process."""
+    """Optimise and compile a module; return the addresses of its functions, valid for the life of the process."""
     with _LOCK:
         module.triple = llvm.get_default_triple()
         module.data_layout = str(_machine().target_data)
@@ -69,7 +72,7 @@ def _is_exported(function: ir.Function) -> bool:
     return not function.is_declaration and function.linkage != "internal"
 
 
-def as_function(address: int, num_pointers: int, num_integers: int):
-    """A compiled function void(pointer…, int32…) as a Python callable; the GIL is released while it runs."""
+def as_function(address: int, num_pointers: int, num_integers: int) -> CompiledFunction:
+    """Return a compiled function void(pointer…, int32…) as a Python callable, which releases the GIL as it runs."""
     types = [ctypes.c_void_p] * num_pointers + [ctypes.c_int32] * num_integers
     return ctypes.CFUNCTYPE(None, *types)(address)

@@ -1,7 +1,7 @@
-"""JAX's element-wise primitives as LLVM instructions, a few at most, or as calls of what `elementary` and `libm` have.
+"""JAX's element-wise primitives as one or a few LLVM instructions, or as calls of `elementary` and `libm`.
 
-Integers behave as XLA's: sums wrap, x / 0 = −1, x % 0 = x, shifts by the width or more leave nothing but the sign, and
-floats that do not fit an integer become the nearest one that does, NaN becomes 0.
+Integers behave as in XLA: sums wrap, x / 0 = −1, x % 0 = x, and shifts by the width or more leave only the sign. A
+float out of range becomes the nearest integer in range, and NaN becomes 0.
 """
 
 import functools
@@ -14,31 +14,36 @@ from jax.extend import core
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import elementary, libm
-from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.native.tracing import example, trace
 from a2tg_jax.rasterize.kernels.native.vectors import (
     FLAGS,
+    Equation,
     Translator,
     is_float,
     num_bits,
+    result_of,
     scalar_of,
     scalar_type,
     suffix,
 )
 
-Emitter = Callable[[Translator, list[ir.Value], Any], ir.Value]
-"""(lanes, operands, equation) to the result."""
+Operands = list[ir.Value]
+Emitter = Callable[[Translator, Operands, Equation], ir.Value]
+"""Function of (lanes, operands, equation) that emits code and returns its result."""
 
 
-def _dtype(equation, operand: int = 0) -> np.dtype:
-    return equation.invars[operand].aval.dtype
+def _dtype(equation: Equation, operand: int = 0) -> np.dtype:
+    aval: Any = equation.invars[operand].aval
+    dtype: np.dtype = aval.dtype
+    return dtype
 
 
-def _is_signed(equation) -> bool:
+def _is_signed(equation: Equation) -> bool:
     return _dtype(equation).kind == "i"
 
 
 def _binary(for_floats: str, for_integers: str) -> Emitter:
-    def emit(lanes: Translator, operands, _):
+    def emit(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
         if is_float(operands[0].type):
             return getattr(lanes.builder, for_floats)(*operands, flags=FLAGS)
         return getattr(lanes.builder, for_integers)(*operands)
@@ -47,7 +52,7 @@ def _binary(for_floats: str, for_integers: str) -> Emitter:
 
 
 def _comparison(symbol: str) -> Emitter:
-    def emit(lanes: Translator, operands, equation):
+    def emit(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
         b = lanes.builder
         if is_float(operands[0].type):
             return (b.fcmp_unordered if symbol == "!=" else b.fcmp_ordered)(symbol, *operands)
@@ -70,13 +75,13 @@ def _libm(name: str) -> Emitter:
 
 @functools.cache
 def _formula(name: str) -> core.ClosedJaxpr:
-    return trace(elementary.FORMULAS[name], jax.ShapeDtypeStruct((), np.float32))[0]
+    return trace(elementary.FORMULAS[name], example(np.float32))[0]
 
 
 def _elementary(name: str, in_libm: str) -> Emitter:
-    """Our formula in float32, libm's function in float64."""
+    """Make an emitter of the formula of `elementary` in float32, and of libm's function in float64."""
 
-    def emit(lanes: Translator, operands, _):
+    def emit(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
         if num_bits(operands[0].type) != 32:
             return libm.call(lanes, in_libm, operands)
         (result,) = lanes.emit(_formula(name), operands)
@@ -86,10 +91,10 @@ def _elementary(name: str, in_libm: str) -> Emitter:
 
 
 def _trigonometric(name: str) -> Emitter:
-    """`_elementary`, and libm's function where a lane holds an angle too large for the formula."""
+    """Make an emitter as `_elementary` does, with libm's function for angles that are too large for the formula."""
     small = _elementary(name, name)
 
-    def emit(lanes: Translator, operands, equation):
+    def emit(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
         result, (x,), b = small(lanes, operands, equation), operands, lanes.builder
         if num_bits(x.type) != 32:
             return result
@@ -104,20 +109,20 @@ def _trigonometric(name: str) -> Emitter:
     return emit
 
 
-def _one_over_square_root(lanes: Translator, operands, equation) -> ir.Value:
+def _one_over_square_root(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x,) = operands
     one = lanes.constant(1, scalar_of(x.type))
     return lanes.builder.fdiv(one, lanes.intrinsic("sqrt", [x]), flags=FLAGS)
 
 
-def _logistic(lanes: Translator, operands, equation) -> ir.Value:
+def _logistic(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x,), b = operands, lanes.builder
     one = lanes.constant(1, scalar_of(x.type))
     power = PRIMITIVES["exp"](lanes, [b.fneg(x)], equation)
     return b.fdiv(one, b.fadd(one, power, flags=FLAGS), flags=FLAGS)
 
 
-def _power(lanes: Translator, operands, equation) -> ir.Value:
+def _power(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     x, exponent = operands
     if not is_float(exponent.type):
         signed = _dtype(equation, 1).kind == "i"
@@ -126,8 +131,8 @@ def _power(lanes: Translator, operands, equation) -> ir.Value:
     return libm.call(lanes, "pow", [x, exponent])
 
 
-def _whole_power(lanes: Translator, operands, equation) -> ir.Value:
-    """By repeated squaring."""
+def _whole_power(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
+    """Emit x^y for a whole constant y, by repeated squaring."""
     (power,), left, result = operands, abs(equation.params["y"]), None
     one = lanes.constant(1, scalar_of(power.type))
     while left:
@@ -142,7 +147,7 @@ def _whole_power(lanes: Translator, operands, equation) -> ir.Value:
 _multiply = _binary("fmul", "mul")
 
 
-def _divide(lanes: Translator, operands, equation) -> ir.Value:
+def _divide(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     x, y = operands
     b, type_ = lanes.builder, scalar_of(x.type)
     if is_float(x.type):
@@ -155,7 +160,7 @@ def _divide(lanes: Translator, operands, equation) -> ir.Value:
     return b.select(is_zero, number(-1), quotient)
 
 
-def _remainder(lanes: Translator, operands, equation) -> ir.Value:
+def _remainder(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x, _), b = operands, lanes.builder
     if is_float(x.type):
         return libm.call(lanes, "fmod", operands)
@@ -164,8 +169,8 @@ def _remainder(lanes: Translator, operands, equation) -> ir.Value:
     return b.select(is_zero, x, remainder)
 
 
-def _safe_divisor(lanes: Translator, operands, equation) -> tuple[ir.Value, ir.Value]:
-    """Where the divisor is 0; and the divisor, but 1 where a processor would trap: at 0 and at −1."""
+def _safe_divisor(lanes: Translator, operands: Operands, equation: Equation) -> tuple[ir.Value, ir.Value]:
+    """Emit a mask of the divisors 0, and the divisor with 1 in place of 0 and −1, at which processors may trap."""
     b, (_, y) = lanes.builder, operands
     number = functools.partial(lanes.constant, scalar=scalar_of(y.type))
     is_zero = b.icmp_unsigned("==", y, number(0))
@@ -176,7 +181,7 @@ def _safe_divisor(lanes: Translator, operands, equation) -> tuple[ir.Value, ir.V
 
 
 def _shift(method: str) -> Emitter:
-    def emit(lanes: Translator, operands, _):
+    def emit(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
         (x, amount), b = operands, lanes.builder
         width = num_bits(x.type)
         number = functools.partial(lanes.constant, scalar=scalar_of(x.type))
@@ -190,7 +195,7 @@ def _shift(method: str) -> Emitter:
 
 
 def _extreme(of_floats: str, symbol: str) -> Emitter:
-    def emit(lanes: Translator, operands, equation):
+    def emit(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
         if is_float(operands[0].type):
             return getattr(lanes, of_floats)(*operands)
         return lanes.builder.select(_comparison(symbol)(lanes, operands, equation), *operands)
@@ -201,24 +206,24 @@ def _extreme(of_floats: str, symbol: str) -> Emitter:
 _maximum, _minimum = _extreme("maximum", ">"), _extreme("minimum", "<")
 
 
-def _clamp(lanes: Translator, operands, equation) -> ir.Value:
+def _clamp(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     low, x, high = operands
     return _minimum(lanes, [_maximum(lanes, [x, low], equation), high], equation)
 
 
-def _negate(lanes: Translator, operands, _) -> ir.Value:
+def _negate(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
     (x,) = operands
     return lanes.builder.fneg(x) if is_float(x.type) else lanes.builder.neg(x)
 
 
-def _absolute(lanes: Translator, operands, equation) -> ir.Value:
+def _absolute(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x,) = operands
     if is_float(x.type):
         return lanes.intrinsic("fabs", [x])
     return _maximum(lanes, [x, lanes.builder.neg(x)], equation) if _is_signed(equation) else x
 
 
-def _sign(lanes: Translator, operands, equation) -> ir.Value:
+def _sign(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x,), b = operands, lanes.builder
     number = functools.partial(lanes.constant, scalar=scalar_of(x.type))
     if not is_float(x.type):
@@ -230,25 +235,25 @@ def _sign(lanes: Translator, operands, equation) -> ir.Value:
     return b.select(b.fcmp_ordered("!=", x, number(0.0)), signed, x)
 
 
-def _round(lanes: Translator, operands, equation) -> ir.Value:
+def _round(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     is_to_even = equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return lanes.intrinsic("rint" if is_to_even else "round", operands)
 
 
-def _is_finite(lanes: Translator, operands, _) -> ir.Value:
+def _is_finite(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
     (x,) = operands
     infinity = lanes.constant(np.inf, scalar_of(x.type))
     return lanes.builder.fcmp_ordered("<", lanes.intrinsic("fabs", [x]), infinity)
 
 
-def _count_leading_zeros(lanes: Translator, operands, _) -> ir.Value:
+def _count_leading_zeros(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
     (x,) = operands
     return lanes.call(f"llvm.ctlz.{suffix(x.type)}", x.type, [x, ir.IntType(1)(0)])
 
 
-def _convert(lanes: Translator, operands, equation) -> ir.Value:
+def _convert(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x,), b = operands, lanes.builder
-    source, target = _dtype(equation), equation.outvars[0].aval.dtype
+    source, target = _dtype(equation), result_of(equation).dtype
     type_ = lanes.vector(scalar_type(target))
     if source == target:
         return x
@@ -267,11 +272,11 @@ def _convert(lanes: Translator, operands, equation) -> ir.Value:
     return (b.sext if source.kind == "i" else b.zext)(x, type_)
 
 
-def _bitcast(lanes: Translator, operands, equation) -> ir.Value:
-    return lanes.builder.bitcast(operands[0], lanes.vector(scalar_type(equation.outvars[0].aval.dtype)))
+def _bitcast(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
+    return lanes.builder.bitcast(operands[0], lanes.vector(scalar_type(result_of(equation).dtype)))
 
 
-def _select(lanes: Translator, operands, equation) -> ir.Value:
+def _select(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     which, first, *others = operands
     if _dtype(equation) == np.bool_:
         return lanes.builder.select(which, others[0], first)
@@ -281,7 +286,7 @@ def _select(lanes: Translator, operands, equation) -> ir.Value:
     return first
 
 
-def _identity(lanes: Translator, operands, _) -> ir.Value:
+def _identity(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
     return operands[0]
 
 
@@ -352,4 +357,4 @@ PRIMITIVES: dict[str, Emitter] = {
     "tanh": _elementary("tanh", "tanh"),
     "xor": _bitwise("xor"),
 }
-"""Applied to every entry of small arrays alike."""
+"""Emitters by the name of the primitive; of small arrays, each applies to every entry."""

@@ -1,102 +1,110 @@
-"""A score of two images, natively: of every window the means of x, y, x² + y² and x·y, a function of them, its average.
+"""Native score of two images: the average over windows of a function of the means of x, y, x² + y² and x·y.
 
     score(x, y, sums, d_means, rows; first, last, channels, height, width)
     pull_back(x, y, d_mean, d_squares, d_product, share, d_x, rows; the same)
 
-Windows are separable; their T taps go down the columns first, then along the row. `score` does the rows from `first`
-up to `last` of windows, counted through all channels, `pull_back` those of pixels.
+Windows are separable; their T taps go down the columns first, then along the row. `score` computes the rows
+first..last − 1 of windows, counted through all channels; `pull_back` computes such rows of pixels.
 
-Buffers: x, y and d_x [C, height, width]; sums [C·down] of the scores of a row of down × across windows; d_means
-[4, C, down + 2·(T − 1), across] their derivatives by each mean, between margins of zeros; d_mean, d_squares and
-d_product three of these; share [1] what each score counts; rows for the columns' sums.
+Buffers: x, y and d_x [C, height, width]; sums [C·down] of the scores of each row, of down × across windows; d_means
+[4, C, down + 2·(T − 1), across] derivatives of the scores by each mean, between margins of zeros; d_mean, d_squares and
+d_product three of these; share [1] the weight of each score; rows: workspace for the sums of columns.
 """
 
 import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of, vary_with
+from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
 from a2tg_jax.rasterize.kernels.native import ffi, llvm_modules, threads
 from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
-from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
+from a2tg_jax.rasterize.kernels.native.tracing import example, trace
 from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
 
 SCORE = ("x", "y", "sums", "d_means", "rows")
 PULL_BACK = ("x", "y", "d_mean", "d_squares", "d_product", "share", "d_x", "rows")
 INTEGERS = ("first", "last", "channels", "height", "width")
 LEAST_PIXELS = 10_000
-"""Fewer pixels than this are not worth another thread."""
+"""Least number of pixels that is worth another thread."""
 
 
 class Score(NamedTuple):
-    """What is averaged over windows; hashable."""
+    """Score to average over windows; hashable."""
 
     function: Callable[[Array, Array, Array, Array], Array]
-    """Element-wise, of the means of x, y, x² + y² and x·y."""
+    """Element-wise function of the means of x, y, x² + y² and x·y."""
     taps: tuple[float, ...]
     """Weights of a window along one axis."""
 
 
-def least_width(dtype, num_taps: int) -> int:
-    """The narrowest image that the loops can do: the windows of a row fill a vector."""
-    return llvm_modules.vector_bytes() // np.dtype(dtype).itemsize + num_taps - 1
+def least_width(dtype: DTypeLike, num_taps: int) -> int:
+    """Return the least width of an image: the windows of a row must fill a vector."""
+    return _num_lanes(dtype) + num_taps - 1
+
+
+def _num_lanes(dtype: DTypeLike) -> int:
+    return llvm_modules.vector_bytes() // int(np.dtype(dtype).itemsize)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def mean_score(score: Score, x: Array, y: Array) -> Array:
-    """The average over all windows of images [C, H, W], float32 or float64, which are at least `least_width` wide."""
+    """Return the average over all windows of images [C, H, W], float32 or float64, at least `least_width` wide."""
     return _score(score, x, y)[0]
 
 
 def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return the average, and its derivatives by the means, `d_means`."""
     count, height, width = x.shape
     margin = len(score.taps) - 1
     down, across = height - margin, width - margin
-    shapes = (
-        jax.ShapeDtypeStruct((count * down,), x.dtype),
-        jax.ShapeDtypeStruct((4, count, down + 2 * margin, across), x.dtype),
-    )
+    shapes = (count * down,), (4, count, down + 2 * margin, across)
     name = _registered(score, str(x.dtype), "score", _score_handler)
-    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
-    sums, d_means = vary_with((x, y), call(x, y))
+    sums, d_means = ffi.call(name, [(shape, x.dtype) for shape in shapes], x, y)
     return jnp.sum(sums) / (count * down * across), d_means
 
 
-def _score_forward(score: Score, x: Array, y: Array):
+def _score_forward(score: Score, x: Array, y: Array) -> tuple[Array, tuple[Array, Array, Array]]:
     value, d_means = _score(score, x, y)
     return value, (x, y, d_means)
 
 
-def _score_backward(score: Score, residuals, cotangent: Array) -> tuple[Array, Array]:
+def _score_backward(score: Score, residuals: tuple[Array, Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, y, (d_x_mean, d_y_mean, *d_products) = residuals
     count, height, _ = x.shape
     name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
-    call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype), vmap_method="sequential")
     num_windows = count * (height - len(score.taps) + 1) * d_x_mean.shape[2]
     share = cotangent[None] / num_windows
     inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
-    # Where nobody asks for the second, XLA leaves it out.
-    return cotangent_of((x, y), tuple(vary_with(given, call(*given)) for given in inputs))
+    # XLA drops the second call if its result is not used.
+    (d_x,), (d_y,) = (ffi.call(name, [(x.shape, x.dtype)], *given) for given in inputs)
+    cotangents: tuple[Array, Array] = cotangent_of((x, y), (d_x, d_y))
+    return cotangents
 
 
 mean_score.defvjp(_score_forward, _score_backward)
 
 
-def _registered(score: Score, dtype: str, which: str, handler: Callable) -> str:
+def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"], handler: Callable[..., None]) -> str:
+    """Return the name under which XLA knows a function of a score."""
     function = getattr(score.function, "__qualname__", type(score.function).__name__)
-    make_handler = lambda: functools.partial(handler, getattr(_loops(score, dtype), which), len(score.taps) - 1)  # noqa: E731
+
+    def make_handler() -> ffi.Handler:
+        return functools.partial(handler, getattr(_window_functions(score, dtype), which), len(score.taps) - 1)
+
     return ffi.registered(f"{which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
 
 
-def _score_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+def _score_handler(run: CompiledFunction, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
     sums, d_means = results
     count, height, width = arguments[0].shape
     d_means[:, :, :margin], d_means[:, :, -margin:] = 0, 0
@@ -108,12 +116,14 @@ def _score_handler(run: Any, margin: int, arguments: list[np.ndarray], results: 
     _in_spans(part, len(sums), arguments[0].size)
 
 
-def _pull_back_handler(run: Any, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+def _pull_back_handler(
+    run: CompiledFunction, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]
+) -> None:
     (d_x,) = results
     count, height, width = d_x.shape
 
     def part(first: int, last: int, _: int) -> None:
-        # A row of windows stands between margins that stay zero.
+        # A row of windows lies between margins, which stay zero.
         rows = np.zeros(3 * (width + margin), d_x.dtype)
         run(*(array.ctypes.data for array in (*arguments, d_x, rows)), first, last, count, height, width)
 
@@ -121,28 +131,32 @@ def _pull_back_handler(run: Any, margin: int, arguments: list[np.ndarray], resul
 
 
 def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: int) -> None:
-    """part(first, last, _) for all rows, on as many threads as the pixels are worth."""
+    """Call part(first, last, _) for all rows, on as many threads as the pixels are worth."""
     threads.run_spans(part, threads.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
 
 
 class _Rows(Writer):
-    """What both loops share."""
+    """Base of the writers of both functions."""
 
     def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], score: Score, dtype: str):
         super().__init__(module, name, buffers, INTEGERS, dtype)
         self.score, self.margin = score, len(score.taps) - 1
-        self.lanes = Lanes(self.b, llvm_modules.vector_bytes() // np.dtype(dtype).itemsize)
+        self.lanes = Lanes(self.b, _num_lanes(dtype))
         self.reals = self.lanes.vector(self.real)
         self.channels, self.height, self.width = (self.long(self.arguments[name]) for name in INTEGERS[2:])
         self.down, self.across = (self.b.sub(size, LONG(self.margin)) for size in (self.height, self.width))
 
-    def loop_over_rows(self):
+    def loop_over_rows(self) -> contextlib.AbstractContextManager[tuple[ir.Value, ir.Block]]:
+        """Write a loop over the rows first..last − 1."""
         return self.loop(self.long(self.arguments["first"]), self.long(self.arguments["last"]))
 
     @contextlib.contextmanager
     def vectors(self, num: ir.Value) -> Iterator[tuple[ir.Value, ir.Value]]:
-        """A loop over `num` numbers, L at a time. The last vector may overlap the one before: yields where it begins,
-        and how many of its numbers were done already."""
+        """Write a loop over `num` numbers, L at a time; the last vector may overlap the one before.
+
+        Yields:
+          The start of each vector, and how many of its numbers the vector before contains.
+        """
         b, length = self.b, LONG(self.lanes.width)
         with self.loop(LONG(0), b.sdiv(b.add(num, LONG(self.lanes.width - 1)), length)) as (k, _):
             place, last = b.mul(k, length), b.sub(num, length)
@@ -150,28 +164,30 @@ class _Rows(Writer):
             yield start, b.sub(place, start)
 
     def row(self, name: str, index: ir.Value, length: ir.Value) -> ir.Value:
-        """The address of a row of an array."""
+        """Return the address of a row of an array."""
         return self.at(self.arguments[name], self.b.mul(index, length), self.real)
 
     def vector(self, base: ir.Value, index: ir.Value) -> ir.Value:
-        """L numbers of an array from an index on."""
+        """Load L numbers of an array, from an index on."""
         return self.load(self.at(base, index, self.real), 0, self.reals)
 
     def weighed(self, numbers: Sequence[ir.Value], taps: Sequence[float]) -> ir.Value:
-        """Σ taps·numbers."""
+        """Return Σ taps·numbers."""
         weights = [self.lanes.constant(tap, self.real) for tap in taps]
         return functools.reduce(self.sum, map(self.product, numbers, weights))
 
     def along(self, base: ir.Value, start: ir.Value, stride: ir.Value) -> list[ir.Value]:
-        """The numbers under a window's taps, from `start` on."""
+        """Load the numbers under a window's taps, from `start` on."""
         places = [self.b.add(start, self.times(stride, i)) for i in range(self.margin + 1)]
         return [self.vector(base, place) for place in places]
 
 
 class _ScoreRows(_Rows):
+    """Writer of `score`."""
+
     def write(self, dtype: str) -> None:
-        b, number = self.b, jax.ShapeDtypeStruct((), dtype)
-        with_slopes, _ = trace(jax.value_and_grad(self.score.function, argnums=(0, 1, 2, 3)), *[number] * 4)
+        b = self.b
+        with_slopes, _ = trace(jax.value_and_grad(self.score.function, argnums=(0, 1, 2, 3)), *[example(dtype)] * 4)
         lane = ir.Constant(self.lanes.vector(INT), list(range(self.lanes.width)))
         total, zero = self.variable(self.reals), self.lanes.constant(0.0, self.real)
         means = [self.row("rows", LONG(k), self.width) for k in range(4)]
@@ -194,7 +210,7 @@ class _ScoreRows(_Rows):
         b.ret_void()
 
     def store_columns(self, means: Sequence[ir.Value], first: ir.Value) -> None:
-        """Of every column, the weighed sums of x, y, x² + y² and x·y over the rows of a window, from row `first` on."""
+        """Store each column's weighted sums of x, y, x² + y² and x·y over the rows of a window, from `first` on."""
         with self.vectors(self.width) as (start, _):
             xs, ys = (self.along(self.row(name, first, self.width), start, self.width) for name in "xy")
             squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
@@ -204,6 +220,8 @@ class _ScoreRows(_Rows):
 
 
 class _PullBackRows(_Rows):
+    """Writer of `pull_back`."""
+
     def write(self) -> None:
         b, taps = self.b, self.score.taps[::-1]
         length = b.add(self.width, LONG(self.margin))
@@ -229,21 +247,22 @@ class _PullBackRows(_Rows):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Loops:
-    """Compiled loops; each releases the GIL."""
+class _WindowFunctions:
+    """Compiled functions `score` and `pull_back`."""
 
-    score: Any
-    pull_back: Any
+    score: CompiledFunction
+    pull_back: CompiledFunction
 
 
 @functools.cache
-def _loops(score: Score, dtype: str) -> _Loops:
+def _window_functions(score: Score, dtype: str) -> _WindowFunctions:
+    """Return the functions of a score, compiled at the first call."""
     module = ir.Module("windows")
     forward, backward = (llvm_modules.unique(name) for name in ("score", "pull_back"))
     _ScoreRows(module, forward, SCORE, score, dtype).write(dtype)
     _PullBackRows(module, backward, PULL_BACK, score, dtype).write()
     addresses = llvm_modules.compile_module(module)
-    return _Loops(
+    return _WindowFunctions(
         score=llvm_modules.as_function(addresses[forward], len(SCORE), len(INTEGERS)),
         pull_back=llvm_modules.as_function(addresses[backward], len(PULL_BACK), len(INTEGERS)),
     )

@@ -1,8 +1,8 @@
-"""Cotangents of splats, summed over threads that each composite a part of the tiles.
+"""Sums of the splats' cotangents over threads that each composite a part of the tiles.
 
-A splat's rows of the results belong to the first part that lists it. The few splats that a later part lists again, at
-the borders between parts, have rows of that part beside them, which are added at the end, part by part. The sums are
-those of ((part 0 + part 1) + part 2) + …, bit by bit, and no thread needs room for all splats.
+A splat's row of the results belongs to the first part that lists it. The few splats that a later part lists again, at
+the borders between parts, have extra rows of that part, which are added at the end, part by part. The sums equal
+((part 0 + part 1) + part 2) + …, bit for bit, and no thread needs memory for all splats.
 """
 
 import itertools
@@ -12,21 +12,28 @@ import numpy as np
 from a2tg_jax.rasterize.kernels.native import threads
 
 ROWS_PER_THREAD = 2_000
-"""Fewer rows to be added than these are not worth another thread."""
+"""Least number of rows to add that is worth another thread."""
 
 
 class SumsOfParts:
-    """The results, set to zero, and rows beside them, for one call.
+    """Results of one call, set to zero at first, and the extra rows of its parts.
 
     Args:
       ids: [pairs] splats.
-      starts: [tiles + 1] where the pairs of each tile begin.
+      starts: [tiles + 1] start of each tile's pairs.
       regions: [N, 3] first texel, height and width of each splat's texture; of another length without textures.
-      results: [N, S] of splats, [T, C] of texels, and [N, 4], or [1, 4] where nobody asks for these.
+      results: cotangents [N, S] of splats, [T, C] of texels, and [N, 4] of the probe, or [1, 4] without a statistic.
       parts: ranges of tiles.
     """
 
-    def __init__(self, ids: np.ndarray, starts: np.ndarray, regions: np.ndarray, results, parts: list[threads.Span]):
+    def __init__(
+        self,
+        ids: np.ndarray,
+        starts: np.ndarray,
+        regions: np.ndarray,
+        results: list[np.ndarray],
+        parts: list[threads.Span],
+    ):
         for result in results:
             result[...] = 0
         d_splats, d_texels, d_probe = self.results = results
@@ -50,15 +57,15 @@ class SumsOfParts:
         self.more_first = np.append(self.more_first, 0).astype(np.int32)
 
     def outputs(self, index: int) -> list[np.ndarray]:
-        """What the loop adds to in a part, from `d_splats` on."""
+        """Return the buffers that the backward pass adds to in a part, from `d_splats` on."""
         d_splats, _, d_probe = self.results
         more = self.more_splats, self.more_texels[index], self.more_probe, self.more_first
         return [d_splats, self.texels_of_parts[index], d_probe, self.places, *more]
 
     def add_up(self) -> None:
-        """Adds the further rows to the results, in the order of the parts."""
+        """Add the extra rows to the results, in the order of the parts."""
         for first, last in itertools.pairwise(self.borders):
-            # A splat has at most one row of a part, so that threads may share these.
+            # A splat has at most one extra row in a part, so that threads can divide them.
             spans = threads.even_spans(last - first, ROWS_PER_THREAD)
             threads.run_spans(self._add_rows, [(first + begin, first + end) for begin, end in spans])
         for texels in self.texels_of_parts[1:] if self.is_shared else ():
@@ -78,12 +85,16 @@ class SumsOfParts:
 
 
 def _places(ids: np.ndarray, spans: list[threads.Span], num: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """The further row of every pair, −1 where it has none; the splat of every further row; where each part's end.
+    """Assign extra rows to the pairs of splats that an earlier part lists.
 
     Args:
       ids: [pairs] splats.
-      spans: of the pairs of each part.
-      num: splats.
+      spans: range of each part's pairs.
+      num: number of splats.
+
+    Returns:
+      The extra row of every pair, −1 if it has none; the splat of every extra row; and the borders between the parts'
+      extra rows.
     """
     places, is_listed, row = np.full(max(1, spans[-1][1]), -1, np.int32), np.zeros(num, bool), np.empty(num, np.int32)
     again: list[np.ndarray] = []
@@ -102,7 +113,7 @@ def _places(ids: np.ndarray, spans: list[threads.Span], num: int) -> tuple[np.nd
 
 
 def _overlap(regions: np.ndarray) -> bool:
-    """Whether two textures share texels."""
+    """Return whether two textures share texels."""
     first, area = regions[:, 0].astype(np.int64), regions[:, 1].astype(np.int64) * regions[:, 2]
     both = np.sort(first << 32 | area)
     first, area = both >> 32, both & 0xFFFFFFFF

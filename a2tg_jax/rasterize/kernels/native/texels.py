@@ -1,8 +1,8 @@
-"""Texture lookups in vector code, without gathers: reading the splats' textures, and adding to their cotangents.
+"""Texture lookups in vector code without gathers: reads of the splats' textures, and sums of their cotangents.
 
-Every texel that a vector of L neighbouring pixels may see is loaded once, for all lanes, which weigh it by how near
-they are: what `bilinear` says with four corners is the same sum. Textures of up to 4×4 are visited whole, by code that
-is unrolled along a row; of larger ones the texels between the least and the largest coordinate of the lanes.
+Every texel that a vector of L neighbouring pixels may see is loaded once for all lanes, and each lane weighs it by its
+distance. The sum is that of the four corners in `core.bilinear`. Textures of up to 4×4 texels are visited whole, with
+code unrolled along a row; in larger ones, the texels between the least and the largest coordinate of the lanes are.
 """
 
 import contextlib
@@ -16,64 +16,70 @@ from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
 from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
 
 EMPTY = 0
-"""The width of a texture without texels."""
+"""Width of a texture without texels."""
 SMALL_WIDTHS = (1, 2, 4)
-"""Textures of these widths, and up to the largest of them high, are small."""
+"""Widths of small textures, whose height is at most the largest of these."""
 SMALL_HEIGHT = max(SMALL_WIDTHS)
 
 
 class NativeTexture(NamedTuple):
-    """A splat's texture among all texels, or its cotangents among theirs."""
+    """Place of a splat's texture among all texels, or of its cotangents among theirs."""
 
     first: ir.Value
-    """The address of its first texel."""
+    """Address of its first texel."""
     height: ir.Value
-    """64 bits, as the width."""
+    """Height in texels, a 64-bit integer."""
     width: ir.Value
+    """Width in texels, a 64-bit integer."""
 
 
 class Place(NamedTuple):
-    """Where L lanes look in a texture."""
+    """Positions of L lanes in a texture."""
 
     x: ir.Value
-    """Texel coordinates."""
+    """Horizontal coordinates in texels."""
     y: ir.Value
+    """Vertical coordinates in texels."""
     is_reached: ir.Value
-    """Lanes whose pixel the splat may reach; one at least."""
+    """Mask of the lanes whose pixel the splat may reach; at least one is set."""
 
 
 class Line(NamedTuple):
-    """A row or a column of texels."""
+    """Row or column of texels."""
 
     index: ir.Value
+    """Number of the row or column."""
     weight: ir.Value
-    """max(0, 1 − |distance|) in each lane."""
+    """Weight max(0, 1 − |distance|) in each lane."""
     slope: ir.Value | None
-    """Its derivative within the cell; None where it is zero or nobody asks."""
+    """Derivative of the weight within the cell; None if it is zero or not requested."""
 
 
 class TexelWriter(Writer):
-    """A function that reads textures in texels [T, C], or adds to their cotangents."""
+    """Writer of a function that reads textures in texels [T, C], or adds to their cotangents."""
 
     lanes: Lanes
+    """Operations on vectors of L pixels."""
     reals: ir.Type
+    """Type of a vector of L floats."""
     num_columns: int
+    """Number C of numbers per texel."""
     empty: Sequence[float]
-    """The C values of a splat without a texture; none where all splats have one."""
+    """C values of a splat without a texture; empty if all splats have one."""
     sums: ir.Value
-    """Cotangents of the texels of a small texture per lane, `num_sums` vectors; zero before a splat."""
+    """Cotangents of a small texture's texels in each lane, `num_sums` vectors; zero before a splat."""
 
     @property
     def num_sums(self) -> int:
-        """C for every texel of the largest small texture."""
+        """Number of vectors in `sums`: C for every texel of the largest small texture."""
         return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
 
     def texture(self, texels: ir.Value, first: ir.Value, height: ir.Value, width: ir.Value) -> NativeTexture:
-        """The texture that begins with texel `first`."""
+        """Return the texture that begins with texel `first`."""
         return NativeTexture(self.at(texels, self.times(first, self.num_columns), self.real), height, width)
 
     def sample(self, texture: NativeTexture, place: Place, has_slopes: bool) -> list[ir.Value]:
-        """C values; and C slopes along x and C along y, where asked for."""
+        """Return C interpolated values and, with slopes, their C derivatives along x and C along y."""
         count = self.num_columns
         num_slopes = count if has_slopes else 0
         values, along_x, along_y = (self.zeros(num) for num in (count, num_slopes, num_slopes))
@@ -85,7 +91,12 @@ class TexelWriter(Writer):
             with self.rows(texture, width, place, has_slopes) as row:
                 in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
 
-                def add_texel(column: Line, row=row, in_row=in_row, in_row_along_x=in_row_along_x) -> None:
+                def add_texel(
+                    column: Line,
+                    row: Line = row,
+                    in_row: list[ir.Value] = in_row,
+                    in_row_along_x: list[ir.Value] = in_row_along_x,
+                ) -> None:
                     texel = self.texel(texture, column, row)
                     numbers = [self.lanes.broadcast(self.load(texel, k, self.real)) for k in range(count)]
                     self.accumulate(in_row, column.weight, numbers)
@@ -99,14 +110,16 @@ class TexelWriter(Writer):
         return self.loads([*values, *along_x, *along_y])
 
     def add_to_texels(self, texture: NativeTexture, place: Place, d_values: Sequence[ir.Value]) -> None:
-        """Adds the cotangents of C values, which are zero in lanes that do not count; `finish_texels` completes it."""
+        """Add the cotangents of C values, zero in lanes that do not count; `finish_texels` completes the sum."""
         for width in self.cases(texture):
             if width == EMPTY:
                 continue
             with self.rows(texture, width, place, False) as row:
                 in_row = [self.product(row.weight, d_value) for d_value in d_values]
 
-                def add_texel(column: Line, width=width, row=row, in_row=in_row) -> None:
+                def add_texel(
+                    column: Line, width: int | None = width, row: Line = row, in_row: list[ir.Value] = in_row
+                ) -> None:
                     addends = [self.product(column.weight, d_value) for d_value in in_row]
                     if width is None:
                         self.add_sums(self.texel(texture, column, row), addends)
@@ -119,7 +132,7 @@ class TexelWriter(Writer):
                 self.each_column(texture, width, place, False, add_texel)
 
     def finish_texels(self, texture: NativeTexture) -> None:
-        """Adds what the lanes have summed of a small texture to the cotangents of the texels."""
+        """Add the lanes' sums of a small texture to the cotangents of its texels."""
         b, zero = self.b, self.lanes.constant(0.0, self.real)
         num = b.select(
             b.icmp_signed(">", self.small_width(texture), LONG(0)), b.mul(texture.height, texture.width), LONG(0)
@@ -132,7 +145,7 @@ class TexelWriter(Writer):
             self.add_sums(self.entry(texture, place), addends)
 
     def small_width(self, texture: NativeTexture) -> ir.Value:
-        """The width of a small texture; −1 for a large one."""
+        """Return the width of a small texture; −1 for a large one."""
         b = self.b
         is_width = [b.icmp_signed("==", texture.width, LONG(width)) for width in self.small_widths]
         is_low = b.icmp_signed("<=", texture.height, LONG(SMALL_HEIGHT))
@@ -140,11 +153,11 @@ class TexelWriter(Writer):
 
     @property
     def small_widths(self) -> tuple[int, ...]:
+        """Widths of small textures, with `EMPTY` if there may be textures without texels."""
         return (EMPTY, *SMALL_WIDTHS) if self.empty else SMALL_WIDTHS
 
     def cases(self, texture: NativeTexture) -> Iterator[int | None]:
-        """Branches, which the caller fills: one per width of a small texture, which may be none, and one (None) for all
-        that are large."""
+        """Write branches, which the caller fills: one per width of a small texture, and one (None) for large ones."""
         b = self.b
         large, end = b.append_basic_block("large"), b.append_basic_block("end")
         switch = b.switch(self.small_width(texture), large)
@@ -159,7 +172,7 @@ class TexelWriter(Writer):
 
     @contextlib.contextmanager
     def rows(self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool) -> Iterator[Line]:
-        """A loop over the rows that may be seen; all of them, where the width is that of a small texture."""
+        """Write a loop over the rows that may be seen; for the width of a small texture, over all rows."""
         if width is None:
             span, y = self.seen(place.y, place.is_reached, texture.height)
         else:
@@ -170,7 +183,7 @@ class TexelWriter(Writer):
     def each_column(
         self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool, visit: Callable[[Line], None]
     ) -> None:
-        """Calls `visit` for the columns that may be seen: in a loop, or unrolled for a small texture."""
+        """Call `visit` on the columns that may be seen: in a loop, or unrolled for a small texture."""
         if width is None:
             span, x = self.seen(place.x, place.is_reached, texture.width)
             with self.loop(*span) as (index, _):
@@ -184,11 +197,15 @@ class TexelWriter(Writer):
     def seen(
         self, places: ir.Value, is_reached: ir.Value, size: ir.Value
     ) -> tuple[tuple[ir.Value, ir.Value], ir.Value]:
-        """The first texel along an axis that a reached lane sees, and the one after the last; and the places, those of
-        other lanes moved between the reached ones."""
+        """Find the texels along an axis that the reached lanes see.
+
+        Returns:
+          The first texel and the end, which is excluded; and the places, those of other lanes moved between the
+          reached ones.
+        """
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
         most = self.lanes.broadcast(b.sitofp(b.sub(size, LONG(1)), self.real))
-        # Whatever a lane holds, even if it is no number, nothing outside of the texture is read.
+        # Clipped, so that no lane reads outside the texture, even if it holds NaN.
         places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
         places = b.select(b.fcmp_ordered("<", places, most), places, most)
         least = self.lanes.smallest(b.select(is_reached, places, most))
@@ -201,13 +218,13 @@ class TexelWriter(Writer):
         return (b.fptosi(least, LONG), end), moved
 
     def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
-        """One of `size` texels along an axis, seen from `places`."""
+        """Return one of `size` rows or columns, seen from `places`."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
         distance = b.fsub(places, self.lanes.broadcast(b.sitofp(index, self.real)))
         weight = self.lanes.larger(b.fsub(number(1.0), self.lanes.intrinsic("fabs", [distance])), number(0.0))
         if not has_slope:
             return Line(index, weight, None)
-        # The last texel goes on: nothing changes beyond it.
+        # Beyond the last texel the texture is constant.
         is_last = b.icmp_signed("==", index, b.sub(size, LONG(1)))
         falling = self.lanes.broadcast(b.select(is_last, self.real(0.0), self.real(-1.0)))
         slope = b.select(b.fcmp_ordered("<", distance, number(0.0)), number(1.0), falling)
@@ -215,20 +232,20 @@ class TexelWriter(Writer):
         return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
 
     def texel(self, texture: NativeTexture, column: Line, row: Line) -> ir.Value:
-        """The address of a texel."""
+        """Return the address of a texel."""
         return self.entry(texture, self.b.add(self.b.mul(row.index, texture.width), column.index))
 
     def entry(self, texture: NativeTexture, index: ir.Value) -> ir.Value:
-        """The address of a texel, counted row by row."""
+        """Return the address of a texel, counted row by row."""
         return self.at(texture.first, self.times(index, self.num_columns), self.real)
 
     def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
-        """Adds the sums over lanes of C vectors to an entry."""
+        """Add the sums over lanes of C vectors to a texel."""
         sums = self.sums_over_lanes(vectors)
         self.store(self.b.fadd(self.load(entry, 0, sums.type), sums), entry, 0)
 
     def accumulate(self, totals: Sequence[ir.Value], weight: ir.Value | None, numbers: Sequence[ir.Value]) -> None:
-        """totals += weight·numbers; a weight of None is zero."""
+        """Add weight·numbers to the totals; a weight of None is zero."""
         if weight is None:
             return
         for total, number in zip(totals, numbers, strict=True):
@@ -236,17 +253,18 @@ class TexelWriter(Writer):
             self.b.store(self.sum(before, self.product(weight, number)), total)
 
     def zeros(self, num: int) -> list[ir.Value]:
-        """Variables, one vector each, set to zero here."""
+        """Return variables of one vector each, set to zero at this point."""
         rooms = [self.variable(self.reals) for _ in range(num)]
         for room in rooms:
             self.b.store(self.lanes.constant(0.0, self.real), room)
         return rooms
 
     def loads(self, rooms: Sequence[ir.Value]) -> list[ir.Value]:
+        """Load variables of one vector each."""
         return [self.b.load(room, typ=self.reals) for room in rooms]
 
     def sums_over_lanes(self, vectors: Sequence[ir.Value]) -> ir.Value:
-        """C vectors of L as one vector of the C sums."""
+        """Sum C vectors over their lanes; return one vector of the C sums."""
         if len(vectors) == 4 and self.lanes.width % 4 == 0:
             total = functools.reduce(self.b.fadd, self.transpose_quarters(vectors))
             return self.lanes.fold(total, self.b.fadd, 4)
@@ -256,7 +274,7 @@ class TexelWriter(Writer):
         return sums
 
     def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
-        """Four vectors, every four lanes of them transposed as a 4×4 matrix."""
+        """Transpose every four lanes of four vectors as a 4×4 matrix."""
         low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
         high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
         first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
@@ -264,7 +282,7 @@ class TexelWriter(Writer):
         return [self.shuffle(*pair) for pair in pairs]
 
     def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
-        """The pattern in every four lanes; numbers are lanes of x, strings of y."""
+        """Apply a pattern to every four lanes; numbers are lanes of x, strings are lanes of y."""
         width = self.lanes.width
         mask = [
             quarter + (width + int(lane) if isinstance(lane, str) else lane)

@@ -1,31 +1,31 @@
-"""The threads that native loops run on, made at the first need."""
+"""Thread pool of native loops, started on first use."""
 
 import concurrent.futures
 import functools
 import itertools
 from collections.abc import Callable, Sequence
 
-from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.cores import num_threads as num_threads
 
 Span = tuple[int, int]
-"""First item, and the one after the last."""
+"""First item, and the end, which is excluded."""
 
 
 def even_spans(num: int, least_items: int) -> list[Span]:
-    """0..num in one span for each thread that gets at least so many items; at least one span."""
+    """Split 0..num into even spans, one per thread, of at least `least_items` each if there is more than one."""
     count = max(1, min(num_threads(), num // max(1, least_items)))
     return list(itertools.pairwise(num * k // count for k in range(count + 1)))
 
 
 def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> None:
-    """work(first, last, index) for every span, the first one on this thread, the others on the pool's."""
-    others: list[concurrent.futures.Future] = []
+    """Call work(first, last, index) for every span: the first one on this thread, the others on the pool's."""
+    others: list[concurrent.futures.Future[None]] = []
     try:
         for index, span in enumerate(spans[1:], start=1):
             others.append(_pool(num_threads()).submit(work, *span, index))
         work(*spans[0], 0)
     finally:
-        # Whatever happens, nobody may write to XLA's buffers once they are given back.
+        # Also after an exception: nobody may write to XLA's buffers once they are given back.
         concurrent.futures.wait(others)
     for other in others:
         other.result()

@@ -1,4 +1,4 @@
-"""What native loops are made for (`KernelSpec`), and the scalar functions that they apply, traced to jaxprs."""
+"""Specification of the native passes (`KernelSpec`), and the scalar functions that they apply, as jaxprs."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,38 +7,43 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.appearance import Arguments, StaticRule
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.kernels.native import llvm_modules
-from a2tg_jax.rasterize.kernels.native.tracing import trace
+from a2tg_jax.rasterize.kernels.native.tracing import example, trace
 from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.splats import num_channels
 
 
 @dataclasses.dataclass(frozen=True)
 class KernelSpec:
-    """What a pair of loops is made for; hashable."""
+    """Specification for which a forward and a backward pass are compiled; hashable."""
 
     rule: StaticRule
-    """What the splats show."""
+    """Appearance rule."""
     num_rule_numbers: int
-    """K, what else the rule knows of a splat."""
+    """Number K of numbers per splat of the rule."""
     num_columns: int
-    """C, numbers of a texel; 0 where its splats have no textures."""
+    """Number C of numbers per texel; 0 without textures."""
     dtype: str
-    """Of all that is computed: "float32" or "float64"."""
+    """Dtype of all computations: "float32" or "float64"."""
     tile_size: int
+    """Side of a tile in pixels."""
     near_plane: float
+    """Least depth of visible hits."""
     has_geometry: bool
+    """Whether depth, squared depth and normals are composited beside the colour."""
     statistic: pixel.Statistic | None
+    """Statistic that the backward pass computes for densification, if any."""
     num_colors: int = 3
-    """D, colours of a splat."""
+    """Number D of colours of a splat."""
 
     @property
     def arguments(self) -> Arguments:
-        """What the element-wise functions of the rule are called with."""
+        """Arguments of the element-wise functions of the rule."""
         return Arguments(self.num_rule_numbers, self.num_columns, self.num_colors, self.dtype)
 
     @property
@@ -47,31 +52,29 @@ class KernelSpec:
 
     @property
     def num_floats(self) -> int:
-        """S: the splat's own numbers, and the squared distance beyond which it does not show."""
+        """Number S of floats per splat: its numbers, and the squared distance beyond which it is invisible."""
         return num_numbers(self.has_geometry, self.num_colors) + self.num_rule_numbers + 1
 
     @property
     def lanes(self) -> int:
-        """L, numbers that fit the processor's vectors."""
+        """Number L of numbers in one of the processor's vectors."""
         return llvm_modules.vector_bytes() // np.dtype(self.dtype).itemsize
 
     @property
     def num_vectors(self) -> int:
-        """Vectors of L pixels in a tile, the last one perhaps not full."""
+        """Number of vectors of L pixels in a tile; the last one may be partly filled."""
         return -(-(self.tile_size**2) // self.lanes)
 
 
 class Functions:
-    """The jaxprs of one spec, all of scalars.
+    """Jaxprs of scalars for one spec.
 
-    `prepare` and `prepare_vjp` are run once per splat and tile; `reach`, `forward` and `backward` at every pixel.
+    `prepare` and `prepare_vjp` run once per splat and tile; `reach`, `forward` and `backward` run at every pixel.
     """
 
     def __init__(self, spec: KernelSpec):
         self._spec, self._rule = spec, spec.rule.rule
-        number: Any = jax.ShapeDtypeStruct((), spec.dtype)
-        integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
-        flag = jax.ShapeDtypeStruct((), jnp.bool_)
+        number, integer, flag = example(spec.dtype), example(jnp.int32), example(jnp.bool_)
         triple = (number,) * 3
         normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
         splat = pixel.Splat((triple,) * 3, number, (number,) * spec.num_colors, normal, numbers)
@@ -89,26 +92,36 @@ class Functions:
         of_backward = number, channels, (number, number), (triple,) * 3
         self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
 
-    def _reach(self, planes, region, x, y):
-        """Squared distance ρ of the pixel, and where the splat's texture is looked up."""
+    def _reach(
+        self, planes: pixel.Planes, region: TextureRegion | None, x: Array, y: Array
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Return the squared distance ρ of the pixel, and the position of the texture lookup."""
         hit = pixel.intersect(planes, x, y, self._spec.near_plane, self._rule.has_low_pass)
         return hit.rho, () if region is None else self._rule.texel_position(region, hit.u, hit.v)
 
-    def _forward(self, planes, splat, values, x, y, transmittance, is_live, channels):
-        """Transmittance and liveness behind the splat, and the channels with it."""
+    def _forward(
+        self, planes: pixel.Planes, splat: pixel.Splat, values: tuple[Array, ...], x: Array, y: Array,
+        transmittance: Array, is_live: Array, channels: tuple[Array, ...],
+    ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
+        """Return transmittance and liveness behind the splat, and the channels with it."""
         at_pixel = planes, splat, values, x, y, transmittance, is_live
         added, transmittance, is_live = pixel.blend(self._rule, self._spec.near_plane, *at_pixel)
         return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
 
-    def _backward(self, planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g, center, jacobian):
-        """The state behind the splat, whether it contributes, and the cotangents: of texture values, and all others."""
+    def _backward(
+        self, planes: pixel.Planes, splat: pixel.Splat, lookup: Lookup | None, x: Array, y: Array,
+        transmittance: Array, is_live: Array, suffix_sum: Array, g: tuple[Array, ...], center: tuple[Array, Array],
+        jacobian: pixel.Rows,
+    ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
+        """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
         spec, rule = self._spec, self._rule
         at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
         state, weight, d = pixel.blend_vjp(rule, spec.near_plane, *at_pixel, spec.statistic is not None)
-        added = ()
-        if spec.statistic:
-            moved = splat.M, x, y, *center, d.rho, jacobian
-            added = pixel.positional_gradient(spec.statistic, *moved, spec.near_plane, rule.has_low_pass)
+        added: tuple[Array, ...] = ()
+        if spec.statistic and d.rho is not None:
+            added = pixel.positional_gradient(
+                spec.statistic, splat.M, x, y, *center, d.rho, jacobian, spec.near_plane, rule.has_low_pass
+            )
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
 
@@ -141,6 +154,7 @@ def _primitives(jaxpr: Any) -> set[str]:
     return found
 
 
-def _planes_vjp(M, x, y, d_planes):
-    """The cotangent of M, given that of its planes."""
-    return jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+def _planes_vjp(M: pixel.Rows, x: Array, y: Array, d_planes: pixel.Planes) -> pixel.Rows:
+    """Return the cotangent of M, given that of its planes."""
+    d_M: pixel.Rows = jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+    return d_M

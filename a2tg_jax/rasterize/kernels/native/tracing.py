@@ -1,4 +1,4 @@
-"""Jaxprs of scalar functions, traced whatever JAX is tracing around them."""
+"""Jaxprs of scalar functions, independent of what JAX is tracing around them."""
 
 import concurrent.futures
 from collections.abc import Callable
@@ -6,22 +6,29 @@ from typing import Any
 
 import jax
 from jax.extend import core
+from jax.typing import DTypeLike
 
 
-def trace(function: Callable, *examples) -> tuple[core.ClosedJaxpr, Any]:
-    """The jaxpr of a function of scalars, and the structure of what it returns.
+def example(dtype: DTypeLike) -> Any:
+    """Return an abstract scalar as an example for `trace`."""
+    return jax.ShapeDtypeStruct((), dtype)  # type: ignore[no-untyped-call]
 
-    Whatever is being traced around it has no part in it: not the axes of a `shard_map`, nor a mesh.
+
+def trace(function: Callable[..., Any], *examples: Any) -> tuple[core.ClosedJaxpr, Any]:
+    """Return the jaxpr of a function of scalars, and the tree structure of its result.
+
+    The jaxpr does not depend on what is being traced around it, such as the axes of a `shard_map` or a mesh.
 
     Args:
-      examples: pytrees of `jax.ShapeDtypeStruct` with shape ().
+      function: function to trace.
+      examples: pytrees of `example`, one per argument.
     """
     closed, shape = _in_clean_context(lambda: jax.make_jaxpr(function, return_shape=True)(*examples))
     return closed, jax.tree.structure(shape)
 
 
 def _in_clean_context(work: Callable[[], Any]) -> Any:
-    """work(), on a thread of its own: JAX keeps what it is tracing by thread. Its rules for dtypes are the caller's."""
+    """Run work() on a thread of its own, for JAX's tracing is per thread, with the caller's dtype rules."""
     config: Any = jax.config
     is_x64, promotion = config.jax_enable_x64, config.jax_numpy_dtype_promotion
 

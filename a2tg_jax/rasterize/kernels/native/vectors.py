@@ -1,20 +1,22 @@
-"""Arithmetic on vectors of lanes, or on plain scalars, at the position of an LLVM builder."""
+"""Arithmetic on vectors of lanes, or on plain scalars, at an LLVM builder's position."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from jax.extend import core
+from jax.typing import DTypeLike
 from llvmlite import ir
 
 FLAGS = ("contract",)
-"""Products and sums may fuse; nothing else of IEEE arithmetic is given up within a lane."""
+"""Flags that let products and sums fuse; within a lane all other IEEE rules hold."""
+Equation = core.JaxprEqn
 INT = ir.IntType(32)
 BOOL = ir.IntType(1)
 
 
 class Untranslatable(ValueError):
-    """A function cannot become native loops; the message names what stands in the way."""
+    """Error of a function that cannot become native loops; the message names the obstacle."""
 
     primitive: str | None = None
     """Name of the primitive that has no translation, if it is one."""
@@ -27,8 +29,8 @@ class Untranslatable(ValueError):
         return error
 
 
-def scalar_type(dtype) -> ir.Type:
-    """The LLVM type of a scalar of a numpy dtype.
+def scalar_type(dtype: DTypeLike) -> ir.Type:
+    """Return the LLVM type of a scalar of a numpy dtype.
 
     Raises:
       Untranslatable: for anything but bool, integers of 8 to 64 bits, float32 and float64.
@@ -46,7 +48,7 @@ def scalar_type(dtype) -> ir.Type:
 
 
 def scalar_of(type_: ir.Type) -> ir.Type:
-    """The type of one lane."""
+    """Return the type of one lane."""
     return type_.element if isinstance(type_, ir.VectorType) else type_
 
 
@@ -55,15 +57,20 @@ def is_float(type_: ir.Type) -> bool:
 
 
 def num_bits(type_: ir.Type) -> int:
-    """Width of one lane's type."""
+    """Return the bits of one lane's type."""
     scalar = scalar_of(type_)
     return {ir.FloatType: 32, ir.DoubleType: 64}.get(type(scalar)) or scalar.width
 
 
 def suffix(type_: ir.Type) -> str:
-    """How intrinsics spell a type."""
+    """Return the spelling of a type in the names of intrinsics."""
     one = f"{'f' if is_float(type_) else 'i'}{num_bits(type_)}"
     return f"v{type_.count}{one}" if isinstance(type_, ir.VectorType) else one
+
+
+def result_of(equation: Equation, index: int = 0) -> Any:
+    """Return the abstract value of a result, which has a shape and a dtype."""
+    return equation.outvars[index].aval
 
 
 class Vectors:
@@ -73,16 +80,16 @@ class Vectors:
         self.builder, self.width = builder, width
 
     def vector(self, scalar: ir.Type) -> ir.Type:
-        """The type of one value per lane."""
+        """Return the type of one value per lane."""
         return scalar if self.width == 1 else ir.VectorType(scalar, self.width)
 
-    def constant(self, value, scalar: ir.Type) -> ir.Constant:
-        """The same number in every lane."""
+    def constant(self, value: Any, scalar: ir.Type) -> ir.Constant:
+        """Return the same number in every lane."""
         value = float(value) if is_float(scalar) else int(value)
         return ir.Constant(self.vector(scalar), value if self.width == 1 else [value] * self.width)
 
     def broadcast(self, value: ir.Value) -> ir.Value:
-        """A scalar in every lane."""
+        """Copy a scalar to every lane."""
         if self.width == 1:
             return value
         undefined = ir.Constant(self.vector(value.type), ir.Undefined)
@@ -92,27 +99,27 @@ class Vectors:
         )
 
     def room(self, type_: ir.Type) -> ir.Value:
-        """A variable on the stack."""
+        """Return the address of a new variable on the stack."""
         with self.builder.goto_entry_block():
             room = self.builder.alloca(type_)
         room.type = ir.PointerType()
         return room
 
     def intrinsic(self, name: str, operands: Sequence[ir.Value]) -> ir.Value:
-        """Calls llvm.<name> of operands of one type, which gives a value of that type."""
+        """Call llvm.<name> on operands of one type; the result has that type."""
         flags = FLAGS if is_float(operands[0].type) else ()
         type_ = operands[0].type
         return self.call(f"llvm.{name}.{suffix(type_)}", type_, operands, flags)
 
     def call(self, name: str, type_: ir.Type, operands: Sequence[ir.Value], flags: Sequence[str] = ()) -> ir.Value:
-        """Calls a function of the module, declared at need, that returns a value of a type."""
+        """Call a function of the module that returns a value of a type; declare it if needed."""
         module = self.builder.module
         function_type = ir.FunctionType(type_, [operand.type for operand in operands])
         function = module.globals.get(name) or ir.Function(module, function_type, name)
         return self.builder.call(function, operands, fastmath=flags)
 
     def sum(self, value: ir.Value) -> ir.Value:
-        """The sum over lanes, in an order of LLVM's choice."""
+        """Sum over lanes, in an order of LLVM's choice."""
         if self.width == 1:
             return value
         scalar = value.type.element
@@ -120,15 +127,15 @@ class Vectors:
         return self.call(f"llvm.vector.reduce.fadd.{suffix(value.type)}", scalar, operands, flags)
 
     def smallest(self, value: ir.Value) -> ir.Value:
-        """The smallest of the lanes, which are numbers."""
+        """Return the smallest lane; none may be NaN."""
         return self.fold(value, self.smaller)
 
     def largest(self, value: ir.Value) -> ir.Value:
-        """The largest of the lanes, which are numbers."""
+        """Return the largest lane; none may be NaN."""
         return self.fold(value, self.larger)
 
     def fold(self, value: ir.Value, combine: Callable[[ir.Value, ir.Value], ir.Value], to: int = 1) -> ir.Value:
-        """Combines the halves of a vector until `to` lanes are left; one lane is a scalar."""
+        """Combine the halves of a vector until `to` lanes are left; one lane is a scalar."""
         b, width = self.builder, self.width
         while width > to:
             width //= 2
@@ -137,25 +144,25 @@ class Vectors:
         return b.extract_element(value, INT(0)) if isinstance(value.type, ir.VectorType) and to == 1 else value
 
     def any(self, mask: ir.Value) -> ir.Value:
-        """Whether a lane of a mask is set."""
+        """Return whether a lane of a mask is set."""
         if self.width == 1:
             return mask
         return self.builder.icmp_unsigned("!=", self.bits(mask), ir.IntType(self.width)(0))
 
     def bits(self, mask: ir.Value) -> ir.Value:
-        """A mask as an integer of `width` bits."""
+        """Convert a mask to an integer of `width` bits."""
         return mask if self.width == 1 else self.builder.bitcast(mask, ir.IntType(self.width))
 
     def larger(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """One instruction: the larger float; y where either is not a number, or where both are zeros."""
+        """Return the larger float, in one instruction; y if either is NaN or both are zeros."""
         return self.builder.select(self.builder.fcmp_ordered(">", x, y), x, y)
 
     def smaller(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """One instruction: the smaller float; y where either is not a number, or where both are zeros."""
+        """Return the smaller float, in one instruction; y if either is NaN or both are zeros."""
         return self.builder.select(self.builder.fcmp_ordered("<", x, y), x, y)
 
     def maximum(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """IEEE 754's maximum of floats: not a number where either is not, and +0 is larger than −0."""
+        """Return IEEE 754's maximum of floats: NaN if either is, and +0 is larger than −0."""
         if _orders_by_compare(y, -1.0):
             return self.larger(y, x)
         if _orders_by_compare(x, -1.0):
@@ -163,14 +170,14 @@ class Vectors:
         for zero, other in ((x, y), (y, x)):
             if _orders_by_compare(zero, 1.0):
                 return self.builder.fadd(self.larger(zero, other), zero)
-        # Where both orders agree, either is right; else a NaN, or zeros of both signs, must come out of the two:
-        # the union of their bits with the signs intersected.
+        # Two orders that agree are both right. Otherwise there is a NaN, or zeros of both signs: the union of the bits,
+        # with the signs intersected, is the result.
         b, sign = self.builder, self._sign_bits(x.type)
         one, other = (b.xor(self._as_bits(self.larger(*pair)), sign) for pair in ((x, y), (y, x)))
         return b.bitcast(b.xor(b.or_(one, other), sign), x.type)
 
     def minimum(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """IEEE 754's minimum of floats: not a number where either is not, and −0 is smaller than +0."""
+        """Return IEEE 754's minimum of floats: NaN if either is, and −0 is smaller than +0."""
         if _orders_by_compare(y, 1.0):
             return self.smaller(y, x)
         if _orders_by_compare(x, 1.0):
@@ -187,26 +194,26 @@ class Vectors:
 
 
 def _orders_by_compare(value: ir.Value, sign_of_zero: float) -> bool:
-    """Whether a comparison finds the larger, or smaller, of this constant and anything else: it is no NaN, and no zero
-    but that of a sign."""
+    """Return whether one comparison orders this constant and any number: it is not NaN, and a zero only of the
+    given sign."""
     if not isinstance(value, ir.Constant):
         return False
     number = value.constant[0] if isinstance(value.type, ir.VectorType) else value.constant
     if isinstance(number, ir.Constant):
         number = number.constant
-    return number == number and (number != 0 or np.copysign(1.0, number) == sign_of_zero)
+    return bool(number == number and (number != 0 or np.copysign(1.0, number) == sign_of_zero))
 
 
 class Translator(Vectors):
-    """Tools for the translation of a primitive: operations on vectors, and the code of a further jaxpr."""
+    """Tools that translate a primitive: operations on vectors, and the code of another jaxpr."""
 
     taking_part: ir.Value | None = None
-    """The lanes whose values will be used; None: all. Loops go on for them only."""
+    """Lanes whose values are used, and for which loops continue; None: all."""
 
     def emit(self, closed: core.ClosedJaxpr, arguments: Sequence[ir.Value]) -> list[ir.Value]:
         """Emit a jaxpr of scalars, given one LLVM value per argument."""
         raise NotImplementedError
 
     def run(self, jaxpr: Any, arguments: Sequence[Any]) -> list[Any]:
-        """Emit a jaxpr, closed or without constants; arrays are as in `control_flow`."""
+        """Emit a jaxpr, closed or without constants; arrays are those of `control_flow`."""
         raise NotImplementedError

@@ -1,8 +1,7 @@
-"""Native loops over tiles, splats and pixels, around the functions of `pixel`.
+"""Forward and backward pass over tiles, splats and pixels, around the functions of `pixel`.
 
-One call composites the tiles from `first` up to `last`. Every splat of a tile's list is prepared once (scalar code),
-then applied to the tile's pixels, L at a time (vector code). Where no pixel of the L can be reached, they are passed
-over.
+One call composites the tiles first..last − 1. Every splat of a tile's list is prepared once (scalar code), then applied
+to the tile's pixels, L at a time (vector code). A vector of which the splat reaches no pixel is skipped.
 
     forward(ids, starts, splats, regions, texels, result; first, last, columns, width, height)
     backward(ids, starts, splats, regions, texels, g, suffix_sum, jacobian, d_splats, d_texels, d_probe,
@@ -10,21 +9,23 @@ over.
 
 Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), regions [N, 3], texels [T, C],
 result [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], suffix_sum [tiles, P], jacobian [3, 3];
-d_splats [N, S], d_texels [T, C] and d_probe [N, 4] are added to. A pair whose number in `places` [pairs] is k, not
-−1, adds to row k of more_splats, more_probe and, from texel more_first[k], of more_texels instead: its splat's own
-rows are another thread's.
+the pass adds to d_splats [N, S], d_texels [T, C] and d_probe [N, 4]. `places` [pairs] holds −1, or k if the splat's own
+row belongs to another thread: the pair then adds to row k of more_splats and more_probe, and to more_texels from texel
+more_first[k] on.
 """
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import llvm_modules
 from a2tg_jax.rasterize.kernels.native.lanes import BOOL, INT, Lanes
+from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.texels import NativeTexture, Place, TexelWriter
 from a2tg_jax.rasterize.kernels.native.traced import Functions, KernelSpec
 from a2tg_jax.rasterize.kernels.native.writer import LONG
@@ -36,12 +37,14 @@ BACKWARD = (
     *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
 CUTOFF_SLACK = 1e-3
-"""Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
+"""Margin of the squared distance within which a pixel is composited; `pixel.show` then decides exactly."""
 
 
 def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
-    """The pixels of a tile, counted row by row, as vectors take them: each takes a block of L where such blocks fill
-    the tile, because a compact block sees fewer splats and fewer texels than a row does."""
+    """Return the pixels of a tile, counted row by row, in the order in which vectors take them.
+
+    If blocks of L pixels fill the tile, each vector takes one: a compact block sees fewer splats and texels than a row.
+    """
     height = 1 << (lanes.bit_length() - 1) // 2
     width = lanes // height
     pixels = np.arange(tile_size**2).reshape(tile_size, tile_size)
@@ -52,30 +55,39 @@ def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
 
 
 class _LoadedSplat(NamedTuple):
-    """A splat as the pixels of a tile want it."""
+    """Splat prepared for the pixels of a tile."""
 
     numbers: list[ir.Value]
-    """As they lie in memory, without the cutoff."""
+    """Numbers as in memory, without the cutoff."""
     planes: list[ir.Value]
-    """`rasterize.pixel.Planes`, the same in every lane, as all that follows."""
+    """`rasterize.pixel.Planes`, the same in every lane."""
     spread: list[ir.Value]
     """`numbers` in every lane."""
     texture: NativeTexture | None
+    """Its texture, if the rule has textures."""
     spread_region: list[ir.Value]
+    """`TextureRegion` in every lane."""
     limit: ir.Value
-    """Squared distance within which a pixel is looked at."""
+    """Squared distance within which a pixel is composited, in every lane."""
 
 
 class _Rows(NamedTuple):
-    """The addresses to which the cotangents of a splat are added."""
+    """Addresses to which the cotangents of a splat are added."""
 
     splat: ir.Value
+    """Row of its numbers."""
     probe: ir.Value
+    """Row of the statistic."""
     texture: NativeTexture | None
+    """Cotangents of its texels, if the rule has textures."""
 
 
-class _Compositing(TexelWriter):
-    """What both passes share."""
+Composite = Callable[[ir.Value, ir.Value, ir.Value, Place | None, ir.Value], None]
+"""Function (k, x, y, place, is_live) that composites a splat on vector k; `place` is the position of its lookup."""
+
+
+class _Pass(TexelWriter):
+    """Base of both passes."""
 
     def __init__(self, spec: KernelSpec, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
         super().__init__(module, name, buffers, INTEGERS, spec.dtype)
@@ -86,7 +98,7 @@ class _Compositing(TexelWriter):
         self.integers = self.lanes.vector(INT)
         order = pixel_order(spec.tile_size, spec.lanes)
         y, x = np.stack(np.divmod(order, spec.tile_size)) - (spec.tile_size - 1) / 2
-        # Lanes past the last pixel lie outside of every image.
+        # Lanes past the last pixel lie outside every image.
         past = np.full(-len(order) % spec.lanes, 1e9)
         self.transmittance = self.variable(self.reals, spec.num_vectors)
         self.live = self.variable(self.integers, spec.num_vectors)
@@ -94,15 +106,16 @@ class _Compositing(TexelWriter):
         self.pixel_y = self._constants(f"{name}.y", self.real, [*y, *past])
         self.order = self._constants(f"{name}.order", INT, order)
 
-    def _constants(self, name: str, type_: ir.Type, numbers) -> ir.Value:
+    def _constants(self, name: str, type_: ir.Type, numbers: Sequence[float] | np.ndarray) -> ir.Value:
+        """Add a table of constants to the module; return its address."""
         array = ir.Constant(ir.ArrayType(type_, len(numbers)), np.asarray(numbers).tolist())
         table = ir.GlobalVariable(self.b.module, array.type, name)
         table.initializer, table.global_constant, table.align = array, True, llvm_modules.vector_bytes()
         table.type = ir.PointerType()
         return table
 
-    def all_tiles(self, composite_tile) -> None:
-        """Calls composite_tile(tile, tile_x, tile_y) in a loop, and ends the function."""
+    def all_tiles(self, composite_tile: Callable[[ir.Value, ir.Value, ir.Value], None]) -> None:
+        """Write a loop of composite_tile(tile, tile_x, tile_y) over the tiles, and end the function."""
         spec, b, given = self.spec, self.b, self.arguments
         with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
             columns = self.long(given["columns"])
@@ -114,8 +127,8 @@ class _Compositing(TexelWriter):
             composite_tile(tile, *center)
         b.ret_void()
 
-    def all_splats(self, tile: ir.Value, each_splat) -> None:
-        """Calls each_splat(id, position) for a tile's list, front to back, until it returns that no pixel is live."""
+    def all_splats(self, tile: ir.Value, each_splat: Callable[[ir.Value, ir.Value], ir.Value]) -> None:
+        """Write a loop of each_splat(id, position) over a tile's list, until it returns that no pixel is live."""
         starts, b = self.arguments["starts"], self.b
         first, last = (self.long(self.load(starts, b.add(tile, LONG(k)), INT)) for k in (0, 1))
         with self.loop(first, last) as (position, done):
@@ -124,11 +137,12 @@ class _Compositing(TexelWriter):
             b.cbranch(is_live, going_on, done)
             b.position_at_end(going_on)
 
-    def all_vectors(self):
+    def all_vectors(self) -> contextlib.AbstractContextManager[tuple[ir.Value, ir.Block]]:
+        """Write a loop over the vectors of a tile."""
         return self.loop(LONG(0), LONG(self.spec.num_vectors))
 
     def live_at_first(self, index: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> ir.Value:
-        """Which pixels of a vector lie inside the image, as 0 and 1."""
+        """Return whether the pixels of a vector lie inside the image, as 0 or 1."""
         b, inside = self.b, []
         for table, center, size in ((self.pixel_x, tile_x, "width"), (self.pixel_y, tile_y, "height")):
             at = b.fadd(self.load(table, index, self.reals), self.lanes.broadcast(center))
@@ -137,17 +151,17 @@ class _Compositing(TexelWriter):
         return b.zext(b.and_(*inside), self.integers)
 
     def pixel(self, k: ir.Value, channel: int) -> ir.Value:
-        """Where the pixel that is lane k of a tile lies among a tile's numbers [channels, P]."""
+        """Return the index of a tile's lane k among its numbers [channels, P]."""
         return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.spec.tile_size**2))
 
     def begin_tile(self, tile_x: ir.Value, tile_y: ir.Value) -> None:
-        """Full transmittance everywhere; live are the pixels inside the image."""
+        """Set the transmittance to 1, and the pixels inside the image live."""
         with self.all_vectors() as (k, _):
             self.store(self.lanes.constant(1.0, self.real), self.transmittance, k)
             self.store(self.live_at_first(k, tile_x, tile_y), self.live, k)
 
     def load_splat(self, id_: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> _LoadedSplat:
-        """A splat of the list, prepared for a tile."""
+        """Load a splat of the list and prepare it for a tile."""
         *numbers, cutoff = self.splat_numbers(id_)
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], tile_x, tile_y])
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
@@ -156,9 +170,8 @@ class _Compositing(TexelWriter):
         texture = self.texture(self.arguments["texels"], *map(self.long, region)) if region else None
         return _LoadedSplat(numbers, *spread, texture, self.spread(region), self.lanes.broadcast(limit))
 
-    def reached_vectors(self, splat: _LoadedSplat, composite) -> ir.Value:
-        """Calls composite(k, x, y, place, is_live) for every vector k of the tile's pixels that the splat may reach,
-        and that looks at this place of its texture; returns whether a pixel of the tile is still live."""
+    def reached_vectors(self, splat: _LoadedSplat, composite: Composite) -> ir.Value:
+        """Composite a splat on the vectors of pixels that it may reach; return whether a pixel is still live."""
         b, lanes = self.b, self.lanes
         none = lanes.constant(0, INT)
         any_live = self.variable(self.integers)
@@ -175,24 +188,28 @@ class _Compositing(TexelWriter):
         return lanes.any(b.icmp_signed("!=", b.load(any_live, typ=self.integers), none))
 
     def splat_numbers(self, id_: ir.Value) -> list[ir.Value]:
+        """Load the S numbers of a splat."""
         base = self.at(self.arguments["splats"], self.times(id_, self.spec.num_floats), self.real)
         return [self.load(base, k, self.real) for k in range(self.spec.num_floats)]
 
     def region_numbers(self, id_: ir.Value) -> list[ir.Value]:
+        """Load the region of a splat's texture; empty without textures."""
         base = self.at(self.arguments["regions"], self.times(id_, 3), INT)
         return [self.load(base, k, INT) for k in range(3)] if self.num_columns else []
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
+        """Copy numbers to every lane."""
         return [self.lanes.broadcast(number) for number in numbers]
 
 
-class _Forward(_Compositing):
-    """Channels and transmittance of the tiles."""
+class _Forward(_Pass):
+    """Pass that computes channels and transmittance of the tiles."""
 
     def write(self) -> None:
+        """Write the function."""
         channels = [self.variable(self.reals, self.spec.num_vectors) for _ in range(self.spec.num_channels)]
 
-        def tile(tile, tile_x, tile_y):
+        def composite_tile(tile: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> None:
             self.begin_tile(tile_x, tile_y)
             with self.all_vectors() as (k, _):
                 for channel in channels:
@@ -200,14 +217,16 @@ class _Forward(_Compositing):
             self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, channels))
             self.write_tile(tile, [*channels, self.transmittance])
 
-        self.all_tiles(tile)
+        self.all_tiles(composite_tile)
 
-    def splat(self, tile_x, tile_y, channels, id_, _) -> ir.Value:
-        """Adds one splat to a tile; returns whether a pixel is still live."""
+    def splat(
+        self, tile_x: ir.Value, tile_y: ir.Value, channels: Sequence[ir.Value], id_: ir.Value, _: ir.Value
+    ) -> ir.Value:
+        """Add one splat to a tile; return whether a pixel is still live."""
         splat = self.load_splat(id_, tile_x, tile_y)
 
-        def composite(k, x, y, place, is_live):
-            values = self.sample(splat.texture, place, has_slopes=False) if splat.texture else []
+        def composite(k: ir.Value, x: ir.Value, y: ir.Value, place: Place | None, is_live: ir.Value) -> None:
+            values = self.sample(splat.texture, place, has_slopes=False) if splat.texture and place else []
             state = [
                 self.load(self.transmittance, k, self.reals),
                 is_live,
@@ -223,6 +242,7 @@ class _Forward(_Compositing):
         return self.reached_vectors(splat, composite)
 
     def write_tile(self, tile: ir.Value, arrays: Sequence[ir.Value]) -> None:
+        """Store the numbers of a tile in `result`."""
         num_pixels = self.spec.tile_size**2
         base = self.at(self.arguments["result"], self.times(tile, num_pixels * len(arrays)), self.real)
         for index, array in enumerate(arrays):
@@ -230,24 +250,26 @@ class _Forward(_Compositing):
                 self.store(self.load(array, k, self.real), base, self.pixel(k, index))
 
 
-class _Backward(_Compositing):
-    """Cotangents of the splats and of the texels, and the statistic."""
+class _Backward(_Pass):
+    """Pass that computes cotangents of the splats and of the texels, and the statistic."""
 
     def write(self) -> None:
+        """Write the function."""
         suffix_sum, *g = (self.variable(self.reals, self.spec.num_vectors) for _ in range(1 + self.spec.num_channels))
         self.sums = self.variable(self.reals, self.num_sums)
         for k in range(self.num_sums):
             self.store(self.lanes.constant(0.0, self.real), self.sums, k)
 
-        def tile(tile, tile_x, tile_y):
+        def composite_tile(tile: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> None:
             self.begin_tile(tile_x, tile_y)
             self.read_tile(tile, [suffix_sum], self.arguments["suffix_sum"])
             self.read_tile(tile, g, self.arguments["g"])
             self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, suffix_sum, g))
 
-        self.all_tiles(tile)
+        self.all_tiles(composite_tile)
 
     def read_tile(self, tile: ir.Value, arrays: Sequence[ir.Value], source: ir.Value) -> None:
+        """Load the numbers of a tile from a buffer."""
         num_pixels = self.spec.tile_size**2
         base = self.at(source, self.times(tile, num_pixels * len(arrays)), self.real)
         for index, array in enumerate(arrays):
@@ -256,8 +278,11 @@ class _Backward(_Compositing):
             with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
                 self.store(self.load(base, self.pixel(k, index), self.real), array, k)
 
-    def splat(self, tile_x, tile_y, suffix_sum, g, id_, position) -> ir.Value:
-        """Adds the cotangents of one splat in a tile; returns whether a pixel is still live."""
+    def splat(
+        self, tile_x: ir.Value, tile_y: ir.Value, suffix_sum: ir.Value, g: Sequence[ir.Value], id_: ir.Value,
+        position: ir.Value,
+    ) -> ir.Value:  # fmt: skip
+        """Add the cotangents of one splat in a tile; return whether a pixel is still live."""
         b, lanes, spec = self.b, self.lanes, self.spec
         splat, zero = self.load_splat(id_, tile_x, tile_y), self.lanes.constant(0.0, self.real)
         tile_center = self.spread([tile_x, tile_y])
@@ -268,8 +293,8 @@ class _Backward(_Compositing):
         num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if spec.statistic else 0)
         totals = self.zeros(num_sums)
 
-        def composite(k, x, y, place, is_live):
-            sample = self.sample(splat.texture, place, has_slopes=True) if splat.texture else []
+        def composite(k: ir.Value, x: ir.Value, y: ir.Value, place: Place | None, is_live: ir.Value) -> None:
+            sample = self.sample(splat.texture, place, has_slopes=True) if splat.texture and place else []
             state = [self.load(self.transmittance, k, self.reals), is_live, self.load(suffix_sum, k, self.reals)]
             cotangents = [self.load(channel, k, self.reals) for channel in g]
             at_pixel = [*splat.planes, *splat.spread, *splat.spread_region, *sample, x, y]
@@ -281,13 +306,13 @@ class _Backward(_Compositing):
             d_values, sums = rest[: self.num_columns], rest[self.num_columns :]
             if spec.statistic:
                 sums.append(lanes.constant(1.0, self.real))
-            # Chosen, not multiplied: what a pixel that shows nothing would give may not be finite.
+            # Selected, not multiplied: the cotangents of a pixel that shows nothing may not be finite.
             chosen = functools.partial(b.select, contributes, rhs=zero)
             with b.if_then(lanes.any(contributes)):
                 b.store(BOOL(1), any_contributes)
                 for total, value in zip(totals, sums, strict=True):
                     b.store(b.fadd(b.load(total, typ=self.reals), chosen(value)), total)
-                if rows.texture:
+                if rows.texture and place:
                     self.add_to_texels(rows.texture, place, [chosen(value) for value in d_values])
 
         is_live = self.reached_vectors(splat, composite)
@@ -298,7 +323,7 @@ class _Backward(_Compositing):
         return is_live
 
     def rows_of(self, id_: ir.Value, position: ir.Value, texture: NativeTexture | None) -> _Rows:
-        """Where the cotangents of one pair are added."""
+        """Return the addresses to which the cotangents of one pair are added."""
         b, arguments = self.b, self.arguments
         place = self.long(self.load(arguments["places"], position, INT))
         is_own = b.icmp_signed("<", place, LONG(0))
@@ -314,8 +339,10 @@ class _Backward(_Compositing):
         at_row = functools.partial(self.at, type_=self.real)
         return _Rows(at_row(splats, self.times(row, self.spec.num_floats)), at_row(probe, self.times(row, 4)), texture)
 
-    def add_totals(self, rows, numbers, tile_x, tile_y, totals) -> None:
-        """Sums over lanes, carried from the planes to the homography, added to the splat's rows of the results."""
+    def add_totals(
+        self, rows: _Rows, numbers: Sequence[ir.Value], tile_x: ir.Value, tile_y: ir.Value, totals: Sequence[ir.Value]
+    ) -> None:
+        """Sum over lanes, carry the planes' cotangents to the homography, and add all to the splat's rows."""
         spec, functions = self.spec, self.functions
         sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
         d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
@@ -326,28 +353,29 @@ class _Backward(_Compositing):
             self.add(rows.probe, others[num_others:])
 
     def add(self, base: ir.Value, values: Sequence[ir.Value]) -> None:
+        """Add values to a row."""
         for k, value in enumerate(values):
             self.store(self.b.fadd(self.load(base, k, self.real), value), base, k)
 
 
 @dataclasses.dataclass(frozen=True)
-class Loops:
-    """Compiled loops; each releases the GIL."""
+class Passes:
+    """Compiled forward and backward pass."""
 
-    forward: Any
-    backward: Any
+    forward: CompiledFunction
+    backward: CompiledFunction
 
 
 @functools.cache
-def loops(spec: KernelSpec) -> Loops:
-    """The loops that a spec describes, compiled at the first call."""
+def compiled_passes(spec: KernelSpec) -> Passes:
+    """Return the passes of a spec, compiled at the first call."""
     functions = Functions(spec)
-    module = ir.Module("loops")
+    module = ir.Module("passes")
     forward, backward = (llvm_modules.unique(name) for name in ("forward", "backward"))
     _Forward(spec, functions, module, forward, FORWARD).write()
     _Backward(spec, functions, module, backward, BACKWARD).write()
     addresses = llvm_modules.compile_module(module)
-    return Loops(
+    return Passes(
         forward=llvm_modules.as_function(addresses[forward], len(FORWARD), len(INTEGERS)),
         backward=llvm_modules.as_function(addresses[backward], len(BACKWARD), len(INTEGERS)),
     )
