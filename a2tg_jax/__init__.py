@@ -82,6 +82,8 @@ if TYPE_CHECKING:
     from a2tg_jax.measure.metrics import psnr as psnr
     from a2tg_jax.measure.metrics import ssim as ssim
     from a2tg_jax.model import Model as Model
+    from a2tg_jax.model import Parameters as Parameters
+    from a2tg_jax.model import concatenate as concatenate
     from a2tg_jax.render import RenderOutput as RenderOutput
     from a2tg_jax.render import RenderSettings as RenderSettings
     from a2tg_jax.render import plan_render as plan_render
@@ -125,6 +127,7 @@ if TYPE_CHECKING:
     from a2tg_jax.training.corrections import Exposure as Exposure
     from a2tg_jax.training.corrections import PoseRefinement as PoseRefinement
     from a2tg_jax.training.gradients import ViewGradients as ViewGradients
+    from a2tg_jax.training.gradients import value_and_grad as value_and_grad
     from a2tg_jax.training.gradients import view_gradients as view_gradients
     from a2tg_jax.training.losses import normal_consistency as normal_consistency
     from a2tg_jax.training.losses import photometric_loss as photometric_loss
@@ -166,7 +169,7 @@ _NAMES = {
     "a2tg_jax.measure.alignment": ("align_poses", "color_fit"),
     "a2tg_jax.measure.evaluation": ("evaluate",),
     "a2tg_jax.measure.metrics": ("lpips", "parameter_bytes", "psnr", "ssim"),
-    "a2tg_jax.model": ("Model",),
+    "a2tg_jax.model": ("Model", "Parameters", "concatenate"),
     "a2tg_jax.render": ("RenderOutput", "RenderSettings", "plan_render", "render_appearance", "render_image"),
     "a2tg_jax.renderer": ("Renderer",),
     "a2tg_jax.systems.a2tg": ("A2tg", "TextureConfig"),
@@ -199,7 +202,7 @@ _NAMES = {
         "save_checkpoint",
     ),
     "a2tg_jax.training.corrections": ("Correction", "Exposure", "PoseRefinement"),
-    "a2tg_jax.training.gradients": ("ViewGradients", "view_gradients"),
+    "a2tg_jax.training.gradients": ("ViewGradients", "value_and_grad", "view_gradients"),
     "a2tg_jax.training.losses": ("normal_consistency", "photometric_loss"),
 }
 """Public names by the module that defines them: the imports above, once more."""

@@ -1,7 +1,8 @@
 """A model: Gaussians and their appearance, as one value that is trained, rendered, counted, moved and saved."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +14,25 @@ from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import short_repr
+from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
-from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance
+from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance, with_features
 from a2tg_jax.texture import AtlasLayout, Textures
+
+
+class Parameters(NamedTuple):
+    """The floats of a model, or gradients of them."""
+
+    gaussians: Gaussians
+    """Those of the Gaussians."""
+    params: Any
+    """Those of the appearance."""
+
+    def __repr__(self) -> str:
+        return short_tuple_repr(self)
 
 
 @jax.tree_util.register_dataclass
@@ -53,6 +67,29 @@ class Model:
         return dataclasses.replace(
             self, gaussians=self.gaussians[: self.num], params=params, layout=layout, num_live=None
         )
+
+    def __getitem__(self, rows: Any) -> "Model":
+        """Return the model of some of the Gaussians that exist (host).
+
+        Args:
+          rows: a mask [N] of bool, indices [M], which may repeat, or a slice.
+
+        Raises:
+          ValueError: if it is none of these, or an index is out of range.
+        """
+        model = self.live
+        indices = _indices(rows, model.num)
+        params, layout = model.appearance.take_rows(model.params, model.layout, indices)
+        return dataclasses.replace(model, gaussians=model.gaussians[indices], params=params, layout=layout)
+
+    @property
+    def parameters(self) -> Parameters:
+        """What is differentiated and trained: all floats of the model."""
+        return Parameters(self.gaussians, self.params)
+
+    def with_parameters(self, parameters: Parameters) -> "Model":
+        """Return the same model with other floats, of the same shapes."""
+        return dataclasses.replace(self, gaussians=parameters.gaussians, params=parameters.params)
 
     @property
     def num(self) -> int:
@@ -130,6 +167,7 @@ class Model:
         self,
         camera: Camera,
         *,
+        features: Any = None,
         background: Any = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     ) -> RenderOutput:
@@ -137,12 +175,14 @@ class Model:
 
         Args:
           camera: the view.
-          background: [3] colour; None is the model's own.
+          features: [N, D] numbers to show in place of colours (`render_image`), one row for each allocated Gaussian.
+          background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
           settings: static options; `texture` is not used, for the appearance has options of its own.
         """
-        background = self.background if background is None else background
+        background = self.background if background is None and features is None else background
+        rule = with_features(self.rule, features, self.gaussians)
         return render_appearance(
-            self.gaussians, camera, self.rule, background=background, settings=settings, num_live=self.num_live
+            self.gaussians, camera, rule, background=background, settings=settings, num_live=self.num_live
         )
 
     def transform(self, similarity: Similarity) -> "Model":
@@ -159,4 +199,73 @@ class Model:
         )
 
     def __repr__(self) -> str:
-        return short_repr(self)
+        try:
+            return f"Model({', '.join(text for _, text in self._facts())})"
+        except (TypeError, ValueError, AttributeError, IndexError):  # Leaves are not arrays, or have no values.
+            return short_repr(self)
+
+    def _repr_html_(self) -> str:
+        return html_table("Model", self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """Return what a reader asks about a model, by name (host)."""
+        kind, base = type(self.appearance).__name__, type(self.appearance.base).__name__
+        degree = self.gaussians.sh_degree
+        facts = [
+            ("Gaussians", counted(self.num, "Gaussian")),
+            ("view dependence", f"SH degrees {degree} to 3" if self.appearance.has_degrees else f"SH degree {degree}"),
+            ("appearance", kind if kind == base else f"{kind} around {base}"),
+            ("memory", in_bytes(self.num_bytes)),
+        ]
+        return facts if self.origin is None else [*facts, ("origin", repr(self.origin))]
+
+
+def _indices(rows: Any, num: int) -> np.ndarray:
+    """Return the indices of the rows that a mask, indices or a slice choose of `num`."""
+    chosen = rows if isinstance(rows, slice) else np.asarray(rows)
+    if not isinstance(chosen, slice) and (chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu")):
+        raise ValueError(f"rows must be a mask [{num}], indices or a slice; got {chosen.dtype} {[*chosen.shape]}")
+    try:
+        return np.arange(num)[chosen if isinstance(chosen, slice) or chosen.size else slice(0)]
+    except IndexError as error:
+        raise ValueError(f"rows must choose among {num} Gaussians: {error}") from None
+
+
+def concatenate(models: Sequence[Model]) -> Model:
+    """Return the Gaussians of several models as one model, in their order (host).
+
+    The models lie in one world: move them first (`Model.transform`). Spherical harmonics of lower degrees are filled
+    up with zeros.
+
+    Args:
+      models: at least one, of one appearance.
+
+    Returns:
+      The model of all Gaussians that exist; its origin is that of the first model.
+
+    Raises:
+      ValueError: if there are no models, or they differ in their appearance or dtype.
+    """
+    models = [model.live for model in models]
+    if not models:
+        raise ValueError("models must be one model at least; got none")
+    first = models[0]
+    for name, found in (
+        ("appearance", [m.appearance for m in models]),
+        ("dtype", [m.gaussians.means.dtype for m in models]),
+    ):
+        if any(other != found[0] for other in found):
+            raise ValueError(f"models must have one {name}; got {', '.join(map(str, found))}")
+    highest = max(model.gaussians.sh.shape[1] for model in models)
+    several = [_with_bases(model.gaussians, 0 if first.appearance.has_degrees else highest) for model in models]
+    if len({gaussians.sh_degree for gaussians in several}) > 1:
+        raise ValueError(f"models must have one degree below their bands; got {[g.sh_degree for g in several]}")
+    params, layout = first.appearance.joined([(model.params, model.layout) for model in models])
+    gaussians = jax.tree.map(lambda *x: jnp.concatenate(x), *several)
+    return dataclasses.replace(first, gaussians=gaussians, params=params, layout=layout)
+
+
+def _with_bases(gaussians: Gaussians, num: int) -> Gaussians:
+    """Return Gaussians with at least `num` spherical harmonics, new ones zero."""
+    missing = max(0, num - gaussians.sh.shape[1])
+    return dataclasses.replace(gaussians, sh=jnp.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0))))

@@ -7,16 +7,24 @@ the settings, which `plan_render` fills in.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, PlainRule, TextureOptions, appearance_for
+from a2tg_jax.appearance import (
+    Appearance,
+    AppearanceRule,
+    Features,
+    PlainRule,
+    TextureOptions,
+    appearance_for,
+)
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
+from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
@@ -24,7 +32,12 @@ from a2tg_jax.rasterize.compositor import composite, refusal
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, project_gaussians
+from a2tg_jax.rasterize.splats import (
+    CompositingSettings,
+    Compositor,
+    Wanted,
+    project_gaussians,
+)
 from a2tg_jax.rasterize.tiles import TileGrid, count_pairs, tile_lists
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
@@ -48,9 +61,10 @@ class RenderSettings:
     A `Model` and a rule have their own options; this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
-    compositor: Literal["auto", "cuda", "native", "xla"] = "auto"
+    compositor: Wanted = "auto"
     """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
-    and XLA with a warning if the others do not support the appearance rule."""
+    and XLA with a warning if the others do not support the appearance rule. These are differentiated once, in reverse
+    mode; "autodiff", slower and by XLA, in any mode and to any order."""
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
 
@@ -68,7 +82,7 @@ class RenderOutput(NamedTuple):
     """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background."""
 
     color: Array
-    """[H, W, 3], background included, not clipped."""
+    """[H, W, 3], background included, not clipped; or [H, W, D] features."""
     alpha: Array
     """[H, W] in [0, 1], 1 − the final transmittance."""
     depth: Array
@@ -80,6 +94,14 @@ class RenderOutput(NamedTuple):
     distortion: Array
     """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
 
+    def __repr__(self) -> str:
+        return short_tuple_repr(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the colour as a PNG file for notebooks; None for several views, or under a transformation."""
+        pixels = as_bytes(self.color)
+        return None if pixels is None else png(pixels)
+
 
 def render_image(
     gaussians: Gaussians,
@@ -87,7 +109,8 @@ def render_image(
     textures: Textures | None = None,
     layout: AtlasLayout | None = None,
     *,
-    background: Any = (0, 0, 0),
+    features: Any = None,
+    background: Any = None,
     settings: RenderSettings = RenderSettings(),
 ) -> RenderOutput:
     """Render a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
@@ -96,7 +119,9 @@ def render_image(
       gaussians: N Gaussians.
       camera: the view.
       textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
-      background: [3] colour behind everything.
+      features: [N, D] numbers of each Gaussian to show in place of its colour, D >= 1, of either sign. They are
+        weighted as the colour is and not clipped: `color` is [H, W, D]. Of textures they see alpha only.
+      background: [3] colour, or [D] features, behind everything; None is 0.
       settings: static options. An eager call, also under `jax.grad`, needs no capacity and never overflows.
 
     Returns:
@@ -108,7 +133,7 @@ def render_image(
         has another number of Gaussians, or if an argument has a wrong shape.
     """
     check_gaussians(gaussians)
-    rule = rule_of(gaussians, textures, layout, settings)
+    rule = with_features(rule_of(gaussians, textures, layout, settings), features, gaussians)
     return render_appearance(gaussians, camera, rule, background=background, settings=settings)
 
 
@@ -117,14 +142,15 @@ def render_appearance(
     camera: Camera,
     rule: AppearanceRule,
     *,
-    background: Any = (0, 0, 0),
+    background: Any = None,
     settings: RenderSettings = RenderSettings(),
     num_live: Array | int | None = None,
 ) -> RenderOutput:
     """Render a view as `render_image` does, with an appearance rule; of the first `num_live` rows, if given."""
     check_gaussians(gaussians)
     check_camera(camera)
-    check_background(background)
+    background = (0,) * rule.num_colors if background is None else background
+    check_background(background, rule.num_colors)
     if num_live is not None:
         check_shape("num_live", num_live, ())
     settings = with_capacity(settings, gaussians, camera, rule, num_live)
@@ -133,14 +159,29 @@ def render_appearance(
     return output
 
 
-def check_background(background: Any) -> None:
-    """Raise ValueError unless the background is one colour."""
+def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> AppearanceRule:
+    """Return the rule that shows features [N, D] in place of colours; the same rule if features is None.
+
+    Raises:
+      ValueError: if the features are not floats [N, D] of the Gaussians' dtype, D >= 1.
+    """
+    if features is None:
+        return rule
+    check_floats("features", features, (gaussians.num, "D"))
+    if dtype_of(features) != gaussians.means.dtype or not np.shape(features)[1]:
+        found = f"{dtype_of(features)}{[*np.shape(features)]}"
+        raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
+    return Features(rule, jnp.asarray(features))
+
+
+def check_background(background: Any, num_colors: int = 3) -> None:
+    """Raise ValueError unless the background is one colour, of `num_colors` numbers."""
     if np.ndim(background) == 3:
         raise ValueError(
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
             "render on black and add (1 - output.alpha[..., None]) * image"
         )
-    check_shape("background", background, (3,))
+    check_shape("background", background, (num_colors,))
 
 
 @functools.cache
@@ -165,7 +206,7 @@ def render_traced(
 
     Args:
       gaussians, camera, rule: as for `render_appearance`.
-      background: [3] colour.
+      background: [3] colour, or as many numbers as the rule has colours.
       settings: static options, with a capacity.
       has_geometry: if False, depth, normal and distortion are zeros and cost nothing.
       sh_degree: replaces that of the settings; may be traced.
@@ -175,15 +216,14 @@ def render_traced(
     """
     compositor = choose(settings.compositor, settings.tile_size)
     compositing = _compositing_settings(
-        camera, settings, compositor, has_geometry, None if probe is None else statistic
+        camera, settings, compositor, has_geometry, None if probe is None else statistic, rule.num_colors
     )
     if gaussians.num == 0:
         return _empty_view(compositing, background), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
     if reason := refusal(compositing, rule, splats):
-        instead = instead_of(compositor, settings.compositor, type(rule), reason)
-        settings = dataclasses.replace(settings, compositor=instead)
+        settings = dataclasses.replace(settings, compositor=instead_of(settings.compositor, type(rule), reason))
         return render_traced(
             gaussians, camera, rule, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
@@ -200,7 +240,12 @@ def render_traced(
 
 
 def _compositing_settings(
-    camera: Camera, settings: RenderSettings, compositor: Compositor, has_geometry: bool, statistic: Statistic | None
+    camera: Camera,
+    settings: RenderSettings,
+    compositor: Compositor,
+    has_geometry: bool,
+    statistic: Statistic | None,
+    num_colors: int,
 ) -> CompositingSettings:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     return CompositingSettings(
@@ -209,7 +254,8 @@ def _compositing_settings(
         has_geometry=has_geometry,
         statistic=statistic,
         compositor=compositor,
-        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor == "xla" else 1,
+        tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor in ("xla", "autodiff") else 1,
+        num_colors=num_colors,
     )
 
 
@@ -224,13 +270,15 @@ def _empty_view(compositing: CompositingSettings, background: Array) -> RenderOu
 def _output(
     compositing: CompositingSettings, channels: Array, transmittance: Array, background: Array, overflow: Array
 ) -> RenderOutput:
-    color = jnp.moveaxis(channels[:3], 0, -1) + transmittance[..., None] * background[None, None, :]
+    first = compositing.num_colors
+    color = jnp.moveaxis(channels[:first], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
     if not compositing.has_geometry:
         nothing = jnp.zeros_like(alpha)
-        return RenderOutput(color, alpha, nothing, jnp.zeros_like(color), overflow, nothing)
-    depth, squared = channels[3], channels[4]
-    normal = jnp.moveaxis(channels[5:8], 0, -1)
+        no_normal = jnp.zeros((*alpha.shape, 3), alpha.dtype)
+        return RenderOutput(color, alpha, nothing, no_normal, overflow, nothing)
+    depth, squared = channels[first], channels[first + 1]
+    normal = jnp.moveaxis(channels[first + 2 :], 0, -1)
     return RenderOutput(color, alpha, depth, normal, overflow, distortion=alpha * squared - depth * depth)
 
 

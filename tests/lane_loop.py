@@ -2,12 +2,12 @@
 
 import jax
 import numpy as np
-from a2tg_jax.rasterize.kernels.native.tracing import trace
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import llvm_modules
 from a2tg_jax.rasterize.kernels.native.lanes import BOOL, Lanes, scalar_type
 from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
+from a2tg_jax.rasterize.kernels.tracing import trace
 
 
 class _Loop(Writer):

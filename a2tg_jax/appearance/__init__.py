@@ -18,11 +18,16 @@ from a2tg_jax.appearance.options import TextureOptions as TextureOptions
 from a2tg_jax.appearance.plain import Plain as Plain
 from a2tg_jax.appearance.portable import appearance_for as appearance_for
 from a2tg_jax.appearance.rule import AppearanceRule as AppearanceRule
+from a2tg_jax.appearance.rule import Features as Features
 from a2tg_jax.appearance.rule import GivenColors as GivenColors
 from a2tg_jax.appearance.rule import PlainRule as PlainRule
 from a2tg_jax.appearance.rule import RuleAround as RuleAround
 from a2tg_jax.appearance.rule import StaticRule as StaticRule
 from a2tg_jax.appearance.rule import gaussian_cutoff as gaussian_cutoff
+from a2tg_jax.appearance.rule_check import Arguments as Arguments
+from a2tg_jax.appearance.rule_check import check_shading as check_shading
+from a2tg_jax.appearance.rule_check import elementwise_rule as elementwise_rule
+from a2tg_jax.appearance.rule_check import takes_arrays as takes_arrays
 from a2tg_jax.appearance.textured import TexelRates as TexelRates
 from a2tg_jax.appearance.textured import Textured as Textured
 from a2tg_jax.appearance.textured import TexturedRule as TexturedRule

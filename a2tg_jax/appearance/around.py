@@ -1,6 +1,7 @@
 """Wrappers around an appearance, and the one place where they forward to it."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,15 @@ class AppearanceAround(Appearance):
 
     def first_rows(self, params: Any, layout: Any, num: int) -> tuple[Any, Any]:
         inner, inner_layout = self.inner.first_rows(params.inner, layout.inner, num)
+        return params._replace(inner=inner), layout._replace(inner=inner_layout)
+
+    def take_rows(self, params: Any, layout: Any, rows: np.ndarray) -> tuple[Any, Any]:
+        inner, inner_layout = self.inner.take_rows(params.inner, layout.inner, rows)
+        return params._replace(inner=inner), layout._replace(inner=inner_layout)
+
+    def joined(self, parts: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
+        inner, inner_layout = self.inner.joined([(params.inner, layout.inner) for params, layout in parts])
+        params, layout = parts[0]
         return params._replace(inner=inner), layout._replace(inner=inner_layout)
 
     def check(self, params: Any, layout: Any, gaussians: Gaussians) -> None:

@@ -1,6 +1,7 @@
 """Spherical harmonics with a degree per Gaussian, on top of any other appearance."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +21,8 @@ from a2tg_jax.appearance.sh_bands import (
     clear_bands,
     first_bands,
     gather_bands,
+    join_bands,
+    take_bands,
 )
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
@@ -107,6 +110,18 @@ class Banded(AppearanceAround):
     def first_rows(self, params: BandedParams, layout: BandedLayout, num: int) -> tuple[BandedParams, BandedLayout]:
         bands, owners = first_bands(params.bands, layout.bands, num)
         params, layout = super().first_rows(params, layout, num)
+        return params._replace(bands=bands), layout._replace(bands=owners)
+
+    def take_rows(
+        self, params: BandedParams, layout: BandedLayout, rows: np.ndarray
+    ) -> tuple[BandedParams, BandedLayout]:
+        bands, owners = take_bands(params.bands, layout.bands, rows)
+        params, layout = super().take_rows(params, layout, rows)
+        return params._replace(bands=bands), layout._replace(bands=owners)
+
+    def joined(self, parts: Sequence[tuple[BandedParams, BandedLayout]]) -> tuple[BandedParams, BandedLayout]:
+        bands, owners = join_bands([(params.bands, layout.bands) for params, layout in parts])
+        params, layout = super().joined(parts)
         return params._replace(bands=bands), layout._replace(bands=owners)
 
     def bands(self, params: BandedParams, layout: BandedLayout) -> tuple[Bands, BandLayout]:

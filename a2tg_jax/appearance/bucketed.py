@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +37,13 @@ class Bucketed(Appearance):
 
     def first_rows(self, params: Textures, layout: AtlasLayout, num: int) -> tuple[Textures, AtlasLayout]:
         return packed_textures(params, layout) if num == layout.num else first_textures(params, layout, num)
+
+    def take_rows(self, params: Textures, layout: AtlasLayout, rows: np.ndarray) -> tuple[Textures, AtlasLayout]:
+        arrays = texture_arrays(params, layout)
+        return textures_from_arrays([arrays[row] for row in rows])
+
+    def joined(self, parts: Sequence[tuple[Textures, AtlasLayout]]) -> tuple[Textures, AtlasLayout]:
+        return textures_from_arrays([array for part in parts for array in texture_arrays(*part)])
 
     def textures(self, params: Textures, layout: AtlasLayout) -> tuple[Textures, AtlasLayout]:
         return params, layout

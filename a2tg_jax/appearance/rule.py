@@ -25,8 +25,8 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.jit import classes_of
 from a2tg_jax.core.sh import sh_sum
 
-Residual = tuple[Array, Array, Array] | None
-"""Added to red, green and blue; None stands for 0."""
+Residual = tuple[Array, ...] | None
+"""Added to the D colours; None stands for 0."""
 Factor = Array | None
 """Multiplies alpha; None stands for 1."""
 
@@ -39,6 +39,9 @@ class AppearanceRule:
     has_low_pass: bool = True
     """Static. Whether the low-pass filter of 2DGS shows splats that are smaller than a pixel or seen edge-on.
     Without it, ρ is u² + v² at the hit of the pixel's ray, and a splat without a hit is invisible."""
+
+    num_colors: int = 3
+    """Static number D of colours of a splat: red, green and blue, or as many features."""
 
     empty: tuple[float, ...] = ()
     """Static C values of a splat without a texture, whose region has no texels; () if all splats have one."""
@@ -60,7 +63,10 @@ class AppearanceRule:
         return gaussians.opacities
 
     def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
-        """Return the colours [N, 3] in this view, of spherical harmonics up to `degree`, which may be traced."""
+        """Return the colours [N, D] in this view.
+
+        By default, D = 3 of spherical harmonics up to `degree`, which may be traced.
+        """
         return jnp.maximum(self.own_color_sums(gaussians, camera, degree) + 0.5, 0.0)
 
     def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
@@ -121,6 +127,10 @@ class RuleAround(AppearanceRule):
         return self.inner.has_low_pass
 
     @property
+    def num_colors(self) -> int:  # type: ignore[override]
+        return self.inner.num_colors
+
+    @property
     def empty(self) -> tuple[float, ...]:  # type: ignore[override]
         return self.inner.empty
 
@@ -168,6 +178,30 @@ class GivenColors(RuleAround):
         return self.given
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Features(RuleAround):
+    """D features of each splat in place of its colour, with the weights that another rule gives its splats.
+
+    Features have either sign and are not clipped. Textures of the inner rule change alpha only.
+    """
+
+    features: Array
+    """[N, D] features of the Gaussians, D >= 1."""
+
+    @property
+    def num_colors(self) -> int:  # type: ignore[override]
+        return self.features.shape[1]
+
+    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        return self.features
+
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
+        return None, self.inner.shade(numbers, values, u, v)[1]
+
+
 @dataclasses.dataclass(frozen=True)
 class StaticRule:
     """Rule without its arrays; hashable, so that code can be compiled for it."""
@@ -186,8 +220,14 @@ class StaticRule:
         """Rule as its element-wise functions see it: every use of an array field raises."""
         numbered = jax.tree.unflatten(self.structure, range(self.structure.num_leaves))
         paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
-        name = self.classes[0].__name__
-        return jax.tree.unflatten(self.structure, [_LeftOut(name + jax.tree_util.keystr(path)) for path, _ in paths])
+        return jax.tree.unflatten(
+            self.structure, [_LeftOut(self.name + jax.tree_util.keystr(path)) for path, _ in paths]
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the rule's class."""
+        return self.classes[0].__name__
 
 
 class _LeftOut:
@@ -207,7 +247,9 @@ class _LeftOut:
             raise AttributeError(name)
         self._refuse()
 
-    __jax_array__ = __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
+    # A property: JAX asks whether there is such a method, and its own error would name neither field nor rule.
+    __jax_array__ = property(_refuse)
+    __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
     __add__ = __sub__ = __mul__ = __truediv__ = __pow__ = __neg__ = __abs__ = __matmul__ = _refuse
     __radd__ = __rsub__ = __rmul__ = __rtruediv__ = __rpow__ = __rmatmul__ = _refuse
     __lt__ = __le__ = __gt__ = __ge__ = _refuse

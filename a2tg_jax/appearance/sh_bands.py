@@ -155,6 +155,25 @@ def first_bands(bands: Bands, layout: BandLayout, num: int) -> tuple[Bands, Band
     return _packed(dense, layout.degrees[:num], layout.base_degree)
 
 
+def take_bands(bands: Bands, layout: BandLayout, rows: np.ndarray) -> tuple[Bands, BandLayout]:
+    """Return the coefficients of the Gaussians `rows`, which may repeat, with their degrees (host)."""
+    dense = [table[rows] for table in _dense_tables(bands, layout)]
+    return _packed(dense, layout.degrees[rows], layout.base_degree)
+
+
+def join_bands(parts: Sequence[tuple[Bands, BandLayout]]) -> tuple[Bands, BandLayout]:
+    """Return the coefficients of several sets of Gaussians, one after the other (host).
+
+    Raises:
+      ValueError: if their base degrees differ.
+    """
+    bases = sorted({layout.base_degree for _, layout in parts})
+    if len(bases) > 1:
+        raise ValueError(f"bands must begin above one degree; got {bases}")
+    dense = [np.concatenate(tables) for tables in zip(*(_dense_tables(*part) for part in parts), strict=True)]
+    return _packed(dense, np.concatenate([layout.degrees for _, layout in parts]), bases[0])
+
+
 def band_colors(bands: Bands, layout: BandLayout, means: Array, center: Array, degree: Any) -> Array:
     """Return the sums [N, 3] that the bands add to Σ Y_l·sh_l, before 0.5 is added and negatives are cut off.
 

@@ -1,5 +1,6 @@
 """Appearances in files: named arrays, and whether the portable formats can hold them."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -55,6 +56,21 @@ class StoredArrays:
         Buffers have the sizes that `from_arrays` gives them.
         """
         return jax.tree.map(lambda x: x[:num], params), layout
+
+    def take_rows(self, params: Any, layout: Any, rows: np.ndarray) -> tuple[Any, Any]:
+        """Return the parameters and layout of the given rows, indices of Gaussians that may repeat (host)."""
+        self._check_no_layout(layout)
+        return jax.tree.map(lambda x: x[rows], params), layout
+
+    def joined(self, parts: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
+        """Return the parameters and layout of several, given as (params, layout), one after the other (host)."""
+        for _, layout in parts:
+            self._check_no_layout(layout)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *(params for params, _ in parts)), parts[0][1]
+
+    def _check_no_layout(self, layout: Any) -> None:
+        if jax.tree.leaves(layout):
+            raise NotImplementedError(f"{type(self).__name__} has a layout: it must define take_rows and joined itself")
 
     def check(self, params: Any, layout: Any, gaussians: Gaussians) -> None:
         """Raise ValueError unless parameters and layout fit the Gaussians (host)."""

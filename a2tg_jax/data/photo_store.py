@@ -37,6 +37,9 @@ class Picture:
         """Return a picture of pixels held in memory; a picture is returned unchanged."""
         return pixels if isinstance(pixels, Picture) else Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 
+    def __repr__(self) -> str:
+        return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {'in memory' if self.is_held else 'on disk'})"
+
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""

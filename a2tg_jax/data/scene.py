@@ -1,7 +1,9 @@
 """Scenes: photographs with exact pinhole cameras, and points, in the normalised world."""
 
 import dataclasses
+import html
 import itertools
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.display import THUMBNAIL, counted, html_image, png
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.masks import Mask
@@ -17,6 +20,10 @@ from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
+LONGEST_PREVIEW = 800
+"""Longest side in pixels of the picture of a view in a notebook."""
+NUM_THUMBNAILS = 8
+"""Number of training views in the picture of a scene."""
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
 GENERIC_NAMES = {
@@ -59,6 +66,14 @@ class View:
         """Whether the photograph has an opacity. This does not read it."""
         return self.picture.shape[2] == 4
 
+    def __repr__(self) -> str:
+        height, width = self.picture.size
+        more = (", with alpha" if self.has_alpha else "") + ("" if self.mask is None else ", with a mask")
+        return f"View({self.name!r}, {width}×{height}{more})"
+
+    def _repr_png_(self) -> bytes:
+        return png(self.picture.read(), LONGEST_PREVIEW)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
@@ -77,6 +92,23 @@ class Scene:
     """Similarity from the original world of the input to the normalised world; its inverse brings results back."""
     scale: float
     """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean."""
+
+    def __repr__(self) -> str:
+        views = [counted(len(self.train), "training view"), counted(len(self.test), "test view")]
+        return f"Scene({self.name!r}, {', '.join(views)}, {self._sizes()}, {counted(len(self.points), 'point')})"
+
+    def _repr_html_(self) -> str:
+        """Return the line above thumbnails of a few training views, evenly spaced, for notebooks."""
+        chosen = {len(self.train) * place // NUM_THUMBNAILS for place in range(NUM_THUMBNAILS)} if self.train else set()
+        views = [self.train[index] for index in sorted(chosen)]
+        images = (html_image(png(view.picture.read(), THUMBNAIL), view.name) for view in views)
+        return f"<div>{html.escape(repr(self))}</div><div>{' '.join(images)}</div>"
+
+    def _sizes(self) -> str:
+        """Return the size of the images, or the number of sizes and the largest."""
+        sizes = {view.picture.size for view in (*self.train, *self.test)}
+        height, width = max(sizes, key=math.prod, default=(0, 0))
+        return f"{width}×{height}" if len(sizes) < 2 else f"{len(sizes)} sizes to {width}×{height}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

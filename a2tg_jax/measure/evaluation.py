@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View, view_image
@@ -78,6 +79,13 @@ class Evaluation:
     def lpips(self) -> float | None:
         """Mean over the views; None without weights."""
         return None if self.lpips_network is None else float(np.mean([view.lpips for view in self.per_view]))
+
+    def __repr__(self) -> str:
+        facts = [counted(len(self.per_view), "view")]
+        if self.per_view:
+            facts += [f"PSNR {self.psnr:.2f} dB", f"SSIM {self.ssim:.3f}"]
+            facts += [] if self.lpips is None else [f"LPIPS {self.lpips:.3f} ({self.lpips_network})"]
+        return f"Evaluation({', '.join(facts)}, {self.frames_per_second:.0f} frames/s)"
 
 
 def evaluate(

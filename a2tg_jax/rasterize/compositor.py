@@ -1,7 +1,7 @@
 """Front-to-back compositing of tiles, given any appearance rule, with an exact gradient in constant memory.
 
 `pixel` defines one pixel. A module of `kernels` computes all: `native` on CPUs, `cuda` on NVIDIA GPUs, or `xla`.
-Each has a `forward` and a `backward` with the same arguments and results.
+Each has a `forward` and a `backward` with the same arguments and results. `autodiff` has no gradient of its own.
 
 The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
 """
@@ -16,7 +16,9 @@ from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.rasterize.kernels import autodiff
 from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
+from a2tg_jax.rasterize.reverse_only import once, reverse_only
 from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -37,8 +39,15 @@ def composite(
       probe: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
         `rasterize.pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
     """
-    arrays = splats, rule.texels, rule.regions, cutoff, lists, jacobian, probe
-    channels, transmittance = _composite_tiles(settings, StaticRule.of(rule), *arrays)
+    static = StaticRule.of(rule)
+    if settings.compositor == "autodiff":
+        if settings.statistic:
+            raise ValueError("the statistic of densification needs another compositor than 'autodiff'")
+        channels, transmittance = autodiff.composite_tiles(settings, static, splats, rule.texels, rule.regions, lists)
+    else:
+        splats, texels, probe = reverse_only(settings.compositor, (splats, rule.texels, probe))
+        arrays = splats, texels, rule.regions, cutoff, lists, jacobian, probe
+        channels, transmittance = _composite_tiles(settings, static, *arrays)
     return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
 
 
@@ -54,9 +63,12 @@ def _composite_tiles(
     cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group, P pixels a tile."""
-    shown: tuple[Array, Array] = _kernels(settings.compositor).forward(
-        settings, rule, splats, texels, regions, cutoff, lists
-    )
+    return _forward(settings, rule, splats, texels, regions, cutoff, lists)
+
+
+def _forward(settings: CompositingSettings, rule: StaticRule, *arrays: Any) -> tuple[Array, Array]:
+    forward = functools.partial(_kernels(settings.compositor).forward, settings, rule)
+    shown: tuple[Array, Array] = once(settings.compositor, forward, *arrays)
     return shown
 
 
@@ -64,7 +76,7 @@ def _composite_tiles_fwd(
     settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
 ) -> tuple[tuple[Array, Array], tuple[Any, ...]]:  # fmt: skip
-    shown = _kernels(settings.compositor).forward(settings, rule, splats, texels, regions, cutoff, lists)
+    shown = _forward(settings, rule, splats, texels, regions, cutoff, lists)
     return shown, (splats, texels, regions, cutoff, lists, jacobian, probe, *shown)
 
 
@@ -74,7 +86,8 @@ def _composite_tiles_bwd(
     *arrays, channels, transmittance = residuals
     g, g_transmittance = cotangents
     suffix_sum = jnp.sum(g * channels, axis=2) + g_transmittance * transmittance
-    found = _kernels(settings.compositor).backward(settings, rule, *arrays, g, suffix_sum)
+    backward = functools.partial(_kernels(settings.compositor).backward, settings, rule)
+    found = once(settings.compositor, backward, *arrays, g, suffix_sum)
     d_splats, d_texels, d_probe = cotangent_of((arrays[0], arrays[1], arrays[-1]), found)
     return d_splats, d_texels, None, None, None, None, d_probe
 

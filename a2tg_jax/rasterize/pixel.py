@@ -38,8 +38,8 @@ class Splat(NamedTuple):
     """Rows of the homography from (u, v, 1) to pixels."""
     opacity: Array
     """Peak opacity, before the falloff."""
-    color: Triple
-    """Red, green and blue of the spherical harmonics."""
+    color: tuple[Array, ...]
+    """Own colours: red, green and blue of the spherical harmonics, or D features."""
     normal: Triple | None
     """Normal in the world, facing the camera; None if only colour is composited."""
     numbers: tuple[Array, ...] = ()
@@ -87,7 +87,7 @@ class Shown(NamedTuple):
     alpha: Array
     """Alpha in [0, max_alpha]; 0 if it would be less than 1/255."""
     channels: tuple[Array, ...]
-    """Red, green, blue; and depth, depth², normal x, y, z if the splat has a normal."""
+    """Colours; and depth, depth², normal x, y, z if the splat has a normal."""
 
 
 def _cross(a: Triple, b: Triple) -> Triple:
@@ -213,7 +213,7 @@ class Cotangents(NamedTuple):
 
     planes: Planes
     opacity: Array
-    color: Triple
+    color: tuple[Array, ...]
     normal: Triple | None
     numbers: tuple[Array, ...]
     values: tuple[Array, ...]

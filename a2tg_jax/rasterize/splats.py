@@ -8,17 +8,21 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.appearance import AppearanceRule, Arguments, StaticRule, check_shading
+from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid
 
-Compositor = Literal["cuda", "native", "xla"]
-"""Native loops (CPUs), CUDA kernels (NVIDIA GPUs) or XLA (everywhere)."""
+Compositor = Literal["cuda", "native", "xla", "autodiff"]
+"""CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA without a gradient of its own."""
+Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
+"""A compositor, or the first of native loops, CUDA kernels and XLA that runs here."""
 
 
 class Splats(NamedTuple):
@@ -27,7 +31,7 @@ class Splats(NamedTuple):
     M: Array
     """[N, 3, 3] homographies from (u, v, 1) to pixels."""
     colors: Array
-    """[N, 3] colours of the spherical harmonics."""
+    """[N, D] own colours, or other features."""
     opacities: Array
     """[N] peak opacities."""
     normals: Array
@@ -48,19 +52,27 @@ class CompositingSettings(NamedTuple):
     statistic: Statistic | None
     """Statistic that densification reads from the backward pass, if any."""
     compositor: Compositor
-    """Native loops, CUDA kernels, or XLA."""
+    """Native loops, CUDA kernels, or XLA with or without a gradient of its own."""
     tile_batch: int
-    """Number of tiles that XLA composites at once; 1 with the others."""
+    """Number of tiles that XLA composites at once; 1 with native loops and CUDA kernels."""
+
+    num_colors: int = 3
+    """Number D of colours of a splat."""
 
     @property
     def num_channels(self) -> int:
-        """Number D of channels: colour, and with geometry depth, depth² and normal."""
-        return 8 if self.has_geometry else 3
+        """Number of channels: colours, and with geometry depth, depth² and normal."""
+        return num_channels(self.has_geometry, self.num_colors)
 
     @property
     def num_groups(self) -> int:
         """Number of batches of tiles in the image."""
         return -(-self.grid.num // self.tile_batch)
+
+
+def num_channels(has_geometry: bool, num_colors: int) -> int:
+    """Return the number of composited channels: colours, and with geometry depth, depth² and normal."""
+    return num_colors + 5 if has_geometry else num_colors
 
 
 def project_gaussians(
@@ -79,12 +91,13 @@ def project_gaussians(
       num_live: number of rows that exist; may be traced.
 
     Raises:
-      ValueError: if the rule gives opacities or numbers of another shape, or a `max_alpha` outside (0, 1).
+      ValueError: if the rule gives opacities, numbers or colours of another shape, or a `max_alpha` outside (0, 1),
+        or if its element-wise functions return something else than they must.
     """
     M, normals = homographies(gaussians, camera)
     opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
-    _check_rule(rule, opacities, numbers, gaussians.num)
     colors = rule.own_colors(gaussians, camera, sh_degree)
+    _check_rule(rule, opacities, numbers, colors, gaussians.num)
     # Not >=: a NaN depth counts as drawn, so that it is reported.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
@@ -99,14 +112,25 @@ def project_gaussians(
     return Splats(M, colors, opacities, normals, numbers), cutoff
 
 
-def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, num: int) -> None:
+def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, colors: Array, num: int) -> None:
+    name = type(rule).__name__
     if opacities.shape != (num,) or numbers.shape[:-1] != (num,):
         raise ValueError(
-            f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {type(rule).__name__} "
+            f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {name} "
             f"gave {opacities.shape} and {numbers.shape}"
         )
+    if colors.shape != (num, rule.num_colors):
+        wanted = f"[N, {rule.num_colors}] of N = {num} gaussians, by its num_colors"
+        raise ValueError(f"a rule gives own_colors {wanted}; {name} gave {colors.shape}")
     if not 0 < rule.max_alpha < 1:
-        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {type(rule).__name__} is {rule.max_alpha}")
+        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {name} is {rule.max_alpha}")
+    check_shading(StaticRule.of(rule), shading_arguments(rule.texels, rule.regions, numbers, colors))
+
+
+def shading_arguments(texels: Array, regions: TextureRegion | None, numbers: Array, colors: Array) -> Arguments:
+    """Return what the element-wise functions of a rule are called with, from the arrays of its splats."""
+    num_values = 0 if regions is None else texels.shape[1]
+    return Arguments(numbers.shape[1], num_values, colors.shape[1], np.dtype(colors.dtype).name)
 
 
 def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:

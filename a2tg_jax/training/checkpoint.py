@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.host.machine import Machine, this_machine
@@ -47,6 +48,12 @@ class History:
     def empty() -> "History":
         counts, values = np.zeros(0, np.int64), np.zeros(0)
         return History(counts, counts, values, values, counts, values, values)
+
+    def __repr__(self) -> str:
+        rows = counted(len(self.iteration), "row")
+        if not len(self.iteration):
+            return f"History({rows})"
+        return f"History({rows} to iteration {self.iteration[-1]:,} of stage {self.stage[-1]}, {self.psnr[-1]:.2f} dB)"
 
     @property
     def last_seconds(self) -> float:
@@ -115,6 +122,10 @@ class Checkpoint:
     def model(self) -> Model:
         """The Gaussians that exist, and what they show."""
         return self.state.model.live
+
+    def __repr__(self) -> str:
+        at = f"stage {self.stage + 1}, iteration {self.iteration:,}"
+        return f"Checkpoint({type(self.system).__name__}, {at}, {counted(self.state.model.num, 'Gaussian')})"
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import warnings
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
+from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.model import Model
@@ -32,6 +33,9 @@ class StageResult:
     """Training time, compilation included."""
     num_regrown: int
     """Number of times the tile lists needed more room; each cost a compilation."""
+
+    def __repr__(self) -> str:
+        return f"StageResult({self.name!r}, {_result(self.model, self.seconds)})"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,6 +68,14 @@ class FitResult:
     def num_regrown(self) -> int:
         """Number of times the tile lists needed more room."""
         return sum(stage.num_regrown for stage in self.stages)
+
+    def __repr__(self) -> str:
+        stages = counted(len(self.stages), "stage")
+        return f"FitResult({type(self.system).__name__}, {stages}, {_result(self.model, self.seconds)})"
+
+
+def _result(model: Model, seconds: float) -> str:
+    return f"{counted(model.num, 'Gaussian')}, {in_bytes(model.num_bytes)}, {seconds:.0f} s"
 
 
 def fit(

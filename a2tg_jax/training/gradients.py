@@ -9,10 +9,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_camera
+from a2tg_jax.core.display import short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, Parameters
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.render import RenderOutput, RenderSettings, check_background, render_traced, with_capacity
 from a2tg_jax.training.corrections import Correction, corrected_camera
@@ -36,6 +37,9 @@ class ViewGradients(NamedTuple):
     """Render of the view. If `output.overflow` is set, the capacity was too small and no result is valid."""
     num_pairs: Array
     """Number of pairs, the least capacity (`plan_render`)."""
+
+    def __repr__(self) -> str:
+        return short_tuple_repr(self)
 
 
 def view_gradients(
@@ -86,6 +90,28 @@ def view_gradients(
     return ViewGradients(
         found.value, found.gaussians, found.params, safe_norm(statistics), is_visible, found.told, found.num_pairs
     )
+
+
+def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Parameters]]:
+    """Return a function of a model that gives a loss and its gradient in all floats of the model.
+
+    `jax.value_and_grad` refuses a whole model, which has integers, too. The gradient is a `Parameters` as
+    `model.parameters` is: an optimizer updates these, and `model.with_parameters` puts them back.
+
+    Args:
+      loss: of a model, and of any further arguments, which are not differentiated; a scalar.
+      has_aux: whether the loss returns (scalar, anything) instead.
+    """
+
+    def of_parameters(parameters: Parameters, model: Model, *args: Any, **kwargs: Any) -> Any:
+        return loss(model.with_parameters(parameters), *args, **kwargs)
+
+    differentiate = jax.value_and_grad(of_parameters, has_aux=has_aux)
+
+    def of_model(model: Model, *args: Any, **kwargs: Any) -> tuple[Any, Parameters]:
+        return differentiate(model.parameters, model, *args, **kwargs)
+
+    return of_model
 
 
 class View(NamedTuple):

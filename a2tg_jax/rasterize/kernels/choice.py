@@ -5,7 +5,6 @@ import importlib.util
 import os
 import warnings
 from collections.abc import Callable
-from typing import Literal
 
 import jax
 
@@ -13,7 +12,7 @@ import jax
 # the first trace, JAX would trace and compile all of it a second time.
 import jax.extend.core
 
-from a2tg_jax.rasterize.splats import Compositor
+from a2tg_jax.rasterize.splats import Compositor, Wanted
 
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 MAX_TILE_SIZE = 64
@@ -21,7 +20,6 @@ MAX_TILE_SIZE = 64
 IS_COMPILED_AHEAD = False
 """Set to compile for a GPU on a machine without one."""
 
-Wanted = Literal["auto", "cuda", "native", "xla"]
 REMEDIES = {
     "cuda": "JAX on an NVIDIA GPU and NVRTC: pip install 'a2tg-jax[cuda13]'",
     "native": "JAX on the CPU and llvmlite: pip install llvmlite",
@@ -34,12 +32,12 @@ def choose(wanted: Wanted, tile_size: int) -> Compositor:
     Raises:
       ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
     """
-    if wanted not in ("auto", "cuda", "native", "xla"):
-        raise ValueError(f"compositor must be 'auto', 'cuda', 'native' or 'xla'; got {wanted!r}")
+    if wanted not in ("auto", "cuda", "native", "xla", "autodiff"):
+        raise ValueError(f"compositor must be 'auto', 'cuda', 'native', 'xla' or 'autodiff'; got {wanted!r}")
     if not 1 <= tile_size <= MAX_TILE_SIZE:
         raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
-    is_available: dict[str, Callable[[], bool]] = {"cuda": has_cuda, "native": has_native, "xla": lambda: True}
-    if wanted != "auto" and not is_available[wanted]():
+    is_available: dict[str, Callable[[], bool]] = {"cuda": has_cuda, "native": has_native}
+    if wanted in is_available and not is_available[wanted]():
         raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or say 'auto'")
     if wanted != "auto":
         return wanted
@@ -61,14 +59,14 @@ def wants_determinism() -> bool:
     return any(asked.values())
 
 
-def instead_of(compositor: Compositor, wanted: Wanted, rule: type, reason: str) -> Compositor:
+def instead_of(wanted: Wanted, rule: type, reason: str) -> Compositor:
     """Return the compositor for a rule that kernels cannot run: XLA, with one warning per rule.
 
     Raises:
-      ValueError: if the kernels are required.
+      ValueError: if a compositor is required by name.
     """
     if wanted != "auto":
-        raise ValueError(f"compositor={compositor!r} cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
+        raise ValueError(f"compositor={wanted!r} cannot run {rule.__name__}: {reason}. Say 'xla', or 'auto'")
     _warn_of_fallback(rule, reason)
     return "xla"
 

@@ -34,6 +34,16 @@ REDUCTIONS = {
 class Untranslatable(ValueError):
     """Error of a function that cannot become a kernel; the message names the obstacle."""
 
+    primitive: str | None = None
+    """Name of the primitive that has no translation, if it is one."""
+
+    @staticmethod
+    def of(primitive: str, target: str) -> "Untranslatable":
+        """Return the error of a primitive without a translation to a kind of kernels."""
+        error = Untranslatable(f"{target} have no translation for the primitive '{primitive}'")
+        error.primitive = primitive
+        return error
+
 
 class Evaluator(abc.ABC):
     """Base class of what makes code of jaxprs; a subclass knows numbers, element-wise primitives and loops."""
@@ -114,7 +124,7 @@ class Evaluator(abc.ABC):
         """Emit an element-wise primitive on scalars."""
         emit = self.primitive(name)
         if emit is None:
-            raise Untranslatable(f"{self.target} have no translation for the primitive '{name}'")
+            raise Untranslatable.of(name, self.target)
         return emit(operands, equation)
 
     def _reduction(self, name: str, array: np.ndarray[Any, Any], equation: Equation) -> Any:

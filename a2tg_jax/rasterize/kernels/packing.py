@@ -18,9 +18,9 @@ def pack_inputs(
     return lists.ids, lists.starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size
 
 
-def num_numbers(has_geometry: bool) -> int:
-    """Return the numbers per splat: the 9 entries of M, opacity, colour, and with geometry the normal."""
-    return 16 if has_geometry else 13
+def num_numbers(has_geometry: bool, num_colors: int) -> int:
+    """Return the numbers per splat: the 9 entries of M, opacity, colours, and with geometry the normal."""
+    return 10 + num_colors + (3 if has_geometry else 0)
 
 
 def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
@@ -32,12 +32,13 @@ def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
 
 def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
     """Unpack cotangents [N, S] as those of splats."""
-    first = num_numbers(has_geometry)
+    num_colors = like.colors.shape[1]
+    normal, first = 10 + num_colors, num_numbers(has_geometry, num_colors)
     return Splats(
         M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
         opacities=packed[:, 9].astype(like.opacities.dtype),
-        colors=packed[:, 10:13].astype(like.colors.dtype),
-        normals=packed[:, 13:16].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
+        colors=packed[:, 10:normal].astype(like.colors.dtype),
+        normals=packed[:, normal:first].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
         numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
     )
 

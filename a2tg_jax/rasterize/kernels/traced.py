@@ -1,6 +1,7 @@
 """Specification of kernels (`KernelSpec`), and the scalar functions that they apply, as jaxprs."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import StaticRule
+from a2tg_jax.appearance import Arguments, StaticRule
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.kernels.tracing import example, trace
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats, num_channels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,15 +37,22 @@ class KernelSpec:
     """Whether depth, squared depth and normals are composited beside the colour."""
     statistic: pixel.Statistic | None
     """Statistic that the backward pass computes for densification, if any."""
+    num_colors: int = 3
+    """Number D of colours of a splat."""
+
+    @property
+    def arguments(self) -> Arguments:
+        """Arguments of the element-wise functions of the rule."""
+        return Arguments(self.num_rule_numbers, self.num_columns, self.num_colors, self.dtype)
 
     @property
     def num_channels(self) -> int:
-        return 8 if self.has_geometry else 3
+        return num_channels(self.has_geometry, self.num_colors)
 
     @property
     def num_floats(self) -> int:
         """Number S of floats per splat: its numbers, and the squared distance beyond which it is invisible."""
-        return num_numbers(self.has_geometry) + self.num_rule_numbers + 1
+        return num_numbers(self.has_geometry, self.num_colors) + self.num_rule_numbers + 1
 
     @staticmethod
     def of(
@@ -60,6 +68,7 @@ class KernelSpec:
             near_plane=settings.near_plane,
             has_geometry=settings.has_geometry,
             statistic=settings.statistic,
+            num_colors=settings.num_colors,
         )
 
 
@@ -74,7 +83,7 @@ class Functions:
         number, integer, flag = example(spec.dtype), example(jnp.int32), example(jnp.bool_)
         triple = (number,) * 3
         normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
-        splat = pixel.Splat((triple,) * 3, number, triple, normal, numbers)
+        splat = pixel.Splat((triple,) * 3, number, (number,) * spec.num_colors, normal, numbers)
         values = (number,) * spec.num_columns
         region = TextureRegion(integer, integer, integer) if values else None
         lookup = Lookup(region, Sample(values, values, values)) if region else None
@@ -120,6 +129,35 @@ class Functions:
                 spec.statistic, splat.M, x, y, *center, d.rho, jacobian, spec.near_plane, rule.has_low_pass
             )
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
+
+
+def place_of(primitive: str, spec: KernelSpec) -> str:
+    """Return in which function of a rule a primitive occurs, as in " in MyRule.shade"; "" if in none."""
+    rule = spec.rule.rule
+    for name, given in spec.arguments.of(()).items():
+        function = getattr(rule, name)
+        if primitive in _primitives(trace(function, *given)[0]):
+            return f" in {spec.rule.name}.{name}"
+        if name != "texel_position" and primitive in _primitives(trace(_gradient_of(function), *given)[0]):
+            return f" in the gradient of {spec.rule.name}.{name}"
+    return ""
+
+
+def _gradient_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    def gradient(*given: Any) -> Any:
+        results, pull_back = jax.vjp(function, *given)
+        return pull_back(results)
+
+    return gradient
+
+
+def _primitives(jaxpr: Any) -> set[str]:
+    """Return the names of the primitives of a jaxpr and of the jaxprs within it."""
+    found: set[str] = set()
+    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        inner = [leaf for leaf in jax.tree.leaves(tuple(equation.params.values())) if hasattr(leaf, "eqns")]
+        found |= {equation.primitive.name}.union(*map(_primitives, inner))
+    return found
 
 
 def _planes_vjp(M: pixel.Rows, x: Array, y: Array, d_planes: pixel.Planes) -> pixel.Rows:

@@ -14,12 +14,12 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.appearance import AppearanceRule, StaticRule
+from a2tg_jax.appearance import AppearanceRule, StaticRule, elementwise_rule
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Lookup, TextureRegion
 from a2tg_jax.core.numerics import pixel_sum, spread
 from a2tg_jax.rasterize import pixel
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats, shading_arguments
 from a2tg_jax.rasterize.tiles import TileLists
 
 BLOCK = 8
@@ -37,7 +37,7 @@ BlockCotangents = tuple[Splats, Array | None, TexelAddends | None]
 """Cotangents of a block's splats, of the probe [B, 4], and of the texels."""
 
 
-class _Tile(NamedTuple):
+class Tiles(NamedTuple):
     """One tile, or G of them."""
 
     x: Array
@@ -67,21 +67,22 @@ def forward(
       cutoff: [N] squared distance beyond which each splat is invisible; not used here.
       lists: splats of each tile.
     """
-    rule, ids, dtype = static.rule, _padded_ids(lists), splats.M.dtype
+    rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
+    ids, dtype = padded_ids(lists), splats.M.dtype
 
     def group(index: Array) -> tuple[Array, Array]:
-        tiles, start = _tiles_of_group(settings, lists, index, dtype)
-        add_block = _over_tiles(functools.partial(_block, settings, rule, texels), settings.tile_batch)
+        tiles, start = tiles_of_group(settings, lists, index, dtype)
+        add_block = over_tiles(functools.partial(_block, settings, rule, texels), settings.tile_batch)
 
         def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             at, transmittance, is_live, channels = carry
-            rows = _gather(splats, regions, _block_ids(ids, at))
+            rows = gather_rows(splats, regions, block_ids(ids, at))
             added, transmittance, is_live = add_block(rows, at, tiles, transmittance, is_live)
             return at + BLOCK, transmittance, is_live, channels + added
 
         shape = settings.tile_batch, settings.num_channels, settings.grid.tile_size**2
-        carry = (start, *_initial_state(settings, tiles), jnp.zeros(shape, dtype))
-        _, transmittance, _, channels = jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)
+        carry = (start, *initial_state(settings, tiles), jnp.zeros(shape, dtype))
+        _, transmittance, _, channels = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)
         return channels, transmittance
 
     shown: tuple[Array, Array] = jax.lax.map(group, jnp.arange(settings.num_groups, dtype=jnp.int32))
@@ -103,21 +104,22 @@ def backward(
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
     totals = packed, jnp.zeros_like(texels), jnp.zeros_like(probe)
-    rule, ids = static.rule, _padded_ids(lists)
+    rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
+    ids = padded_ids(lists)
 
     def group(index: Array, totals: Totals) -> Totals:
-        tiles, start = _tiles_of_group(settings, lists, index, splats.M.dtype)
-        pull_back = _over_tiles(functools.partial(_block_vjp, settings, rule, texels, jacobian), settings.tile_batch)
+        tiles, start = tiles_of_group(settings, lists, index, splats.M.dtype)
+        pull_back = over_tiles(functools.partial(_block_vjp, settings, rule, texels, jacobian), settings.tile_batch)
 
         def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
             at, *state, totals = carry
-            block_ids = _block_ids(ids, at)
-            rows = _gather(splats, regions, block_ids)
+            in_block = block_ids(ids, at)
+            rows = gather_rows(splats, regions, in_block)
             *state, d_rows = pull_back(rows, at, tiles, *state, g[index])
-            return (at + BLOCK, *state, _accumulate(totals, block_ids, d_rows))
+            return (at + BLOCK, *state, _accumulate(totals, in_block, d_rows))
 
-        carry = (start, *_initial_state(settings, tiles), suffix_sum[index], totals)
-        totals = jax.lax.while_loop(functools.partial(_is_unfinished, tiles.end), step, carry)[-1]
+        carry = (start, *initial_state(settings, tiles), suffix_sum[index], totals)
+        totals = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)[-1]
         return totals
 
     packed, d_texels, d_probe = jax.lax.fori_loop(jnp.int32(0), jnp.int32(settings.num_groups), group, totals)
@@ -126,20 +128,20 @@ def backward(
     return d_splats, d_texels, d_probe
 
 
-def _initial_state(settings: CompositingSettings, tiles: _Tile) -> tuple[Array, Array]:
+def initial_state(settings: CompositingSettings, tiles: Tiles) -> tuple[Array, Array]:
     """Return transmittance 1 [G, P], and the live pixels [G, P]; those outside the image never are."""
-    x, y = _pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
+    x, y = pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
     is_inside = (tiles.x[:, None] + x < settings.grid.width) & (tiles.y[:, None] + y < settings.grid.height)
     return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
 
 
-def _is_unfinished(ends: Array, carry: tuple[Any, ...]) -> Array:
+def is_unfinished(ends: Array, carry: tuple[Any, ...]) -> Array:
     """Return whether a tile of a group has splats left, and live pixels."""
     at, _, is_live = carry[:3]
     return jnp.any((at < ends) & jnp.any(is_live, axis=1))
 
 
-def _over_tiles(function: Callable[..., Any], num: int) -> Callable[..., Any]:
+def over_tiles(function: Callable[..., Any], num: int) -> Callable[..., Any]:
     """Map a function of one tile over a leading axis of `num` tiles; a single one needs no vmap."""
     if num > 1:
         return jax.vmap(function)
@@ -147,14 +149,14 @@ def _over_tiles(function: Callable[..., Any], num: int) -> Callable[..., Any]:
     return lambda *args: jax.tree.map(put, function(*jax.tree.map(take, args)))
 
 
-def _padded_ids(lists: TileLists) -> Array:
+def padded_ids(lists: TileLists) -> Array:
     """Return the lists' splats and one block of padding, so that every block can be read whole."""
     return jnp.concatenate([lists.ids, jnp.zeros(BLOCK, lists.ids.dtype)])
 
 
-def _tiles_of_group(
+def tiles_of_group(
     settings: CompositingSettings, lists: TileLists, index: Array, dtype: DTypeLike
-) -> tuple[_Tile, Array]:
+) -> tuple[Tiles, Array]:
     """Return the tiles of a group, and the starts of their lists [G]; tiles past the last one have empty lists."""
     tile = index * settings.tile_batch + jnp.arange(settings.tile_batch, dtype=jnp.int32)
     size = settings.grid.tile_size
@@ -163,17 +165,17 @@ def _tiles_of_group(
     is_real = tile < settings.grid.num
     tile = jnp.minimum(tile, settings.grid.num - 1)
     start = lists.starts[tile]
-    return _Tile(x, y, jnp.where(is_real, lists.starts[tile + 1], start)), start
+    return Tiles(x, y, jnp.where(is_real, lists.starts[tile + 1], start)), start
 
 
-def _block_ids(ids: Array, at: Array) -> Array:
+def block_ids(ids: Array, at: Array) -> Array:
     """Return the splats [G, B] of the blocks that start at `at` [G]."""
     if at.shape[0] == 1:
         return jax.lax.dynamic_slice(ids, (at[0],), (BLOCK,))[None]
     return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK, dtype=jnp.int32)[None, :], ids.shape[0] - 1)]
 
 
-def _gather(splats: Splats, regions: TextureRegion | None, ids: Array) -> Block:
+def gather_rows(splats: Splats, regions: TextureRegion | None, ids: Array) -> Block:
     """Return the splats [G, B, ...] of some ids [G, B], and their texture regions."""
     flat = ids.reshape(-1)
     rows = jax.tree.map(lambda x: x[flat], (splats, regions))
@@ -194,13 +196,13 @@ def _accumulate(totals: Totals, ids: Array, d_rows: BlockCotangents) -> Totals:
     return splats, texels, probe if d_probe is None else probe.at[flat].add(d_probe.reshape(flat.shape[0], -1))
 
 
-def _pixels_of_tile(size: int, dtype: DTypeLike) -> tuple[Array, Array]:
+def pixels_of_tile(size: int, dtype: DTypeLike) -> tuple[Array, Array]:
     """Return x and y of a tile's pixel centres, relative to its centre, each [1, P]."""
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return jnp.asarray(x.reshape(1, -1), dtype), jnp.asarray(y.reshape(1, -1), dtype)
 
 
-def _split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
+def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
     """Split splats [B, ...] into numbers for `pixel`, each [B], or spread over [B, num] pixels."""
 
     def put(x: Array) -> Array:
@@ -215,15 +217,15 @@ def _split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.
     return pixel.Splat(M, put(splats.opacities), several(splats.colors), normal, numbers)
 
 
-def _hits(settings: CompositingSettings, rule: AppearanceRule, splats: Splats, tile: _Tile) -> pixel.Hit:
+def _hits(settings: CompositingSettings, rule: AppearanceRule, splats: Splats, tile: Tiles) -> pixel.Hit:
     """Return the hits of a tile's pixels with the splats of a block, [B, P] each."""
-    x, y = _pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
-    planes = pixel.planes_of(_split(splats, False).M, tile.x, tile.y)
+    x, y = pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
+    planes = pixel.planes_of(split(splats, False).M, tile.x, tile.y)
     planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
     return pixel.intersect(planes, x, y, settings.near_plane, rule.has_low_pass)
 
 
-def _look_up(rule: AppearanceRule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
+def look_up(rule: AppearanceRule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
     """Look up the textures of B splats at P pixels, [B, P] each; None if the rule has no textures."""
     if regions is None:
         return None
@@ -236,16 +238,16 @@ def _look_up(rule: AppearanceRule, texels: Array, regions: TextureRegion | None,
 
 def _show(
     settings: CompositingSettings, rule: AppearanceRule, splats: Splats, hit: pixel.Hit, values: tuple[Array, ...],
-    at: Array, tile: _Tile, rho_probe: Array | None = None,
+    at: Array, tile: Tiles, rho_probe: Array | None = None,
 ) -> pixel.Shown:  # fmt: skip
     """Return what a block shows at a tile's pixels, [B, P] each; entries past the end of the list show nothing."""
-    shown = pixel.show(rule, _split(splats, settings.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe)
+    shown = pixel.show(rule, split(splats, settings.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
 
 def _block(
-    settings: CompositingSettings, rule: AppearanceRule, texels: Array, rows: Block, at: Array, tile: _Tile,
+    settings: CompositingSettings, rule: AppearanceRule, texels: Array, rows: Block, at: Array, tile: Tiles,
     transmittance: Array, is_live: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Composite one block of B splats over one tile.
@@ -265,17 +267,17 @@ def _block(
     """
     splats, regions = rows
     hit = _hits(settings, rule, splats, tile)
-    shown = _show(settings, rule, splats, hit, _values(_look_up(rule, texels, regions, hit)), at, tile)
+    shown = _show(settings, rule, splats, hit, values_of(look_up(rule, texels, regions, hit)), at, tile)
 
     def add_splat(carry: tuple[Array, Array], alpha: Array) -> tuple[tuple[Array, Array], Array]:
         weight, transmittance, is_live = pixel.absorb(alpha, *carry)
         return (transmittance, is_live), weight
 
     (transmittance, is_live), weights = jax.lax.scan(add_splat, (transmittance, is_live), shown.alpha)
-    return jnp.stack([_sum_rows(channel * weights) for channel in shown.channels]), transmittance, is_live
+    return jnp.stack([sum_rows(channel * weights) for channel in shown.channels]), transmittance, is_live
 
 
-def _sum_rows(x: Array) -> Array:
+def sum_rows(x: Array) -> Array:
     """Sum the first axis, a power of two long, by halves: a reduction would not be vectorised over pixels."""
     while x.shape[0] > 1:
         half = x.shape[0] // 2
@@ -285,21 +287,21 @@ def _sum_rows(x: Array) -> Array:
 
 def _block_vjp(
     settings: CompositingSettings, rule: AppearanceRule, texels: Array, jacobian: Array, rows: Block, at: Array,
-    tile: _Tile, transmittance: Array, is_live: Array, suffix_sum: Array, g: Array,
+    tile: Tiles, transmittance: Array, is_live: Array, suffix_sum: Array, g: Array,
 ) -> tuple[Array, Array, Array, BlockCotangents]:  # fmt: skip
     """Differentiate `_block`: return the state after the block, and the cotangents of its rows.
 
     `suffix_sum` [P] is g·(channels added by this block and all behind it) + g_T·T_final; g is [D, P].
     """
     splats, regions = rows
-    lookup = _look_up(rule, texels, regions, _hits(settings, rule, splats, tile))
+    lookup = look_up(rule, texels, regions, _hits(settings, rule, splats, tile))
 
     def of_floats(splats: Splats, values: tuple[Array, ...], rho_probe: Array | None) -> pixel.Shown:
         hit = _hits(settings, rule, splats, tile)
         return _show(settings, rule, splats, hit, pixel.values_at(rule, lookup, hit, values), at, tile, rho_probe)
 
     rho_probe = jnp.zeros((BLOCK, transmittance.shape[0]), transmittance.dtype) if settings.statistic else None
-    shown, pull_back = jax.vjp(of_floats, splats, _values(lookup), rho_probe)
+    shown, pull_back = jax.vjp(of_floats, splats, values_of(lookup), rho_probe)
     g = g[:, None]
     seen: Any = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 
@@ -314,7 +316,7 @@ def _block_vjp(
     return *carry, (d_splats, d_probe, _texel_cotangents(lookup, d_values))
 
 
-def _values(lookup: Lookup | None) -> tuple[Array, ...]:
+def values_of(lookup: Lookup | None) -> tuple[Array, ...]:
     return () if lookup is None else lookup.sample.values
 
 
@@ -327,13 +329,13 @@ def _texel_cotangents(lookup: Lookup | None, d_values: tuple[Array, ...]) -> Tex
 
 
 def _statistic(
-    settings: CompositingSettings, rule: AppearanceRule, jacobian: Array, splats: Splats, tile: _Tile, d_rho: Array,
+    settings: CompositingSettings, rule: AppearanceRule, jacobian: Array, splats: Splats, tile: Tiles, d_rho: Array,
     weights: Array,
 ) -> Array:  # fmt: skip
     """Return Σ_pixels of the statistic, and the number of pixels composited, [B, 4]."""
     assert settings.statistic is not None
-    x, y = _pixels_of_tile(settings.grid.tile_size, d_rho.dtype)
-    M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
+    x, y = pixels_of_tile(settings.grid.tile_size, d_rho.dtype)
+    M = jax.tree.map(lambda entry: entry[:, None], split(splats, False).M)
     components = pixel.positional_gradient(
         settings.statistic, M, x, y, tile.x, tile.y, d_rho, jacobian, settings.near_plane, rule.has_low_pass
     )

@@ -17,7 +17,7 @@ from a2tg_jax.rasterize.kernels.cuda.source import source
 from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 from a2tg_jax.rasterize.kernels.manual_axes import vary_with
 from a2tg_jax.rasterize.kernels.packing import pack_inputs, unpack_splats
-from a2tg_jax.rasterize.kernels.traced import KernelSpec
+from a2tg_jax.rasterize.kernels.traced import KernelSpec, place_of
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
 from a2tg_jax.rasterize.tiles import TileLists
 
@@ -32,7 +32,7 @@ def _refusal(spec: KernelSpec) -> str | None:
     try:
         source(spec, "cuda")
     except Untranslatable as error:
-        return str(error)
+        return str(error) + (place_of(error.primitive, spec) if error.primitive else "")
     return None
 
 

@@ -19,7 +19,7 @@ from a2tg_jax.core.geometry import Outline
 from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 from a2tg_jax.rasterize.kernels.native import ffi, sums, threads
 from a2tg_jax.rasterize.kernels.packing import pack_inputs, unpack_splats
-from a2tg_jax.rasterize.kernels.traced import KernelSpec
+from a2tg_jax.rasterize.kernels.traced import KernelSpec, place_of
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -43,7 +43,7 @@ def _refusal(spec: KernelSpec) -> str | None:
     try:
         compiled_passes(spec)
     except Untranslatable as error:
-        return str(error)
+        return str(error) + (place_of(error.primitive, spec) if error.primitive else "")
     return None
 
 

@@ -1,0 +1,142 @@
+"""Images of features: any number of channels, of either sign, with the weights of the picture and exact gradients."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene
+
+from a2tg_jax import Model, RenderSettings, render_appearance, render_image
+from a2tg_jax.appearance import PlainRule
+
+SCENE = draw_scene(4, num=8, width=11, height=9)
+SMOOTH = draw_smooth_scene(53, width=8, height=8)
+
+
+def some_features(num: int, channels: int) -> np.ndarray:
+    return np.random.default_rng(channels).normal(size=(num, channels))
+
+
+def weighted(scene, features, background):
+    """Σ weights·features + transmittance·background, of the oracle's weights: [H, W, D]."""
+    image = oracle.render(scene)
+    return np.einsum("nhw,nd->hwd", image.weights, features) + (1 - image.alpha)[..., None] * background
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(
+    ("channels", "compositor"),
+    [(1, "native"), (3, "native"), (8, "native"), (64, "native"), (64, "xla"), (8, "autodiff")],
+)
+def test_features_are_weighted_as_colours_are(channels, compositor):
+    """On a scene with textures, whose alpha counts; the gradients in features and background are the weights."""
+    scene = SMOOTH
+    features, background = some_features(6, channels), np.linspace(-1, 1, channels)
+    cotangent = np.random.default_rng(1).normal(size=(8, 8, channels))
+    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    textures, settings = as_textures(scene, "float64"), RenderSettings(capacity=1024, compositor=compositor)
+
+    def loss(features, background):
+        shown = {"features": features, "background": background, "settings": settings}
+        output = render_image(gaussians, camera, *textures, **shown)
+        return jnp.sum(jnp.asarray(cotangent) * output.color), output
+
+    differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
+    (_, output), (d_features, d_background) = differentiate(jnp.asarray(features), jnp.asarray(background))
+    expected = oracle.render(scene)
+    assert output.color.shape == (8, 8, channels) and output.color.min() < 0
+    np.testing.assert_allclose(output.color, weighted(scene, features, background), atol=1e-10)
+    np.testing.assert_allclose(output.normal, expected.normal, atol=1e-10)
+    np.testing.assert_allclose(d_features, np.einsum("nhw,hwd->nd", expected.weights, cotangent), atol=1e-9)
+    left = np.einsum("hw,hwd->d", 1 - expected.alpha, cotangent)
+    np.testing.assert_allclose(d_background, left, atol=1e-9)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(("channels", "compositor"), [(3, "native"), (8, "native"), (64, "native")])
+def test_gradients_in_geometry_are_those_of_differences(channels, compositor):
+    """Along one direction of all the Gaussians' numbers."""
+    features, camera = jnp.asarray(some_features(6, channels)), as_camera(SMOOTH, "float64")
+    settings = RenderSettings(capacity=1024, compositor=compositor)
+
+    @jax.jit
+    @jax.value_and_grad
+    def differentiate(gaussians):
+        return jnp.sum(render_image(gaussians, camera, features=features, settings=settings).color ** 2)
+
+    gaussians, step = as_gaussians(SMOOTH, "float64"), 3e-6
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), gaussians)
+    ahead, behind = (
+        differentiate(jax.tree.map(lambda x, d, by=by: x + by * d, gaussians, direction))[0] for by in (step, -step)
+    )
+    _, gradient = differentiate(gaussians)
+    slope = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
+    np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-6)
+    assert not jnp.any(gradient.sh) and jnp.all(jnp.any(gradient.means != 0, axis=1))
+
+
+@pytest.mark.usefixtures("gpu_kernels")
+def test_gpu_kernels_show_features():
+    scene = draw_scene(4, num=4, width=8, height=8)
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    features = jnp.asarray(some_features(4, 5), jnp.float32)
+
+    def loss(features, gaussians, compositor):
+        settings = RenderSettings(capacity=256, compositor=compositor)
+        output = render_image(gaussians, camera, features=features, settings=settings)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth)
+
+    found, wanted = (jax.grad(loss, argnums=(0, 1))(features, gaussians, name) for name in ("cuda", "native"))
+    compare = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3)
+    jax.tree.map(compare, found, wanted)
+
+
+def test_features_of_a_model():
+    """Behind the rows that exist there may be others; the model's background is a colour, so that of features is 0."""
+    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    features = jnp.asarray(some_features(8, 4), jnp.float32)
+    model = Model(gaussians, num_live=jnp.int32(5))
+    expected = render_image(gaussians[:5], camera, features=features[:5]).color
+    np.testing.assert_array_equal(model.render(camera, features=features).color, expected)
+    none = render_image(gaussians[:0], camera, features=features[:0], background=jnp.arange(4.0))
+    np.testing.assert_array_equal(none.color, np.broadcast_to(np.arange(4), (9, 11, 4)))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Two(PlainRule):
+    """A rule of one's own with two channels."""
+
+    num_colors = 2
+
+    def own_colors(self, gaussians, camera, degree):
+        return jnp.stack([gaussians.opacities, -gaussians.opacities], axis=1)
+
+    def shade(self, numbers, values, u, v):
+        return (0.1 * u, -0.1 * u), None
+
+
+def test_a_rule_may_have_other_colours_than_three():
+    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    color = render_appearance(gaussians, camera, Two()).color
+    assert color.shape == (9, 11, 2) and jnp.abs(color).max() > 0.1
+    np.testing.assert_allclose(color[..., 0], -color[..., 1], atol=1e-6)
+
+
+def test_mistakes_are_named():
+    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    show = functools.partial(render_image, gaussians, camera)
+    features = jnp.asarray(some_features(8, 5), jnp.float32)
+    with pytest.raises(ValueError, match=r"features must be \[8, D\]; got \[7, 5\]"):
+        show(features=features[:7])
+    with pytest.raises(ValueError, match=r"features must be floats; got int32"):
+        show(features=jnp.zeros((8, 5), jnp.int32))
+    with pytest.raises(ValueError, match=r"features must be float32 as the means are, D >= 1; got float32\[8, 0\]"):
+        show(features=features[:, :0])
+    with pytest.raises(ValueError, match=r"background must be \[5\]; got \[3\]"):
+        show(features=features, background=(0, 0, 0))

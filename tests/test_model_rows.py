@@ -1,0 +1,145 @@
+"""Some rows of a model, several models as one, and the gradient in a whole model."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes_random import as_gaussians, draw_scene
+
+from a2tg_jax import adam_init, adam_update, concatenate, value_and_grad
+from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Textured
+from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.model import Model
+from a2tg_jax.texture import texture_arrays, textures_from_arrays
+
+NUM = 12
+SIZES = [(1, 1), (4, 2), (2, 2)]
+
+
+def moved(params):
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda leaf: leaf + rng.normal(size=leaf.shape).astype(np.float32), params)
+
+
+def some_model(name: str, seed: int = 2, num: int = NUM) -> Model:
+    """A model of `num` Gaussians, behind which two rows do not exist."""
+    gaussians, appearance = as_gaussians(draw_scene(seed, num=num + 2), "float32"), APPEARANCES[name]
+    if appearance.has_degrees:
+        gaussians = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
+    params, layout = appearance.allocate(jax.random.key(seed), gaussians)
+    model = Model(gaussians, moved(params), layout, jnp.int32(num), appearance=appearance)
+    rng = np.random.default_rng(seed)
+    if model.textures and not isinstance(appearance.base, Billboards):
+        sizes = [SIZES[(index + seed) % 3] for index in range(num + 2)]
+        model = model.with_textures(
+            *textures_from_arrays([rng.uniform(size=(*size, 4)).astype(np.float32) for size in sizes])
+        )
+    if model.bands:
+        dense = rng.normal(size=(num + 2, 16, 3)).astype(np.float32)
+        model = model.with_bands(*split_sh(dense, rng.integers(0, 4, num + 2), 0))
+    return model
+
+
+APPEARANCES = {
+    "plain": Plain(),
+    "textured": Textured(start=(2, 3)),
+    "movable kernels": MovableKernels(),
+    "billboards": Billboards(side=3),
+    "banded": Banded(Textured(start=(1, 2))),
+}
+
+
+def rows_of(model: Model) -> list[np.ndarray]:
+    """All floats of each Gaussian that exists, as flat arrays."""
+    model = model.live
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(model.gaussians)]
+    pieces = [[leaf[row].ravel() for leaf in leaves] for row in range(model.num)]
+    if model.textures:
+        for piece, texture in zip(pieces, texture_arrays(*model.textures), strict=True):
+            piece.append(texture.ravel())
+    elif jax.tree.leaves(model.params):
+        for leaf in jax.tree.leaves(model.params):
+            for piece, row in zip(pieces, np.asarray(leaf), strict=True):
+                piece.append(row.ravel())
+    for piece, row in zip(pieces, model.sh, strict=True):
+        piece.append(np.pad(row, ((0, 16 - len(row)), (0, 0))).ravel())
+    return [np.concatenate(piece) for piece in pieces]
+
+
+def assert_rows(found: Model, wanted: list[np.ndarray]) -> None:
+    assert found.num_live is None and found.num == len(wanted)
+    found.appearance.check(found.params, found.layout, found.gaussians)
+    for a, b in zip(rows_of(found), wanted, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", APPEARANCES)
+def test_rows_are_chosen_by_mask_indices_and_slice(name):
+    model = some_model(name)
+    rows = rows_of(model)
+    keep = np.arange(NUM) % 3 != 1
+    assert_rows(model[keep], [row for row, kept in zip(rows, keep, strict=True) if kept])
+    assert_rows(model[jnp.asarray([7, 0, 7])], [rows[7], rows[0], rows[7]])
+    assert_rows(model[-4:-1], rows[-4:-1])
+    assert_rows(model[np.zeros(NUM, bool)], [])
+    assert model[keep].num_bytes < model.num_bytes
+
+
+@pytest.mark.parametrize("name", APPEARANCES)
+def test_models_are_joined(name):
+    first, second = some_model(name), some_model(name, seed=3, num=5)
+    assert_rows(concatenate([first, second, first]), rows_of(first) + rows_of(second) + rows_of(first))
+    assert_rows(concatenate([first]), rows_of(first))
+    assert_rows(concatenate([first[:0], second]), rows_of(second))
+    halves = first[: NUM // 2], first[NUM // 2 :]
+    assert_rows(concatenate(halves), rows_of(first))
+
+
+def test_lower_degrees_are_filled_up():
+    first, second = some_model("plain"), some_model("plain", seed=3)
+    flat = dataclasses.replace(first, gaussians=dataclasses.replace(first.gaussians, sh=first.gaussians.sh[:, :1]))
+    joined = concatenate([flat, second])
+    assert joined.gaussians.sh_degree == 3 and not np.any(joined.sh[:NUM, 1:])
+    np.testing.assert_array_equal(joined.sh[NUM:], second.live.sh)
+
+
+def test_mistakes_are_named():
+    model = some_model("plain")
+    with pytest.raises(ValueError, match=r"rows must choose among 12 Gaussians: .*14"):
+        _ = model[np.ones(14, bool)]
+    with pytest.raises(ValueError, match=r"rows must choose among 12 Gaussians: .*12"):
+        _ = model[[0, 12]]
+    with pytest.raises(ValueError, match=r"rows must be a mask \[12\], indices or a slice; got int64 \[\]"):
+        _ = model[3]
+    with pytest.raises(ValueError, match=r"rows must be .*; got float64 \[1\]"):
+        _ = model[[0.5]]
+    with pytest.raises(ValueError, match=r"models must be one model at least"):
+        concatenate([])
+    with pytest.raises(ValueError, match=r"models must have one appearance; got Plain.*, MovableKernels"):
+        concatenate([model, some_model("movable kernels")])
+
+
+def test_a_loss_of_a_whole_model_is_differentiated():
+    model = some_model("textured")
+
+    def loss(model, weight):
+        return weight * sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(model.parameters))
+
+    with pytest.raises(TypeError, match="int32"):
+        jax.grad(loss)(model, 2.0)
+    value, gradient = jax.jit(value_and_grad(loss))(model, 2.0)
+    loss = jax.jit(loss)
+    np.testing.assert_allclose(value, loss(model, 2.0), rtol=1e-5)
+    expected = jax.tree.map(lambda x: 2 * np.cos(x), model.parameters)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), gradient, expected)
+    updated, _ = adam_update(model.parameters, gradient, adam_init(model.parameters), 1e-2)
+    assert loss(model.with_parameters(updated), 2.0) < value
+
+
+def test_a_loss_may_return_more():
+    model = some_model("plain")
+    found, gradient = value_and_grad(lambda m: (jnp.sum(m.gaussians.means**2), m.num_live), has_aux=True)(model)
+    assert found[1] == NUM and gradient.params == ()
+    np.testing.assert_allclose(gradient.gaussians.means, 2 * model.gaussians.means)

@@ -1,0 +1,130 @@
+"""What a notebook and a console show of values: a line each, and pictures."""
+
+import dataclasses
+import io
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from scenes_random import as_camera, as_gaussians, draw_scene
+from small_models import some_model
+
+from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics
+from a2tg_jax.model import Model
+from a2tg_jax.render import RenderOutput
+from a2tg_jax.systems.a2tg import A2tg
+from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.fitting import FitResult, StageResult
+
+CAMERA = as_camera(draw_scene(0, width=21, height=13), "float32")
+MASK = np.arange(13 * 21).reshape(13, 21) % 2 == 0
+
+
+def some_view(name: str = "a.png", channels: int = 3, mask: np.ndarray | None = None) -> View:
+    pixels = np.random.default_rng(0).integers(0, 256, (13, 21, channels), dtype=np.uint8)
+    return View(name, CAMERA, pixels, mask)
+
+
+def some_scene(num: int = 12) -> Scene:
+    views = tuple(some_view(f"<{index}>.png") for index in range(num))
+    points = np.zeros((8412, 3), np.float32)
+    return Scene("fox", views, (some_view("test.png"),), points, points, None, 1.0)
+
+
+def small_model() -> Model:
+    return Model(as_gaussians(draw_scene(1, num=5), "float32"))
+
+
+def some_history() -> History:
+    return History.empty().with_point(1, 100, 0.5, 20.0, 5, 0.1, 2.0).with_point(2, 1200, 0.4, 21.25, 5, 0.1, 9.0)
+
+
+def fit_result() -> FitResult:
+    stage = StageResult("texture", small_model(), some_history(), 12.4, 0)
+    return FitResult(A2tg(), (stage, stage))
+
+
+METRICS = tuple(ViewMetrics(f"{k}.png", 20.0 + k, 0.5, 0.25, 10.0) for k in range(3))
+EVALUATION = Evaluation(METRICS, "vgg", 41.6, (np.zeros((50, 50, 3), np.uint8),) * 3)
+
+LINES = {
+    "Scene('fox', 12 training views, 1 test view, 21×13, 8,412 points)": some_scene,
+    "View('a.png', 21×13)": some_view,
+    "View('a.png', 21×13, with alpha, with a mask)": lambda: some_view(channels=4, mask=MASK),
+    "Picture(uint8[13, 21, 3], in memory)": lambda: some_view().picture,
+    "Evaluation(3 views, PSNR 21.00 dB, SSIM 0.500, LPIPS 0.250 (vgg), 42 frames/s)": lambda: EVALUATION,
+    "Evaluation(0 views, 42 frames/s)": lambda: EVALUATION[:0],
+    "Evaluation(3 views, PSNR 21.00 dB, SSIM 0.500, 42 frames/s)": lambda: dataclasses.replace(
+        EVALUATION, lpips_network=None
+    ),
+    "Model(5 Gaussians, SH degree 3, Plain, 1.2 kB)": small_model,
+    "FitResult(A2tg, 2 stages, 5 Gaussians, 1.2 kB, 25 s)": fit_result,
+    "StageResult('texture', 5 Gaussians, 1.2 kB, 12 s)": lambda: fit_result().stages[0],
+    "History(2 rows to iteration 1,200 of stage 2, 21.25 dB)": some_history,
+    "History(0 rows)": History.empty,
+}
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_value_is_a_line(line):
+    assert repr(LINES[line]()) == line
+
+
+def test_checkpoint_is_a_line():
+    state = types.SimpleNamespace(iteration=1200, model=small_model())
+    checkpoint = Checkpoint(A2tg(), 1, state, some_history())
+    assert repr(checkpoint) == "Checkpoint(A2tg, stage 2, iteration 1,200, 5 Gaussians)"
+
+
+def test_model_without_values_has_a_repr():
+    seen = []
+    jax.jit(lambda model: seen.append(repr(model)) or model.gaussians.means)(small_model())
+    model = dataclasses.replace(some_model(), num_live=jnp.int32(1))
+    jax.jit(lambda model: seen.append(repr(model)) or model.gaussians.means)(model)
+    assert seen[0].startswith("Model(5 Gaussians") and seen[1].startswith("Model(gaussians=Gaussians(")
+    assert "object" in repr(jax.tree.map(lambda x: object(), model))
+
+
+def decoded(file: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(file)))
+
+
+def some_output(*views: int) -> RenderOutput:
+    color = jnp.linspace(-0.5, 1.5, 13 * 21 * 3).reshape(13, 21, 3)
+    plane = jnp.zeros((13, 21))
+    output = RenderOutput(color, plane, plane, jnp.zeros((13, 21, 3)), jnp.asarray(False), plane)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (*views, *x.shape)), output)
+
+
+def test_render_is_a_picture():
+    output = some_output()
+    assert repr(output).startswith("RenderOutput(color=float32[13, 21, 3], alpha=float32[13, 21], ")
+    expected = np.rint(255 * np.clip(np.asarray(output.color), 0, 1))
+    np.testing.assert_array_equal(decoded(output._repr_png_()), expected)
+
+
+def test_several_views_and_traced_views_have_no_picture():
+    seen = []
+    jax.jit(lambda output: seen.append(output._repr_png_()))(some_output())
+    assert seen == [None] and some_output(2)._repr_png_() is None
+
+
+def test_view_is_a_picture():
+    view = some_view(channels=4)
+    np.testing.assert_array_equal(decoded(view._repr_png_()), view.picture.read())
+
+
+def test_scene_shows_a_few_thumbnails():
+    text = some_scene()._repr_html_()
+    assert text.count("<img ") == 8 and "12 training views" in text
+    assert 'title="&lt;0&gt;.png"' in text and 'title="&lt;10&gt;.png"' in text
+    assert some_scene(2)._repr_html_().count("<img ") == 2
+
+
+def test_model_is_a_short_table():
+    text = some_model()._repr_html_()
+    assert text.count("<tr>") <= 6 and "Gaussians" in text and "memory" in text
