@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -23,7 +24,7 @@ from a2tg_jax.results import compression, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.record import SceneSource, read_record
 from a2tg_jax.results.viewing import open_source, routes_of
-from a2tg_jax.training import SYSTEMS
+from a2tg_jax.training import SYSTEMS, find_system
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -147,6 +148,22 @@ def test_help_of_each_command(capsys, name):
     text = capsys.readouterr().out
     assert raised.value.code == 0
     assert text.startswith(f"usage: a2tg {name}") and cli.COMMANDS[name].__doc__.splitlines()[0] in text
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_tells_one_default_of_each_option(capsys, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    options = re.split(r"\n[│ ]*-", capsys.readouterr().out)
+    assert len(options) > 1 and all(option.count("(default:") < 2 for option in options)
+
+
+def test_help_names_every_preset(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    told = capsys.readouterr().out.rpartition("--preset {")[2].partition("--downscale INT")[0]
+    assert all(preset in told for name in SYSTEMS for preset in find_system(name).presets())
 
 
 def test_preset_decides_the_defaults_of_the_numbers():
@@ -388,6 +405,13 @@ def test_resume_refuses_other_numbers(tiny_run, capsys):
     assert "leave out --preset, which differs in --downscale, " in fails(capsys, *again, "--preset", "quick")
     assert "there is no system" in fails(capsys, *again, "--compare", "b2tg")
     assert "was trained on synthetic" in fails(capsys, "train", run.path, "--out", run.path, "--resume")
+
+
+def test_demo_goes_on_from_what_is_there(tiny_run, capsys):
+    run, *_ = tiny_run
+    assert "--resume" in fails(capsys, "demo", "--out", run.path)
+    assert cli.main(["demo", "--out", str(run.path), "--resume"]) == 0
+    assert "a2tg-textures" in capsys.readouterr().out
 
 
 def test_damaged_model_is_one_clear_line(tiny_run, capsys, tmp_path):

@@ -20,13 +20,15 @@ from a2tg_jax.training.start import initial_model
 SYNTHETIC = "train synthetic --out new"
 MISTAKES = {
     # Commands, flags and their values
-    "trian": "there is no command 'trian'",
+    "trian": "did you mean train?",
     "--verbose": "there is no command '--verbose'",
     "train": "Missing from a2tg train",
     "train synthetic": "--out PATH",
     "train --out new": "SCENE",
     "train synthetic more --out new": "Unrecognized options: more",
     f"{SYNTHETIC} --texture.fracton 0.5": "did you mean --texture.fraction",
+    f"{SYNTHETIC} --itertions 5": "did you mean --stage1-iterations or --stage2-iterations?",
+    f"{SYNTHETIC} --cap 5": "did you mean --densify.cap or --texture.cap?",
     f"{SYNTHETIC} --seed": "Missing value for argument '--seed'",
     f"{SYNTHETIC} --seed 0.5": "'0.5'",
     f"{SYNTHETIC} --batch-size two": "'two'",
@@ -34,8 +36,10 @@ MISTAKES = {
     f"{SYNTHETIC} --texture.upscale-at soon": "--texture.upscale-at",
     f"{SYNTHETIC} --on-nan hope": "Expected one of ('stop', 'restore')",
     f"{SYNTHETIC} --system b2tg": "there is no system 'b2tg'",
+    f"{SYNTHETIC} --system bytwise": "did you mean bytewise?",
     f"{SYNTHETIC} --system os:sep": "'os:sep' is no system",
     f"{SYNTHETIC} --preset fast": "presets paper",
+    f"{SYNTHETIC} --preset quik": "did you mean quick?",
     f"{SYNTHETIC} --compare b2tg": "there is no system 'b2tg'",
     f"{SYNTHETIC} --system gaussians-2d --texture.cap 4": "Unrecognized options: --texture.cap",
     # Numbers out of range
@@ -78,6 +82,8 @@ MISTAKES = {
     "train --config bad.toml --out new": "is not valid TOML",
     "train --config wrong.toml --out new": "did you mean scene",
     "demo --out photos": "not a run folder",
+    "demo --out photos --resume": "is not a run folder",
+    "demo --out run --resume --overwrite": "give one of them",
     "eval run --lpips-weights nowhere.npz": "nowhere.npz",
     "eval photos": "is not a run folder",
     "eval run": "no finished stage",

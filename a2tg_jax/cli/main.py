@@ -13,13 +13,13 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import parse
+from a2tg_jax.cli.arguments import LastModel, defaulting_to, parse
 from a2tg_jax.cli.train import Demo, Train, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.data import run_sfm
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.frames import Route, render_frames, write_video
@@ -91,10 +91,10 @@ class Render:
     """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
     frames: int = 120
     """Number of frames of the flight, at 30 frames per second."""
-    out: Path | None = None
-    """Output folder (default: RUN/frames)."""
-    model: str | None = None
-    """Name of the model, as a2tg info prints it (default: the last model of the main system)."""
+    out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
+    """Output folder."""
+    model: LastModel = None
+    """Name of the model, as a2tg info prints it."""
 
     def run(self) -> None:
         run = open_run(self.folder)
@@ -121,8 +121,8 @@ class Compress:
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
     """Model file (*.npz), or run folder, whose last model is taken."""
-    out: Path | None = None
-    """Output file (default: NAME.a2tgz beside the model)."""
+    out: Annotated[Path | None, defaulting_to("NAME.a2tgz beside the model")] = None
+    """Output file."""
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
 
@@ -187,7 +187,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(version("a2tg-jax") if name == "--version" else OVERVIEW)
         return 0
     if name not in COMMANDS:
-        return _fail(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
+        told = f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}"
+        return _fail(told + did_you_mean(name, COMMANDS))
     try:
         configure_cpu()
     except ValueError as error:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.results.live import shown_live
 from a2tg_jax.results.viewing import open_source, routes_of
@@ -32,8 +33,8 @@ class View:
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
-    model: str | None = None
-    """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
+    model: LastModel = None
+    """Name of a run's model, as a2tg info prints it."""
     port: int = 0
     """Port on 127.0.0.1; 0 takes a free one."""
     open: bool = True
@@ -67,8 +68,8 @@ class Export:
     """Write one HTML file that needs no other."""
     photographs: bool = False
     """Put the photographs of the run's cameras beside the page."""
-    model: str | None = None
-    """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
+    model: LastModel = None
+    """Name of a run's model, as a2tg info prints it."""
 
     def run(self) -> None:
         source = open_source(self.source, self.model)

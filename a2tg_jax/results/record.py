@@ -30,6 +30,7 @@ from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_co
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
+from a2tg_jax.training.options import BUDGET_OPTIONS
 from a2tg_jax.training.registry import differences, with_changes
 
 SYNTHETIC = "synthetic"
@@ -215,9 +216,17 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "on_nan": record.on_nan,
         "options": _without_none(config_to_dict(record.system), start),
     }
-    text = f"# Repeats the run: {repeating_command(run)}\n{tomli_w.dumps(table)}"
+    text = f"# Repeats the run: {repeating_command(run)}\n{_budget_note(record.system)}{tomli_w.dumps(table)}"
     with replacing(run.own(run.record)) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _budget_note(system: System) -> str:
+    """Return a comment that names the options without effect beside a memory budget; empty if there are none."""
+    replaced = [name for name, value in flatten_config(system).items() if name in BUDGET_OPTIONS and value is not None]
+    if system.memory_budget is None or not replaced:
+        return ""
+    return f"# options.memory_budget decides in place of {', '.join(f'options.{name}' for name in replaced)}\n"
 
 
 def read_record(run: RunFolder) -> RunRecord:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.events import Event, FieldError, with_names
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
@@ -169,6 +169,7 @@ class System:
         if name not in presets:
             raise ValueError(
                 f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {shortened(name)!r}"
+                f"{did_you_mean(name, presets)}"
             )
         return presets[name]
 
