@@ -20,10 +20,13 @@ from a2tg_jax.results.forecast import (
     allowed_memory,
     bytes_allowed,
     forecast_run,
+    quick_downscale,
+    quicker_text,
     room_for_photographs,
     tell_forecast,
 )
 from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, progress
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
@@ -138,6 +141,27 @@ def test_what_does_not_fit_is_refused_with_the_option_to_change(name, option):
     with pytest.raises(ValueError, match=rf"5.0 GB of memory \(a-gaussians: .*4.0 GB may be used: change .*{option}"):
         found.check(4e9)
     found.check(5.1e9)
+
+
+@pytest.mark.parametrize(
+    "preset, size, flags",
+    [
+        ("paper", (1600, 1067), "--preset quick --downscale 6"),
+        ("paper", (320, 213), "--preset quick --downscale 2"),
+        ("quick", (3200, 2133), "--preset quick --downscale 10"),
+        ("quick", (320, 213), None),
+    ],
+)
+def test_a_long_run_is_told_what_is_quicker(monkeypatch, preset, size, flags):
+    monkeypatch.setattr("a2tg_jax.training.cost.num_threads", lambda: 2)
+    record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
+    text = quicker_text(scene_of(*size), record)
+    assert (text == "") == (flags is None)
+    assert flags is None or (f"quicker: {flags} takes very roughly " in text and " h" not in text)
+
+
+def test_the_downscale_of_quick_runs():
+    assert [quick_downscale(side) for side in (100, 640, 641, 4000)] == [1, 1, 2, 7]
 
 
 def test_what_is_told():

@@ -17,11 +17,13 @@ from a2tg_jax.cli.arguments import LastModel, defaulting_to, parse
 from a2tg_jax.cli.train import Demo, Train, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.data import run_sfm
+from a2tg_jax.data.sfm import Matching
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
+from a2tg_jax.results.forecast import quick_downscale, quick_flags
 from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.lock import opened
@@ -38,7 +40,8 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
 
   a2tg demo                            train a built-in scene, about a minute on two cores
   a2tg sfm photos/ scene/              find camera poses for plain photographs with COLMAP
-  a2tg train scene/ --out runs/scene   train a scene, evaluate it, write a report
+  a2tg train scene/ --out runs/scene --preset quick --downscale 4
+                                       train a scene in minutes, evaluate it, write a report
   a2tg eval runs/scene                 evaluate a run again
   a2tg render runs/scene               render frames and a video of a flight, or the test views
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
@@ -147,22 +150,28 @@ class Info:
 class Sfm:
     """Find camera poses and sparse points for plain photographs.
 
-    COLMAP extracts features, matches them and maps the scene.
+    COLMAP extracts features, matches them and maps the scene. Frames of a video are photographs too:
+    ffmpeg -i fox.mp4 -vf fps=2 -q:v 2 photos/fox/%04d.jpg
 
     Example:
-      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox
+      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
     """
 
     photos: Positional[Path]
     """Folder of photographs of one scene."""
     out: Positional[Path]
     """New scene folder for the images and the sparse model, ready for a2tg train."""
+    matching: Matching = "auto"
+    """Pairs of photographs to match: all pairs (exhaustive), neighbours by name (sequential, for many photographs named
+    in the order of taking), or neighbours beyond 200 photographs (auto)."""
 
     def run(self) -> None:
         check_apart(self.out, self.photos)
-        found = run_sfm(self.photos, self.out)
+        found = run_sfm(self.photos, self.out, matching=self.matching)
         print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
-        print(f"scene: {self.out}; continue with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
+        run = ["a2tg", "train", str(self.out), "--out", f"runs/{self.out.resolve().name}"]
+        command = shlex.join([*run, *quick_flags(quick_downscale(found.longest_side))])
+        print(f"scene: {self.out}; continue with: {command}")
 
 
 Command = Demo | Train | Eval | Render | View | Export | Compress | Info | Sfm
