@@ -20,7 +20,7 @@ from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import compression, run_training
+from a2tg_jax.results import compression, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.record import SceneSource, read_record
 from a2tg_jax.results.viewing import open_source, routes_of
@@ -456,12 +456,23 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
     """With the run's photographs; a model of the run by its name."""
     run, *_ = tiny_run
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--photographs"]) == 0
-    assert "dB of PSNR lost, test views" in capsys.readouterr().out
+    assert re.search(r"\d\.\d{3} dB of PSNR (lost|gained), test views\n", capsys.readouterr().out)
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))
     assert decode_web_scene(routes["/scene.a2tgw"].read()).header["num_texels"] is None
     assert json.loads(routes["/photographs.json"].read()) == listed
+
+
+def test_export_for_other_programs(tiny_run, tmp_path, capsys):
+    """Flat 3D Gaussians, which this program's reader takes for what they were; so is the run's own point cloud."""
+    run, *_ = tiny_run
+    assert cli.main(["export", str(run.path), "--ply", str(tmp_path / "new" / "fox.ply")]) == 0
+    assert f"{tmp_path / 'new' / 'fox.ply'}: 60 Gaussians, without their textures" in capsys.readouterr().out
+    for path in (tmp_path / "new" / "fox.ply", run.point_cloud):
+        assert b"property float scale_2\n" in path.read_bytes()
+        assert load_ply(path).num == 60
+    assert "must be the path of a file" in fails(capsys, "export", run.path, "--ply", tmp_path / "fox")
 
 
 def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
@@ -488,5 +499,22 @@ def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
 def test_render_without_ffmpeg_says_so(tiny_run, tmp_path, monkeypatch, capsys):
     run, *_ = tiny_run
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert cli.main(["render", str(run.path), "--frames", "1", "--out", str(tmp_path)]) == 0
-    assert "no video: ffmpeg is not installed" in capsys.readouterr().out
+    command = ["render", str(run.path), "--frames", "2", "--out", str(tmp_path), "--size", "48x20", "--fps", "8"]
+    assert cli.main(command) == 0
+    told = capsys.readouterr().out
+    assert "no video: ffmpeg is not installed; install it" in told and f"animation: {tmp_path / 'flight.webp'}" in told
+    with Image.open(tmp_path / "flight.webp") as animation:
+        assert (animation.size, animation.n_frames) == ((48, 20), 2)
+        animation.seek(1)
+        animation.load()
+        assert animation.info["duration"] == 125
+
+
+def test_render_tells_ffmpeg_the_rate(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    monkeypatch.setattr(
+        subprocess, "run", lambda command, **_: asked.append(command) or subprocess.CompletedProcess([], 0)
+    )
+    assert frames.write_video(tmp_path, tmp_path / "flight.mp4", frames_per_second=12)
+    assert asked[0][asked[0].index("-framerate") + 1] == "12"

@@ -24,7 +24,15 @@ from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.forecast import quick_downscale, quick_flags
-from a2tg_jax.results.frames import Route, render_frames, write_video
+from a2tg_jax.results.frames import (
+    FRAMES_PER_SECOND,
+    Route,
+    check_rate,
+    parse_size,
+    render_frames,
+    write_animation,
+    write_video,
+)
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.lock import opened
 from a2tg_jax.results.preflight import check_apart, check_weights
@@ -46,6 +54,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg render runs/scene               render frames and a video of a flight, or the test views
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
+  a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
   a2tg compress runs/scene             write a small file of the trained model
   a2tg info runs/scene                 print what a run folder holds
 
@@ -80,10 +89,12 @@ class Eval:
 class Render:
     """Render frames of a finished run as PNG files.
 
-    A flight also becomes a video if ffmpeg is installed. The photographs are not needed.
+    A flight also becomes a video: MP4 if ffmpeg is installed, and otherwise an animated WebP. The photographs are not
+    needed.
 
     Examples:
-      a2tg render runs/fox --frames 240
+      a2tg render runs/fox --frames 240 --fps 60
+      a2tg render runs/fox --size 1280x720
       a2tg render runs/fox --path test --out fox-test
       a2tg render runs/fox --path path.json --out fox-flight
     """
@@ -93,7 +104,11 @@ class Render:
     path: Route | Path = "smooth"
     """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
     frames: int = 120
-    """Number of frames of the flight, at 30 frames per second."""
+    """Number of frames of the flight."""
+    fps: float = FRAMES_PER_SECOND
+    """Frames per second of the video."""
+    size: Annotated[str | None, arg(metavar="WxH"), defaulting_to("that of the cameras")] = None
+    """Width and height of the frames in pixels, such as 1280x720. Views of another aspect are cropped."""
     out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
     """Output folder."""
     model: LastModel = None
@@ -102,12 +117,23 @@ class Render:
     def run(self) -> None:
         run = open_run(self.folder)
         out = self.out or run.path / "frames"
-        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model)
+        check_rate(self.fps)
+        size = None if self.size is None else parse_size(self.size)
+        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model, size=size)
         print(f"{len(paths)} frames in {out}")
         if self.path != "test":
-            video = out / "flight.mp4"
-            made = write_video(out, video)
-            print(f"video: {video}" if made else "no video: ffmpeg is not installed")
+            self._write_video(out, paths)
+
+    def _write_video(self, out: Path, frames: list[Path]) -> None:
+        """Write an MP4, or an animated WebP without ffmpeg."""
+        video = out / "flight.mp4"
+        if write_video(out, video, frames_per_second=self.fps):
+            print(f"video: {video}")
+            return
+        print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
+        animation = out / "flight.webp"
+        write_animation(frames, animation, frames_per_second=self.fps)
+        print(f"animation: {animation}")
 
 
 @dataclasses.dataclass(frozen=True)

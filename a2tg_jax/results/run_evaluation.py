@@ -79,7 +79,7 @@ def evaluate_run(
     _write_curves(run, plan, list(models))
     if main.appearance.texture_options is not None:
         _write_texture_figures(run, main, plan[result.main].system, scene)
-    save_ply(run.own(run.point_cloud), main)
+    save_ply(run.own(run.point_cloud), main, third_scale=True)
     _write_surface(run, main, plan[result.main].system, scene)
     _write_flight(run, main, plan[result.main].system)
     _write_viewer(run, main, f"{scene.name} · {result.main}")
