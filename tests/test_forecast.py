@@ -2,10 +2,13 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
+from typing import ClassVar
 
 import jax
 import numpy as np
 import pytest
+from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
@@ -14,6 +17,7 @@ from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.jit import classes_of
 from a2tg_jax.data import Picture
 from a2tg_jax.host import memory
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
     RunForecast,
@@ -35,6 +39,18 @@ from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
 
 MB = 10**6
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Capped(Toy):
+    """A toy whose growth has an option of its own."""
+
+    most: int = 50
+    event_options: ClassVar[Mapping[str, str]] = {"Mcmc.cap": "most"}
+
+    def stages(self) -> tuple[a2tg.Stage, ...]:
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(*stage.events, Mcmc(self.most))),)
 
 
 def scene_of(width, height, num_views=4):
@@ -123,7 +139,7 @@ def test_photographs_on_disk_take_what_is_read_ahead():
 
 
 def forecast_with(**sizes):
-    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0)
+    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0, ("densify.cap",))
 
 
 @pytest.mark.parametrize(
@@ -141,6 +157,22 @@ def test_what_does_not_fit_is_refused_with_the_option_to_change(name, option):
     with pytest.raises(ValueError, match=rf"5.0 GB of memory \(a-gaussians: .*4.0 GB may be used: change .*{option}"):
         found.check(4e9)
     found.check(5.1e9)
+
+
+@pytest.mark.parametrize(
+    "system, option",
+    [
+        (a2tg.A2tg(), "change --densify.cap, --memory-budget or"),
+        (a2tg.A2tg(memory_budget="90MB"), "change --memory-budget or"),
+        (Toy(), "change --initial-gaussians, --memory-budget or"),
+        (Capped(), "change --most, --memory-budget or"),
+    ],
+)
+def test_a_system_names_its_own_limit(system, option):
+    found = dataclasses.replace(forecast_with(model=5e9), limits=system.limits())
+    with pytest.raises(ValueError, match=option):
+        found.check(4e9)
+    assert run_of(scene_of(24, 16), system).limits == system.limits()
 
 
 @pytest.mark.parametrize(

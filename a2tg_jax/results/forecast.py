@@ -49,11 +49,11 @@ QUICK_SIDE = 640
 OPTIONS = {
     "program": "--max-memory, for the program itself takes most",
     "photographs": "--downscale, or --batch-size",
-    "model": "--densify.cap, --memory-budget or --sh-degree",
-    "gradients": "--densify.cap, --memory-budget, --batch-size or --sh-degree",
+    "model": "{limits}, --memory-budget or --sh-degree",
+    "gradients": "{limits}, --memory-budget, --batch-size or --sh-degree",
     "pixels": "--downscale",
 }
-"""Options to change, by what needs most of the memory."""
+"""Options to change, by what needs most of the memory; `limits` are those of the systems' number of Gaussians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +66,8 @@ class RunForecast:
     """Bytes in the run folder."""
     seconds: float
     """Training time on CPUs; 0 if it cannot be estimated."""
+    limits: tuple[str, ...] = ()
+    """Names of the options that limit the number of Gaussians."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -104,8 +106,13 @@ class RunForecast:
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
         raise ValueError(
             f"the run would need about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
-            f"used: change {OPTIONS[largest]}, or allow more with --max-memory"
+            f"used: change {self._told_options(largest)}, or allow more with --max-memory"
         )
+
+    def _told_options(self, largest: str) -> str:
+        """Return the options to change if this part of the memory is the largest."""
+        own = (f"--{name.replace('_', '-')}" for name in self.limits if name != "memory_budget")
+        return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
 
 
 def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
@@ -124,7 +131,10 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
         pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
     )
     seconds = sum(stage.seconds for stage in stages.values()) if is_host else 0
-    return RunForecast({**phases, "evaluation": shown}, _disk_bytes(scene, plan, list(stages.values())), seconds)
+    systems = {id(planned.system): planned.system for planned in plan.stages}.values()
+    limits = tuple(dict.fromkeys(name for system in systems for name in system.limits()))
+    disk = _disk_bytes(scene, plan, list(stages.values()))
+    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits)
 
 
 def quick_downscale(longest_side: int) -> int:

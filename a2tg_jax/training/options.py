@@ -231,6 +231,12 @@ class System:
         names = [field.name for field in dataclasses.fields(self)]
         return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
+    def limits(self) -> tuple[str, ...]:
+        """Return the names of the options that limit the number of Gaussians, for advice."""
+        events = (event for stage in self.stages() for event in stage.events if event.most_gaussians is not None)
+        names = (self.option_of(event, "cap") for event in events)
+        return tuple(dict.fromkeys(name for name in names if name is not None)) or ("initial_gaussians",)
+
     def check_number(self, num: int) -> None:
         """Refuse options that cannot be trained from so many Gaussians.
 
