@@ -34,7 +34,7 @@ from a2tg_jax.systems.stage1 import later_stage
 from a2tg_jax.training import Stage, fit_stage
 from a2tg_jax.training.losses import photometric_loss
 
-ITERATIONS = 300
+ITERATIONS, SMOKE_ITERATIONS = 300, 20
 NUM_PARTS = 4
 """Number of groups in a criterion's order."""
 SEEDS = (0, 1, 2)
@@ -74,12 +74,13 @@ class Trial(a2tg.System):
     """One stage that continues from a model with textures of some rows, or without textures if `rows` is None."""
 
     rows: Any = dataclasses.field(default=None, hash=False)
+    iterations: int = ITERATIONS
 
     def stages(self) -> tuple[Stage, ...]:
         if self.rows is None:
-            return (later_stage(self, "trial", Plain(), (), ITERATIONS),)
+            return (later_stage(self, "trial", Plain(), (), self.iterations),)
         rates = TexelRates(DetailTextureConfig().rate, 0.0)
-        return (later_stage(self, "trial", Textured((0, 0)), (GrowRows(self.rows),), ITERATIONS, rates),)
+        return (later_stage(self, "trial", Textured((0, 0)), (GrowRows(self.rows),), self.iterations, rates),)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -88,7 +89,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     found = measured_once(lab, EXPERIMENT.name, grid, _measure, first_stage=True)
     header = ["criterion", *(f"{result.run.cell.scene.label}, {result.run.cell.budget:g} MB" for result, _ in found)]
     ranks = [_rank_correlations(figures) for _, figures in found]
-    rows = [[told, *(f"{own[name]:+.2f}" for own in ranks)] for name, told in CRITERIA.items()]
+    rows = [[told, *(tables.signed(own[name], 2) for own in ranks)] for name, told in CRITERIA.items()]
     gains = [[told, *(_quarters(figures, name) for _, figures in found)] for name, told in CRITERIA.items()]
     noise = ", ".join(f"{np.std(figures['without']):.3f}" for _, figures in found)
     parts = [
@@ -107,7 +108,8 @@ def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
     scene = lab.folders.load_scene(result.run.job)
     options = result.run.job.system
     system = Trial(**{field.name: getattr(options, field.name) for field in dataclasses.fields(a2tg.System)})
-    system = dataclasses.replace(system, memory_budget=None)
+    iterations = SMOKE_ITERATIONS if lab.is_smoke else ITERATIONS
+    system = dataclasses.replace(system, memory_budget=None, iterations=iterations)
     without = [_quality(scene, model, dataclasses.replace(system, seed=seed)) for seed in SEEDS]
     scores = criteria(model, scene)
     groups = []
@@ -143,7 +145,7 @@ def _ranks(values: Sequence[float]) -> np.ndarray:
 
 
 def _quarters(figures: Mapping[str, Any], name: str) -> str:
-    return " ".join(f"{group['train']:+.2f}" for group in figures["groups"] if group["criterion"] == name)
+    return " ".join(tables.signed(group["train"], 2) for group in figures["groups"] if group["criterion"] == name)
 
 
 def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
