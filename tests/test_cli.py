@@ -20,8 +20,9 @@ from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import compression, frames, run_training
+from a2tg_jax.results import compression, finishing, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.record import SceneSource, read_record
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.training import SYSTEMS, find_system
@@ -473,6 +474,54 @@ def test_export_for_other_programs(tiny_run, tmp_path, capsys):
         assert b"property float scale_2\n" in path.read_bytes()
         assert load_ply(path).num == 60
     assert "must be the path of a file" in fails(capsys, "export", run.path, "--ply", tmp_path / "fox")
+
+
+def test_finish(tiny_run, tmp_path, monkeypatch, capsys):
+    """A run folder of its own, evaluated anew; the run that it was made of stays as it is. Both steps are stand-ins."""
+    run, *_ = tiny_run
+    kept = {path: path.read_bytes() for path in (run.record, run.metrics, run.model("a2tg-textures"))}
+    small, asked = load_model(run.model("a2tg-gaussians")), []
+
+    def shrink(model, views, *, max_loss):
+        asked.append((max_loss, {view.name for view in views}))
+        return small
+
+    def polish(model, views, *, num_steps):
+        asked.append((num_steps, {view.name for view in views}))
+        return model
+
+    monkeypatch.setattr(finishing, "shrink_textures", shrink)
+    monkeypatch.setattr(finishing, "polish", polish)
+    new = RunFolder(tmp_path / "new")
+    command = ["finish", str(run.path), "--out", str(new.path), "--max-loss", "0.5", "--polish-steps", "2"]
+    assert cli.main(command) == 0
+    names = {view.name for view in read_record(run).scene.load().train}
+    assert [number for number, _ in asked] == [0.5, 2] and asked[0][1] <= names == asked[1][1]
+    assert {path: path.read_bytes() for path in kept} == kept
+    title, sizes, train, *_ = capsys.readouterr().out.splitlines()
+    old = load_model(run.model("a2tg-textures"))
+    assert title.split() == ["before", "shrunk", "polished"]
+    assert sizes.split()[1:] == [f"{model.num_bytes:,}" for model in (old, small, small)]
+    before, after = (json.loads(folder.metrics.read_text())["models"] for folder in (run, new))
+    psnrs = [before["a2tg-textures"], before["a2tg-gaussians"], after["a2tg-textures"]]
+    assert train.split()[3:] == [f"{found['train']['psnr']:.2f}" for found in psnrs]
+    assert after["a2tg-textures"]["num_bytes"] == load_model(new.model("a2tg-textures")).num_bytes == small.num_bytes
+    assert after["gaussians-2d-mcmc-continued"]["sha256"] == before["gaussians-2d-mcmc-continued"]["sha256"]
+    assert json.loads(new.finish.read_text())["sha256"] == sha256_of(run.model("a2tg-textures"))
+    assert read_record(new) == read_record(run) and set(new.written()) >= {"finish.json", "report.html"}
+    again = f"a2tg finish {new.path}-trained --out {new.path}-again --max-loss=0.5 --polish-steps=2"
+    assert again in new.record.read_text()
+    assert cli.main(["info", str(new.path)]) == 0 and again in capsys.readouterr().out
+    assert "is not empty" in fails(capsys, *command)
+
+
+def test_what_polishing_spoils_is_left_out():
+    def steps(*psnrs):
+        return {name: finishing.Measured(1, psnr, None) for name, psnr in psnrs}
+
+    assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 20.1))) == "polished"
+    assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 19.8))) == "shrunk"
+    assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9))) == "shrunk"
 
 
 def test_compress(tiny_run, tmp_path, monkeypatch, capsys):

@@ -1,9 +1,8 @@
-"""The command line `a2tg`: demo, train, eval, render, view, export, compress, info, sfm."""
+"""The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm."""
 
 import dataclasses
 import inspect
 import os
-import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -13,29 +12,20 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import LastModel, defaulting_to, parse
+from a2tg_jax.cli.arguments import defaulting_to, parse
+from a2tg_jax.cli.finish import Finish
+from a2tg_jax.cli.render import Render
+from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
-from a2tg_jax.data import run_sfm
-from a2tg_jax.data.sfm import Matching
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
-from a2tg_jax.results.forecast import quick_downscale, quick_flags
-from a2tg_jax.results.frames import (
-    FRAMES_PER_SECOND,
-    Route,
-    check_rate,
-    parse_size,
-    render_frames,
-    write_animation,
-    write_video,
-)
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.lock import opened
-from a2tg_jax.results.preflight import check_apart, check_weights
+from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.whole_run import measure
 from a2tg_jax.training import SYSTEMS
 
@@ -51,6 +41,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg train scene/ --out runs/scene --preset quick --downscale 4
                                        train a scene in minutes, evaluate it, write a report
   a2tg eval runs/scene                 evaluate a run again
+  a2tg finish runs/scene --out runs/f  shrink and polish the trained model, in a new run folder
   a2tg render runs/scene               render frames and a video of a flight, or the test views
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
@@ -83,57 +74,6 @@ class Eval:
         check_weights(self.lpips_weights)
         with opened(self.folder) as run:
             tell_result(measure(run, lpips_weights=self.lpips_weights), self.folder)
-
-
-@dataclasses.dataclass(frozen=True)
-class Render:
-    """Render frames of a finished run as PNG files.
-
-    A flight also becomes a video: MP4 if ffmpeg is installed, and otherwise an animated WebP. The photographs are not
-    needed.
-
-    Examples:
-      a2tg render runs/fox --frames 240 --fps 60
-      a2tg render runs/fox --size 1280x720
-      a2tg render runs/fox --path test --out fox-test
-      a2tg render runs/fox --path path.json --out fox-flight
-    """
-
-    folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Run folder."""
-    path: Route | Path = "smooth"
-    """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
-    frames: int = 120
-    """Number of frames of the flight."""
-    fps: float = FRAMES_PER_SECOND
-    """Frames per second of the video."""
-    size: Annotated[str | None, arg(metavar="WxH"), defaulting_to("that of the cameras")] = None
-    """Width and height of the frames in pixels, such as 1280x720. Views of another aspect are cropped."""
-    out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
-    """Output folder."""
-    model: LastModel = None
-    """Name of the model, as a2tg info prints it."""
-
-    def run(self) -> None:
-        run = open_run(self.folder)
-        out = self.out or run.path / "frames"
-        check_rate(self.fps)
-        size = None if self.size is None else parse_size(self.size)
-        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model, size=size)
-        print(f"{len(paths)} frames in {out}")
-        if self.path != "test":
-            self._write_video(out, paths)
-
-    def _write_video(self, out: Path, frames: list[Path]) -> None:
-        """Write an MP4, or an animated WebP without ffmpeg."""
-        video = out / "flight.mp4"
-        if write_video(out, video, frames_per_second=self.fps):
-            print(f"video: {video}")
-            return
-        print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
-        animation = out / "flight.webp"
-        write_animation(frames, animation, frames_per_second=self.fps)
-        print(f"animation: {animation}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,37 +112,9 @@ class Info:
         print(describe_run(open_run(self.folder)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Sfm:
-    """Find camera poses and sparse points for plain photographs.
-
-    COLMAP extracts features, matches them and maps the scene. Frames of a video are photographs too:
-    ffmpeg -i fox.mp4 -vf fps=2 -q:v 2 photos/fox/%04d.jpg
-
-    Example:
-      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
-    """
-
-    photos: Positional[Path]
-    """Folder of photographs of one scene."""
-    out: Positional[Path]
-    """New scene folder for the images and the sparse model, ready for a2tg train."""
-    matching: Matching = "auto"
-    """Pairs of photographs to match: all pairs (exhaustive), neighbours by name (sequential, for many photographs named
-    in the order of taking), or neighbours beyond 200 photographs (auto)."""
-
-    def run(self) -> None:
-        check_apart(self.out, self.photos)
-        found = run_sfm(self.photos, self.out, matching=self.matching)
-        print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
-        run = ["a2tg", "train", str(self.out), "--out", f"runs/{self.out.resolve().name}"]
-        command = shlex.join([*run, *quick_flags(quick_downscale(found.longest_side))])
-        print(f"scene: {self.out}; continue with: {command}")
-
-
-Command = Demo | Train | Eval | Render | View | Export | Compress | Info | Sfm
+Command = Demo | Train | Eval | Finish | Render | View | Export | Compress | Info | Sfm
 COMMANDS: dict[str, type] = {
-    "demo": Demo, "train": Train, "eval": Eval, "render": Render, "view": View, "export": Export,
+    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "view": View, "export": Export,
     "compress": Compress, "info": Info, "sfm": Sfm,
 }  # fmt: skip
 

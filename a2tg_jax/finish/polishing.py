@@ -39,8 +39,8 @@ class Colors(NamedTuple):
     """[capacity, Tv, Tu, 3] of each bucket of textures."""
 
 
-class Photographs(NamedTuple):
-    """V views of one image size, stacked."""
+class Targets(NamedTuple):
+    """Photographs over the background, of V views of one image size, with the weights of their pixels."""
 
     viewmats: Array
     Ks: Array
@@ -80,7 +80,7 @@ def _jitted() -> jit:
     return jit(_solve, static_argnums=(3, 4))
 
 
-def _solve(model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps, ridge):
+def _solve(model: Model, groups: list[Targets], background: Array, settings: RenderSettings, num_steps, ridge):
     """Return the changes of the colours."""
 
     def over_views(function):
@@ -96,12 +96,12 @@ def _solve(model: Model, groups: list[Photographs], background: Array, settings:
             total, _ = jax.lax.scan(step, total, group)
         return total
 
-    def right(camera: Camera, view: Photographs) -> Colors:
+    def right(camera: Camera, view: Targets) -> Colors:
         residual = view.images - _drawn(model, camera, background, settings)
         return _transpose(model, camera, settings, view.weights * residual)
 
     def normal(change: Colors) -> Colors:
-        def of_view(camera: Camera, view: Photographs) -> Colors:
+        def of_view(camera: Camera, view: Targets) -> Colors:
             return _transpose(model, camera, settings, view.weights * draw_change(model, change, camera, settings))
 
         return over_views(of_view)
@@ -163,11 +163,11 @@ def _check(model: Model, views: Sequence[View]) -> None:
         )
 
 
-def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
+def _stacked(views: Sequence[View], background: Array) -> list[Targets]:
     """Return the views, one stack for each image size, in the dtype of the background."""
     color, dtype = np.asarray(background), background.dtype
     return [
-        Photographs(
+        Targets(
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
             jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
             jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),

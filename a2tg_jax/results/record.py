@@ -27,6 +27,7 @@ from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
+from a2tg_jax.results.finish_options import read_finish
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
@@ -250,8 +251,16 @@ def read_record(run: RunFolder) -> RunRecord:
 
 
 def repeating_command(run: RunFolder) -> str:
-    """Return the command line that repeats a run."""
-    return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", f"{run.path}-again"])
+    """Return the command line that repeats a run, and its finishing if it was finished."""
+
+    def training(out: str) -> str:
+        return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", out])
+
+    if not is_regular(run.finish):
+        return training(f"{run.path}-again")
+    trained = f"{run.path}-trained"
+    finishing = ["a2tg", "finish", trained, "--out", f"{run.path}-again", *read_finish(run).flags]
+    return f"{training(trained)} && {shlex.join(finishing)}"
 
 
 def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:

@@ -125,8 +125,11 @@ def _interrupts_ignored() -> Iterator[None]:
 
 def _begin_worker(shares: Any) -> None:
     """Prepare a process for its first job."""
+    from tqdm import tqdm
+
     import a2tg_jax
 
+    tqdm.set_lock(threading.RLock())  # Its own lock is shared by processes, and one that is ended leaks it.
     threading.Thread(target=_end_with_parent, daemon=True).start()
     cores, gpu = shares.get()
     if cores:
