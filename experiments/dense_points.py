@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from lab import tables
+from lab.interrupts import interruptible
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
@@ -117,4 +118,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with interruptible():
+        main()

@@ -15,6 +15,8 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
+from lab.interrupts import interruptible
+
 ARCHIVES = {
     "https://storage.googleapis.com/gresearch/refraw360/360_v2.zip": "360_v2",
     "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip": ".",
@@ -103,4 +105,5 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with interruptible():
+        main()

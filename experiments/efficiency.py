@@ -18,8 +18,8 @@ from lab.measured import Figures, measured_once
 import a2tg_jax as a2tg
 from a2tg_jax.training import fit_stage
 
-TIMED_ITERATIONS = 150
-TIMED_ROUNDS = 3
+TIMED_ITERATIONS, TIMED_ROUNDS = 150, 3
+SMOKE_ITERATIONS, SMOKE_ROUNDS = 30, 1
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -48,7 +48,8 @@ def _row(result: tables.Result, times: Figures) -> list[str]:
     paces = ", ".join(tables.number(pace, 1) for pace in times["ms_per_step"])
     return [
         result.run.cell.scene.label, result.label, f"{result.record['num']:,}", tables.number(result["mb"], 2),
-        tables.number(times["fps"], 1), tables.number(1e3 / times["fps"], 1), paces, tables.number(minutes, 1),
+        tables.number(times["fps"], 1), tables.number(1e3 / times["fps"], 1), paces,
+        tables.number(minutes, 1 if minutes >= 0.1 else 2),
         times["machine"],
     ]  # fmt: skip
 
@@ -56,10 +57,11 @@ def _row(result: tables.Result, times: Figures) -> list[str]:
 def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
     """Return frames per second on the test views, and the time of a step in each stage, compiled and warm."""
     job = result.run.job
+    rounds = SMOKE_ROUNDS if lab.is_smoke else TIMED_ROUNDS
     scene = lab.folders.load_scene(job)
     jobs = [dataclasses.replace(job, stage=stage) for stage in range(job.stage + 1)]
     return {
-        "fps": max(a2tg.evaluate(scene.test, model).frames_per_second for _ in range(TIMED_ROUNDS)),
+        "fps": max(a2tg.evaluate(scene.test, model).frames_per_second for _ in range(rounds)),
         "ms_per_step": [1e3 * _seconds_per_step(lab, one, scene) for one in jobs],
         "iterations": [one.iterations for one in jobs],
         "machine": jax.devices()[0].device_kind,
@@ -68,10 +70,11 @@ def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
 
 def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
     """Return the time of a step with all Gaussians of the trained stage: the best median of some rounds."""
-    system = dataclasses.replace(job.system, **{f"stage{stage}_iterations": TIMED_ITERATIONS for stage in (1, 2)})
+    iterations, rounds = (SMOKE_ITERATIONS, SMOKE_ROUNDS) if lab.is_smoke else (TIMED_ITERATIONS, TIMED_ROUNDS)
+    system = dataclasses.replace(job.system, **{f"stage{stage}_iterations": iterations for stage in (1, 2)})
     start = a2tg.load_model(lab.folders.model(job if job.stage == 0 else dataclasses.replace(job, stage=0)))
     paces = []
-    for _ in range(TIMED_ROUNDS):
+    for _ in range(rounds):
         history = fit_stage(scene, system, job.stage, start, progress=False).history
         paces.append(float(np.median(np.diff(history.seconds) / np.diff(history.iteration))))
     return min(paces)

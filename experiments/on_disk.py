@@ -148,7 +148,9 @@ def _choices(found: Sequence[tuple[tables.Result, Figures]]) -> str:
     rows = []
     for (group, bits), own in points.items():
         size, train, test = np.mean(own, axis=0)
-        rows.append([group, bits, f"{100 * size:.1f} %", f"{train:+.3f}", f"{test:+.3f}", str(len(own))])
+        rows.append(
+            [group, bits, f"{100 * size:.1f} %", tables.signed(train, 3), tables.signed(test, 3), str(len(own))]
+        )
     return tables.markdown(["group", "kept as", "size", "dB lost, training", "dB lost, test", "models"], rows)
 
 

@@ -28,7 +28,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         size = f"{result.run.cell.budget:g} MB"
         rows.append([result.run.cell.scene.label, size, result.label, f"{found['0']['psnr']:.2f}", *shown])
     if gains:
-        means = [f"{gain:+.2f}" for gain in np.mean(gains, axis=0)]
+        means = [tables.signed(gain, 2) for gain in np.mean(gains, axis=0)]
         rows.append(["*mean*", "", "", "", *means])
     steps = [f"{steps} steps: dB · LPIPS · train dB" for steps in NUM_STEPS]
     header = ["scene", "bytes", "method", "test PSNR", *steps]
@@ -55,8 +55,8 @@ def _quality(lab: Lab, scene: a2tg.Scene, model: a2tg.Model, background) -> dict
 
 
 def _told(after: Mapping[str, float], before: Mapping[str, float]) -> str:
-    psnr, lpips, train = (after[figure] - before[figure] for figure in ("psnr", "lpips", "train"))
-    return f"{psnr:+.2f} · {tables.MISSING if np.isnan(lpips) else f'{lpips:+.3f}'} · {train:+.2f}"
+    digits = {"psnr": 2, "lpips": 3, "train": 2}
+    return " · ".join(tables.signed(after[figure] - before[figure], digits[figure]) for figure in digits)
 
 
 EXPERIMENT = Experiment("polish", ("polish",), present, __doc__)

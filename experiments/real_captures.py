@@ -17,6 +17,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from lab import tables
+from lab.interrupts import interruptible
 from scipy.spatial.transform import Rotation
 
 import a2tg_jax as a2tg
@@ -200,4 +201,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with interruptible():
+        main()

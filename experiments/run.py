@@ -4,8 +4,10 @@
     python experiments/run.py all --scenes SCENES --scale small --lpips-weights lpips_alex.npz
     python experiments/run.py appendix
 
+    python experiments/run.py claim --scene ~/scenes/garden --downscale 4
+
 A stopped call continues when it is called again; finished runs are never run again. `--plan` prints what is left to
-do and about how long it takes.
+do and about how long it takes. docs/sweeps.md says how to write a grid of your own.
 """
 
 import argparse
@@ -15,6 +17,7 @@ from collections.abc import Mapping, Sequence
 
 from lab import pages
 from lab.cli import Experiment, argument_parser, run_experiments
+from lab.interrupts import interruptible
 from lab.standard import STANDARD
 
 MODULES = (
@@ -57,4 +60,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with interruptible():
+        main()

@@ -55,8 +55,9 @@ def _kilobytes(figures: dict[str, Any]) -> str:
 
 
 def _told(after: dict[str, Any], before: dict[str, Any]) -> str:
-    lpips = tables.MISSING if after["lpips"] is None else f"{after['lpips'] - before['lpips']:+.3f}"
-    return f"{_kilobytes(after)} kB: {after['psnr'] - before['psnr']:+.2f} · {lpips}"
+    is_measured = None not in (after["lpips"], before["lpips"])
+    lpips = after["lpips"] - before["lpips"] if is_measured else float("nan")
+    return f"{_kilobytes(after)} kB: {tables.signed(after['psnr'] - before['psnr'], 2)} · {tables.signed(lpips, 3)}"
 
 
 EXPERIMENT = Experiment("shrink", ("shrink",), present, __doc__)

@@ -34,7 +34,9 @@ from a2tg_jax.systems.stage1 import later_stage
 from a2tg_jax.training import Stage, fit_stage
 from a2tg_jax.training.losses import photometric_loss
 
-ITERATIONS = 300
+ITERATIONS, SMOKE_ITERATIONS = 300, 20
+SMOKE_CRITERIA = 2
+"""Number of criteria whose groups are trained at the smoke scale."""
 NUM_PARTS = 4
 """Number of groups in a criterion's order."""
 SEEDS = (0, 1, 2)
@@ -74,12 +76,13 @@ class Trial(a2tg.System):
     """One stage that continues from a model with textures of some rows, or without textures if `rows` is None."""
 
     rows: Any = dataclasses.field(default=None, hash=False)
+    iterations: int = ITERATIONS
 
     def stages(self) -> tuple[Stage, ...]:
         if self.rows is None:
-            return (later_stage(self, "trial", Plain(), (), ITERATIONS),)
+            return (later_stage(self, "trial", Plain(), (), self.iterations),)
         rates = TexelRates(DetailTextureConfig().rate, 0.0)
-        return (later_stage(self, "trial", Textured((0, 0)), (GrowRows(self.rows),), ITERATIONS, rates),)
+        return (later_stage(self, "trial", Textured((0, 0)), (GrowRows(self.rows),), self.iterations, rates),)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -88,13 +91,14 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     found = measured_once(lab, EXPERIMENT.name, grid, _measure, first_stage=True)
     header = ["criterion", *(f"{result.run.cell.scene.label}, {result.run.cell.budget:g} MB" for result, _ in found)]
     ranks = [_rank_correlations(figures) for _, figures in found]
-    rows = [[told, *(f"{own[name]:+.2f}" for own in ranks)] for name, told in CRITERIA.items()]
+    rows = [[told, *(tables.signed(own[name], 2) for own in ranks)] for name, told in CRITERIA.items()]
     gains = [[told, *(_quarters(figures, name) for _, figures in found)] for name, told in CRITERIA.items()]
+    num_groups = max((len(figures["groups"]) for _, figures in found), default=0)
     noise = ", ".join(f"{np.std(figures['without']):.3f}" for _, figures in found)
     parts = [
         f"# {grid.title}",
         f"Rank correlation (Spearman's) of a criterion's mean over a group with the group's gain, over "
-        f"{NUM_PARTS * len(CRITERIA)} groups of a quarter of the Gaussians.\n\n{tables.markdown(header, rows)}",
+        f"{num_groups} groups of a quarter of the Gaussians.\n\n{tables.markdown(header, rows)}",
         "## Gains by quarter\n\ndB on training views, from the quarter that a criterion ranks lowest to its highest. "
         f"The same training from other seeds differs by {noise} dB (standard deviation, without textures).\n\n"
         + tables.markdown(header, gains),
@@ -107,11 +111,12 @@ def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
     scene = lab.folders.load_scene(result.run.job)
     options = result.run.job.system
     system = Trial(**{field.name: getattr(options, field.name) for field in dataclasses.fields(a2tg.System)})
-    system = dataclasses.replace(system, memory_budget=None)
+    iterations = SMOKE_ITERATIONS if lab.is_smoke else ITERATIONS
+    system = dataclasses.replace(system, memory_budget=None, iterations=iterations)
     without = [_quality(scene, model, dataclasses.replace(system, seed=seed)) for seed in SEEDS]
     scores = criteria(model, scene)
     groups = []
-    for name in CRITERIA:
+    for name in list(CRITERIA)[:SMOKE_CRITERIA] if lab.is_smoke else CRITERIA:
         order = np.argsort(scores[name], kind="stable")
         for part, rows in enumerate(np.array_split(order[: len(order) // NUM_PARTS * NUM_PARTS], NUM_PARTS)):
             mask = np.zeros(model.num, bool)
@@ -143,7 +148,8 @@ def _ranks(values: Sequence[float]) -> np.ndarray:
 
 
 def _quarters(figures: Mapping[str, Any], name: str) -> str:
-    return " ".join(f"{group['train']:+.2f}" for group in figures["groups"] if group["criterion"] == name)
+    own = [group["train"] for group in figures["groups"] if group["criterion"] == name]
+    return " ".join(tables.signed(gain, 2) for gain in own) or tables.MISSING
 
 
 def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -19,11 +20,12 @@ from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import compression, run_training
+from a2tg_jax.results import compression, finishing, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.record import SceneSource, read_record
 from a2tg_jax.results.viewing import open_source, routes_of
-from a2tg_jax.training import SYSTEMS
+from a2tg_jax.training import SYSTEMS, find_system
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -147,6 +149,22 @@ def test_help_of_each_command(capsys, name):
     text = capsys.readouterr().out
     assert raised.value.code == 0
     assert text.startswith(f"usage: a2tg {name}") and cli.COMMANDS[name].__doc__.splitlines()[0] in text
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_tells_one_default_of_each_option(capsys, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    options = re.split(r"\n[│ ]*-", capsys.readouterr().out)
+    assert len(options) > 1 and all(option.count("(default:") < 2 for option in options)
+
+
+def test_help_names_every_preset(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    told = capsys.readouterr().out.rpartition("--preset {")[2].partition("--downscale INT")[0]
+    assert all(preset in told for name in SYSTEMS for preset in find_system(name).presets())
 
 
 def test_preset_decides_the_defaults_of_the_numbers():
@@ -390,6 +408,13 @@ def test_resume_refuses_other_numbers(tiny_run, capsys):
     assert "was trained on synthetic" in fails(capsys, "train", run.path, "--out", run.path, "--resume")
 
 
+def test_demo_goes_on_from_what_is_there(tiny_run, capsys):
+    run, *_ = tiny_run
+    assert "--resume" in fails(capsys, "demo", "--out", run.path)
+    assert cli.main(["demo", "--out", str(run.path), "--resume"]) == 0
+    assert "a2tg-textures" in capsys.readouterr().out
+
+
 def test_damaged_model_is_one_clear_line(tiny_run, capsys, tmp_path):
     run, *_ = tiny_run
     copy = RunFolder(shutil.copytree(run.path, tmp_path / "copy"))
@@ -432,12 +457,71 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
     """With the run's photographs; a model of the run by its name."""
     run, *_ = tiny_run
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--photographs"]) == 0
-    assert "dB of PSNR lost, test views" in capsys.readouterr().out
+    assert re.search(r"\d\.\d{3} dB of PSNR (lost|gained), test views\n", capsys.readouterr().out)
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))
     assert decode_web_scene(routes["/scene.a2tgw"].read()).header["num_texels"] is None
     assert json.loads(routes["/photographs.json"].read()) == listed
+
+
+def test_export_for_other_programs(tiny_run, tmp_path, capsys):
+    """Flat 3D Gaussians, which this program's reader takes for what they were; so is the run's own point cloud."""
+    run, *_ = tiny_run
+    assert cli.main(["export", str(run.path), "--ply", str(tmp_path / "new" / "fox.ply")]) == 0
+    assert f"{tmp_path / 'new' / 'fox.ply'}: 60 Gaussians, without their textures" in capsys.readouterr().out
+    for path in (tmp_path / "new" / "fox.ply", run.point_cloud):
+        assert b"property float scale_2\n" in path.read_bytes()
+        assert load_ply(path).num == 60
+    assert "must be the path of a file" in fails(capsys, "export", run.path, "--ply", tmp_path / "fox")
+
+
+def test_finish(tiny_run, tmp_path, monkeypatch, capsys):
+    """A run folder of its own, evaluated anew; the run that it was made of stays as it is. Both steps are stand-ins."""
+    run, *_ = tiny_run
+    kept = {path: path.read_bytes() for path in (run.record, run.metrics, run.model("a2tg-textures"))}
+    small, asked = load_model(run.model("a2tg-gaussians")), []
+
+    def shrink(model, views, *, max_loss):
+        asked.append((max_loss, {view.name for view in views}))
+        return small
+
+    def polish(model, views, *, num_steps):
+        asked.append((num_steps, {view.name for view in views}))
+        return model
+
+    monkeypatch.setattr(finishing, "shrink_textures", shrink)
+    monkeypatch.setattr(finishing, "polish", polish)
+    new = RunFolder(tmp_path / "new")
+    command = ["finish", str(run.path), "--out", str(new.path), "--max-loss", "0.5", "--polish-steps", "2"]
+    assert cli.main(command) == 0
+    names = {view.name for view in read_record(run).scene.load().train}
+    assert [number for number, _ in asked] == [0.5, 2] and asked[0][1] <= names == asked[1][1]
+    assert {path: path.read_bytes() for path in kept} == kept
+    title, sizes, train, *_ = capsys.readouterr().out.splitlines()
+    old = load_model(run.model("a2tg-textures"))
+    assert title.split() == ["before", "shrunk", "polished"]
+    assert sizes.split()[1:] == [f"{model.num_bytes:,}" for model in (old, small, small)]
+    before, after = (json.loads(folder.metrics.read_text())["models"] for folder in (run, new))
+    psnrs = [before["a2tg-textures"], before["a2tg-gaussians"], after["a2tg-textures"]]
+    assert train.split()[3:] == [f"{found['train']['psnr']:.2f}" for found in psnrs]
+    assert after["a2tg-textures"]["num_bytes"] == load_model(new.model("a2tg-textures")).num_bytes == small.num_bytes
+    assert after["gaussians-2d-mcmc-continued"]["sha256"] == before["gaussians-2d-mcmc-continued"]["sha256"]
+    assert json.loads(new.finish.read_text())["sha256"] == sha256_of(run.model("a2tg-textures"))
+    assert read_record(new) == read_record(run) and set(new.written()) >= {"finish.json", "report.html"}
+    again = f"a2tg finish {new.path}-trained --out {new.path}-again --max-loss=0.5 --polish-steps=2"
+    assert again in new.record.read_text()
+    assert cli.main(["info", str(new.path)]) == 0 and again in capsys.readouterr().out
+    assert "is not empty" in fails(capsys, *command)
+
+
+def test_what_polishing_spoils_is_left_out():
+    def steps(*psnrs):
+        return {name: finishing.Measured(1, psnr, None) for name, psnr in psnrs}
+
+    assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 20.1))) == "polished"
+    assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 19.8))) == "shrunk"
+    assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9))) == "shrunk"
 
 
 def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
@@ -464,5 +548,22 @@ def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
 def test_render_without_ffmpeg_says_so(tiny_run, tmp_path, monkeypatch, capsys):
     run, *_ = tiny_run
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert cli.main(["render", str(run.path), "--frames", "1", "--out", str(tmp_path)]) == 0
-    assert "no video: ffmpeg is not installed" in capsys.readouterr().out
+    command = ["render", str(run.path), "--frames", "2", "--out", str(tmp_path), "--size", "48x20", "--fps", "8"]
+    assert cli.main(command) == 0
+    told = capsys.readouterr().out
+    assert "no video: ffmpeg is not installed; install it" in told and f"animation: {tmp_path / 'flight.webp'}" in told
+    with Image.open(tmp_path / "flight.webp") as animation:
+        assert (animation.size, animation.n_frames) == ((48, 20), 2)
+        animation.seek(1)
+        animation.load()
+        assert animation.info["duration"] == 125
+
+
+def test_render_tells_ffmpeg_the_rate(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    monkeypatch.setattr(
+        subprocess, "run", lambda command, **_: asked.append(command) or subprocess.CompletedProcess([], 0)
+    )
+    assert frames.write_video(tmp_path, tmp_path / "flight.mp4", frames_per_second=12)
+    assert asked[0][asked[0].index("-framerate") + 1] == "12"

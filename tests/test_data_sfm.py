@@ -1,10 +1,14 @@
 """Plain photographs to a scene: on renders of the built-in scene, whose cameras are known."""
 
+import contextlib
+import re
+
 import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax.data import load_scene, run_sfm, synthetic_scene
+from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
+from a2tg_jax.data.photo_folder import find_photos
 
 
 def save_photos(folder, num_photos, width, height):
@@ -31,13 +35,37 @@ def test_photographs_become_a_scene(tmp_path):
         run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
 
 
-def test_too_little_in_common(tmp_path):
+def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd):
+    save_photos(tmp_path / "photos", 4, 128, 96)
+    with contextlib.suppress(ValueError):  # The phases count, not what they find.
+        run_sfm(tmp_path / "photos", tmp_path / "scene")
+    lines = capfd.readouterr().err.replace("\r", "\n").splitlines()
+    assert all(re.match(r"(features|matching|mapping|undistorting)\b|$", line) for line in lines)
+    assert any("4/4" in line for line in lines if line.startswith("features"))
+    assert any(line.startswith("matching 6 pairs: 00:0") for line in lines)
+
+
+def test_too_little_in_common(tmp_path, capfd):
     (tmp_path / "photos").mkdir()
     for index in range(3):
         noise = np.random.default_rng(index).integers(0, 255, (64, 64, 3), np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.png")
     with pytest.raises(ValueError, match="only 0 of 3 photographs could be placed"):
         run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
+    assert capfd.readouterr().err == ""
+
+
+def test_failure_says_what_to_do(tmp_path):
+    with pytest.raises(ValueError, match=r"overlap.*take more of them.*texture") as told:
+        sfm._check_model(None, 300, tmp_path, "exhaustive")
+    assert "sequential" not in str(told.value)
+    with pytest.raises(ValueError, match="matching exhaustive"):
+        sfm._check_model(None, 300, tmp_path, "sequential")
+
+
+def test_matching_is_chosen(tmp_path):
+    with pytest.raises(ValueError, match="matching must be one of auto"):
+        run_sfm(tmp_path, tmp_path / "scene", matching="all")
 
 
 def test_no_photographs(tmp_path):
@@ -46,6 +74,32 @@ def test_no_photographs(tmp_path):
     (tmp_path / "photos").mkdir()
     with pytest.raises(ValueError, match="holds 0 photographs"):
         run_sfm(tmp_path / "photos", tmp_path / "scene")
+
+
+@pytest.mark.parametrize(
+    "names, words",
+    [
+        (["a.HEIC", "b.heic", "c.jpg"], ["holds 1 photographs", "2 .heic", "read: .jpg,", "mogrify -format jpg"]),
+        (["a/clip.MOV"], ["holds 0 photographs", "1 .mov", "ffmpeg -i"]),
+        (["notes", ".DS_Store"], ["1 without suffix;"]),
+        (["a.heic", "b.png", "c.png", "d.png", "notes.txt"], ["Skipped: 1 .heic;"]),
+    ],
+)
+def test_what_is_skipped_is_counted(tmp_path, names, words):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError) if len(names) < 4 else pytest.warns(UserWarning) as told:
+        find_photos(tmp_path)
+    text = str(told.value if len(names) < 4 else told[0].message)
+    assert all(word in text for word in words)
+
+
+@pytest.mark.parametrize("read", [find_photos, load_scene])
+def test_a_video_is_told_how_to_become_photographs(tmp_path, read):
+    (tmp_path / "a clip.mp4").touch()
+    with pytest.raises(ValueError, match=r"is a video; .*ffmpeg -i '.*a clip\.mp4' -vf fps=2"):
+        read(tmp_path / "a clip.mp4")
 
 
 def test_unreadable_photograph_is_named(tmp_path):

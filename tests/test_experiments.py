@@ -1,21 +1,28 @@
 """The experiments: grids name the runs that they should, a queue trains each once, tables say what is so."""
 
 import concurrent.futures
+import csv
 import dataclasses
 import json
 import pathlib
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 
+import efficiency
 import equal_bytes
 import numpy as np
+import polish
 import pytest
-from lab import pages, queue, tables
+import shrink
+import upscale_gains
+from lab import pages, queue, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
-from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, read_grid, splats_in
+from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, own_scene, read_grid, splats_in
+from lab.interrupts import interruptible
 from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
 from lab.plan import duration, plan_of, seconds_of_step
 from run import experiments
@@ -87,6 +94,52 @@ def test_scenes_are_chosen_and_held_out():
     assert "snowmiku" not in {cell.scene.label for cell in read_grid("defaults", "small").cells}
     with pytest.raises(ValueError, match="no scene 'dog' at this scale; there are"):
         labels(scenes=["dog"])
+
+
+def test_scenes_of_ones_own_take_the_place_of_the_scales(tmp_path):
+    (tmp_path / "garden").mkdir()
+    own = own_scene(tmp_path / "garden", 4)
+    grid = read_grid("claim", "small", own=(own,))
+    assert {cell.scene for cell in grid.cells} == {SceneAt("garden", (tmp_path / "garden").as_posix(), 4)}
+    assert Folders(pathlib.Path("scenes"), tmp_path).scenes / own.path == tmp_path / "garden"
+    lab = Lab(argument_parser("").parse_args(["--scene", str(tmp_path / "garden"), "--out", str(tmp_path / "out")]))
+    assert lab.is_partial and {cell.scene.label for cell in lab.grid("claim").cells} == {"garden"}
+    with pytest.raises(ValueError, match="no scene folder"):
+        own_scene(tmp_path / "nowhere", 1)
+    with pytest.raises(ValueError, match="at least 1"):
+        own_scene(tmp_path / "garden", 0)
+
+
+def test_a_scale_may_have_fewer_methods():
+    small, smoke = (read_grid("defaults", scale) for scale in ("small", "smoke"))
+    assert len(small.methods) > 10 and [method.label for method in smoke.methods] == small_ends(small.methods)
+
+
+def small_ends(methods):
+    """The first and the last label."""
+    return [methods[0].label, methods[-1].label]
+
+
+def test_the_grid_of_the_documentation_can_be_read(tmp_path, monkeypatch):
+    page = (EXPERIMENTS.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    for name in ("methods", "scales"):
+        shutil.copy(GRIDS / f"{name}.toml", tmp_path)
+    (tmp_path / "my_rates.toml").write_text(text.replace("my_systems:Variant", "a2tg"), encoding="utf-8")
+    monkeypatch.setattr("lab.grid.GRIDS", tmp_path)
+    small, smoke = (read_grid("my_rates", scale) for scale in ("small", "smoke"))
+    assert (len(small.cells), len(smoke.cells)) == (4, 1)
+    rates = [run.job.system.texture.rate for run in small.runs({})][:3]
+    assert rates == [a2tg.A2tg.preset("quick").texture.rate, 5e-3, 1e-2]
+
+
+def test_the_smoke_scale_has_few_runs():
+    """It takes minutes on two cores, where each run is mostly compilation."""
+    jobs: set[str] = set()
+    for name in NAMES:
+        for job in read_grid(name, "smoke").jobs({}):
+            jobs |= {job.key, *([job.start.key] if job.start else [])}
+    assert len(jobs) <= 24
 
 
 def test_a_fingerprint_is_of_what_decides_the_result():
@@ -440,6 +493,46 @@ def test_lpips_without_weights_is_a_dash_in_every_table():
     for text in texts:
         assert "nan" not in text
         assert f"· {tables.MISSING}" in text or f"/ {tables.MISSING}" in text
+
+
+def test_figures_that_are_missing_are_dashes_in_pages_of_models():
+    nan = float("nan")
+    figures = {"psnr": 20.0, "lpips": nan, "train": 21.0}
+    assert polish._told(figures, figures) == "+0.00 · – · +0.00"
+    sizes = {"bytes": 1000, "texels": 10, "psnr": 20.0, "lpips": None}
+    assert shrink._told(sizes, {**sizes, "lpips": 0.1}).endswith(": +0.00 · –")
+    group = {"criterion": "paper", "train": nan, "scores": {}}
+    assert upscale_gains._quarters({"groups": [group]}, "paper") == tables.MISSING
+
+
+def test_short_times_are_not_zero():
+    times = {"fps": 10.0, "ms_per_step": [12.0, 10.0], "iterations": [60, 40], "machine": "cpu"}
+    assert efficiency._row(result("own", 20.0), times)[-2] == "0.02"
+    assert efficiency._row(result("own", 20.0), {**times, "iterations": [6000, 4000]})[-2] == "1.9"
+    assert duration(59) == "less than a minute"
+
+
+def test_finished_runs_are_rows_of_a_spreadsheet():
+    text = spreadsheet.rows_text([("claim", result("own, equal", 25.0, lpips=None))])
+    header, row = csv.reader(text.splitlines())
+    found = dict(zip(header, row, strict=True))
+    assert (found["grid"], found["scene"], found["method"], found["psnr"]) == ("claim", "fox", "own, equal", "25.0")
+    assert found["lpips"] == found["budget_mb"] == "" and found["gaussians"] == "100"
+
+
+def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["run.py", "claim", "--scenes", "my scenes"])
+    with pytest.raises(SystemExit) as ended, interruptible():
+        raise KeyboardInterrupt
+    told = capsys.readouterr().err.strip()
+    assert ended.value.code == 130 and told.count("\n") == 0
+    assert told.endswith("run.py claim --scenes 'my scenes'")
+
+
+def test_processes_begin_without_ctrl_c():
+    with queue._interrupts_ignored():
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_experiments_and_benchmarks_have_one_writer_of_tables():

@@ -2,10 +2,13 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
+from typing import ClassVar
 
 import jax
 import numpy as np
 import pytest
+from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
@@ -14,16 +17,20 @@ from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.jit import classes_of
 from a2tg_jax.data import Picture
 from a2tg_jax.host import memory
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
     RunForecast,
     allowed_memory,
     bytes_allowed,
     forecast_run,
+    quick_downscale,
+    quicker_text,
     room_for_photographs,
     tell_forecast,
 )
 from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, progress
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
@@ -32,6 +39,18 @@ from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
 
 MB = 10**6
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Capped(Toy):
+    """A toy whose growth has an option of its own."""
+
+    most: int = 50
+    event_options: ClassVar[Mapping[str, str]] = {"Mcmc.cap": "most"}
+
+    def stages(self) -> tuple[a2tg.Stage, ...]:
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(*stage.events, Mcmc(self.most))),)
 
 
 def scene_of(width, height, num_views=4):
@@ -120,7 +139,7 @@ def test_photographs_on_disk_take_what_is_read_ahead():
 
 
 def forecast_with(**sizes):
-    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0)
+    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0, ("densify.cap",))
 
 
 @pytest.mark.parametrize(
@@ -138,6 +157,43 @@ def test_what_does_not_fit_is_refused_with_the_option_to_change(name, option):
     with pytest.raises(ValueError, match=rf"5.0 GB of memory \(a-gaussians: .*4.0 GB may be used: change .*{option}"):
         found.check(4e9)
     found.check(5.1e9)
+
+
+@pytest.mark.parametrize(
+    "system, option",
+    [
+        (a2tg.A2tg(), "change --densify.cap, --memory-budget or"),
+        (a2tg.A2tg(memory_budget="90MB"), "change --memory-budget or"),
+        (Toy(), "change --initial-gaussians, --memory-budget or"),
+        (Capped(), "change --most, --memory-budget or"),
+    ],
+)
+def test_a_system_names_its_own_limit(system, option):
+    found = dataclasses.replace(forecast_with(model=5e9), limits=system.limits())
+    with pytest.raises(ValueError, match=option):
+        found.check(4e9)
+    assert run_of(scene_of(24, 16), system).limits == system.limits()
+
+
+@pytest.mark.parametrize(
+    "preset, size, flags",
+    [
+        ("paper", (1600, 1067), "--preset quick --downscale 6"),
+        ("paper", (320, 213), "--preset quick --downscale 2"),
+        ("quick", (3200, 2133), "--preset quick --downscale 10"),
+        ("quick", (320, 213), None),
+    ],
+)
+def test_a_long_run_is_told_what_is_quicker(monkeypatch, preset, size, flags):
+    monkeypatch.setattr("a2tg_jax.training.cost.num_threads", lambda: 2)
+    record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
+    text = quicker_text(scene_of(*size), record)
+    assert (text == "") == (flags is None)
+    assert flags is None or (f"quicker: {flags} takes very roughly " in text and " h" not in text)
+
+
+def test_the_downscale_of_quick_runs():
+    assert [quick_downscale(side) for side in (100, 640, 641, 4000)] == [1, 1, 2, 7]
 
 
 def test_what_is_told():

@@ -19,7 +19,7 @@ from a2tg_jax import (
     render_image,
     textures_from_arrays,
 )
-from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.cameras import Camera, crop_camera, resize_camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.data import View
 from a2tg_jax.renderer import _jitted_draw
@@ -129,3 +129,13 @@ def test_plan_with_a_rule_and_head_room():
         plan_render(cloud(), [])
     with pytest.raises(ValueError, match="give it, or textures and layout"):
         plan_render(cloud(), camera, *textures_from_arrays(np.ones((300, 1, 1, 4))), rule=rule)
+
+
+def test_a_cropped_view_keeps_its_centre_and_proportions():
+    K = np.array([[30.0, 0, 25], [0, 28.0, 14], [0, 0, 1]], np.float32)
+    camera = Camera(jnp.eye(4), jnp.asarray(K), 48, 32)
+    for width, height, factor in ((96, 30, 2), (20, 64, 2), (24, 16, 0.5)):
+        cropped = crop_camera(camera, width, height)
+        assert (cropped.width, cropped.height) == (width, height)
+        expected = factor * K[:2] + [[0, 0, (width - factor * 48) / 2], [0, 0, (height - factor * 32) / 2]]
+        np.testing.assert_allclose(cropped.K[:2], expected, rtol=1e-6)

@@ -272,6 +272,14 @@ def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
     assert (a2tg, again.record, again.out) == ("a2tg", record, tmp_path / "run c-again")
 
 
+def test_record_names_the_options_that_a_budget_replaces(tmp_path):
+    for name, budget in (("with", 1.5), ("without", None)):
+        run = create_run(tmp_path / name)
+        write_record(run, dataclasses.replace(RECORD, system=dataclasses.replace(RECORD.system, memory_budget=budget)))
+        note = "# options.memory_budget decides in place of options.densify.cap\n"
+        assert (note in run.record.read_text()) == (budget is not None)
+
+
 def test_changed_numbers_are_named():
     larger = dataclasses.replace(RECORD.system.texture, cap=8)
     changed = dataclasses.replace(RECORD.system, seed=3, texture=larger)

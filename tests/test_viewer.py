@@ -25,7 +25,7 @@ from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, routes_of
-from a2tg_jax.results.web_export import export_web, exported_text
+from a2tg_jax.results.web_export import export_web, exported_text, loss_told
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, served
 
@@ -285,6 +285,11 @@ def test_a_folder_and_a_single_file(tmp_path):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out --single-file"):
         export_web(source, tmp_path / "with.html", photographs=True, single_file=True)
+
+
+def test_a_gain_is_not_called_a_loss():
+    assert loss_told(0.0671) == "0.067 dB of PSNR lost"
+    assert loss_told(-0.0671) == "0.067 dB of PSNR gained"
 
 
 def test_a_page_of_someone_else_is_not_replaced(tmp_path):

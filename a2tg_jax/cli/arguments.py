@@ -1,18 +1,35 @@
 """Command-line arguments parsed into a dataclass by tyro, with every error on one line."""
 
 import contextlib
+import difflib
 import io
 import os
 import re
-from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Annotated, Any, TypeVar
 
 import tyro
+from tyro.conf import arg
 
 Parsed = TypeVar("Parsed")
 
 WIDE = "1000"
 """Terminal width at which no error message is wrapped."""
+UNRECOGNIZED = "Unrecognized options: "
+LEAST_LIKENESS = 0.75
+"""Smallest similarity, of 1, of an unknown flag and one that is suggested instead."""
+NEARLY_AS_LIKE = 0.05
+"""Difference in similarity from the likest flag up to which others are suggested as well."""
+MOST_SUGGESTED = 3
+
+
+def defaulting_to(text: str) -> Any:
+    """Return the annotation of an option whose help tells its default in words, in place of None."""
+    return arg(help_behavior_hint=f"(default: {text})")
+
+
+LastModel = Annotated[str | None, defaulting_to("the last model of the main system")]
+"""Name of a model of a run; None: the last one of its main system."""
 
 
 def parse(kind: type[Parsed], program: str, arguments: Sequence[str], **options: Any) -> Parsed:
@@ -36,11 +53,13 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], **options:
     except SystemExit as end:
         if not end.code:
             raise
-        raise ValueError(f"{one_line(errors.getvalue())} (see {program} --help)") from None
+        told = one_line(errors.getvalue())
+    suggested = _suggested(told, kind, options) if told.startswith(UNRECOGNIZED) else ""
+    raise ValueError(f"{told}{suggested} (see {program} --help)")
 
 
 def one_line(box: str) -> str:
-    """Return the first message of a tyro error and the flags it suggests, without title, frame and colours."""
+    """Return the first message of a tyro error, without title, frame and colours."""
     lines = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╰╮╯ ") for line in box.splitlines()]
     parts: list[list[str]] = [[]]
     for line in [line for line in lines if line][1:]:
@@ -48,11 +67,41 @@ def one_line(box: str) -> str:
             parts[-1].append(line)
         else:
             parts.append([])
-    said, *others = [part for part in parts if part] or [[box]]
-    suggested = [part for part in others if part[0].startswith("Perhaps")]
-    flags = [re.split(r"[ ,]", line)[0] for part in suggested for line in part if line.startswith("--")]
-    told = " ".join(" ".join(said).split()).rstrip(".")
-    return f"{told}; did you mean {' or '.join(flags)}?" if flags else told
+    said, *_ = [part for part in parts if part] or [[box]]
+    return " ".join(" ".join(said).split()).rstrip(".")
+
+
+def nearest(flag: str, known: Iterable[str]) -> list[str]:
+    """Return the known flags most like an unknown one, as a whole or by their last words, the likest first."""
+    likeness = {name: max(_likeness(flag, tail) for tail in _tails(name)) for name in known}
+    least = max(LEAST_LIKENESS, max(likeness.values(), default=0.0) - NEARLY_AS_LIKE)
+    near = sorted((name for name in likeness if likeness[name] >= least), key=lambda name: -likeness[name])
+    return near[:MOST_SUGGESTED]
+
+
+def _likeness(flag: str, tail: str) -> float:
+    return difflib.SequenceMatcher(None, flag.removeprefix("--"), tail).ratio()
+
+
+def _tails(name: str) -> list[str]:
+    """Return a flag without its dashes, and what follows each of its dots and dashes."""
+    words = name.removeprefix("--")
+    return [words, *(words[match.end() :] for match in re.finditer(r"[.-]", words))]
+
+
+def _suggested(told: str, kind: type, options: dict[str, Any]) -> str:
+    """Return "; did you mean FLAG?" for the first unrecognised option; empty if none is near."""
+    unknown = [word for word in told.removeprefix(UNRECOGNIZED).split(", ") if word.startswith("--")]
+    near = nearest(unknown[0].partition("=")[0], _flags(kind, options)) if unknown else []
+    return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
+def _flags(kind: type, options: dict[str, Any]) -> list[str]:
+    """Return every flag of a command, as its help lists them."""
+    text = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(text):
+        tyro.cli(kind, args=["--help"], **options)
+    return re.findall(r"^[│ ]*(--[\w.-]+)", text.getvalue(), flags=re.MULTILINE)
 
 
 @contextlib.contextmanager

@@ -1,9 +1,8 @@
-"""The command line `a2tg`: demo, train, eval, render, view, export, compress, info, sfm."""
+"""The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm."""
 
 import dataclasses
 import inspect
 import os
-import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -13,19 +12,20 @@ from typing import Annotated, Any, TextIO
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import parse
+from a2tg_jax.cli.arguments import defaulting_to, parse
+from a2tg_jax.cli.finish import Finish
+from a2tg_jax.cli.render import Render
+from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
-from a2tg_jax.data import run_sfm
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
-from a2tg_jax.results.frames import Route, render_frames, write_video
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.lock import opened
-from a2tg_jax.results.preflight import check_apart, check_weights
+from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.whole_run import measure
 from a2tg_jax.training import SYSTEMS
 
@@ -38,11 +38,14 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
 
   a2tg demo                            train a built-in scene, about a minute on two cores
   a2tg sfm photos/ scene/              find camera poses for plain photographs with COLMAP
-  a2tg train scene/ --out runs/scene   train a scene, evaluate it, write a report
+  a2tg train scene/ --out runs/scene --preset quick --downscale 4
+                                       train a scene in minutes, evaluate it, write a report
   a2tg eval runs/scene                 evaluate a run again
+  a2tg finish runs/scene --out runs/f  shrink and polish the trained model, in a new run folder
   a2tg render runs/scene               render frames and a video of a flight, or the test views
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
+  a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
   a2tg compress runs/scene             write a small file of the trained model
   a2tg info runs/scene                 print what a run folder holds
 
@@ -74,40 +77,6 @@ class Eval:
 
 
 @dataclasses.dataclass(frozen=True)
-class Render:
-    """Render frames of a finished run as PNG files.
-
-    A flight also becomes a video if ffmpeg is installed. The photographs are not needed.
-
-    Examples:
-      a2tg render runs/fox --frames 240
-      a2tg render runs/fox --path test --out fox-test
-      a2tg render runs/fox --path path.json --out fox-flight
-    """
-
-    folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Run folder."""
-    path: Route | Path = "smooth"
-    """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
-    frames: int = 120
-    """Number of frames of the flight, at 30 frames per second."""
-    out: Path | None = None
-    """Output folder (default: RUN/frames)."""
-    model: str | None = None
-    """Name of the model, as a2tg info prints it (default: the last model of the main system)."""
-
-    def run(self) -> None:
-        run = open_run(self.folder)
-        out = self.out or run.path / "frames"
-        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model)
-        print(f"{len(paths)} frames in {out}")
-        if self.path != "test":
-            video = out / "flight.mp4"
-            made = write_video(out, video)
-            print(f"video: {video}" if made else "no video: ffmpeg is not installed")
-
-
-@dataclasses.dataclass(frozen=True)
 class Compress:
     """Write the smallest file of a model within a given loss of PSNR.
 
@@ -121,8 +90,8 @@ class Compress:
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
     """Model file (*.npz), or run folder, whose last model is taken."""
-    out: Path | None = None
-    """Output file (default: NAME.a2tgz beside the model)."""
+    out: Annotated[Path | None, defaulting_to("NAME.a2tgz beside the model")] = None
+    """Output file."""
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
 
@@ -143,31 +112,9 @@ class Info:
         print(describe_run(open_run(self.folder)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Sfm:
-    """Find camera poses and sparse points for plain photographs.
-
-    COLMAP extracts features, matches them and maps the scene.
-
-    Example:
-      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox
-    """
-
-    photos: Positional[Path]
-    """Folder of photographs of one scene."""
-    out: Positional[Path]
-    """New scene folder for the images and the sparse model, ready for a2tg train."""
-
-    def run(self) -> None:
-        check_apart(self.out, self.photos)
-        found = run_sfm(self.photos, self.out)
-        print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
-        print(f"scene: {self.out}; continue with: a2tg train {shlex.quote(str(self.out))} --out runs/{self.out.name}")
-
-
-Command = Demo | Train | Eval | Render | View | Export | Compress | Info | Sfm
+Command = Demo | Train | Eval | Finish | Render | View | Export | Compress | Info | Sfm
 COMMANDS: dict[str, type] = {
-    "demo": Demo, "train": Train, "eval": Eval, "render": Render, "view": View, "export": Export,
+    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "view": View, "export": Export,
     "compress": Compress, "info": Info, "sfm": Sfm,
 }  # fmt: skip
 
@@ -187,7 +134,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(version("a2tg-jax") if name == "--version" else OVERVIEW)
         return 0
     if name not in COMMANDS:
-        return _fail(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
+        told = f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}"
+        return _fail(told + did_you_mean(name, COMMANDS))
     try:
         configure_cpu()
     except ValueError as error:

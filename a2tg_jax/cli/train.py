@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
+from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
@@ -52,10 +53,18 @@ class Demo:
 
     out: Path = Path("runs/demo")
     """Run folder."""
+    resume: bool = False
+    """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
 
     def run(self) -> None:
+        if self.resume:
+            _check_resumed_only(self.overwrite)
+            with opened(self.out) as run:
+                scene = read_record(run).scene.load()
+                tell_result(go_on(run, scene, session=tidy_session()), self.out)
+            return
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
         tell_result(begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session()), self.out)
 
@@ -83,8 +92,9 @@ class Train:
     """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
     system: str = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
-    preset: str | None = None
-    """Preset of the options below: paper (default), quick (minutes on two cores) or smoke (half a minute)."""
+    preset: Annotated[str | None, defaulting_to("paper")] = None
+    """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
+    (the conventions of the authors' program)."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8
@@ -106,9 +116,9 @@ class Train:
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
     view: bool = False
     """Show the training in a browser, where you can pause it."""
-    max_memory: str | None = None
-    """Memory limit of the process and of the GPU, such as 8GB or 800MB (default: all available). Training refuses to
-    start if it needs more. Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
+    max_memory: Annotated[str | None, defaulting_to("all available")] = None
+    """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training refuses to start if it needs more.
+    Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
@@ -126,8 +136,7 @@ class Train:
             )
             tell_result(result, self.out)
             return
-        if self.overwrite:
-            raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
+        _check_resumed_only(self.overwrite)
         check_weights(weights)
         with opened(self.out) as run:
             record = self._resumed(run)
@@ -195,6 +204,12 @@ def _value_of(flag: str, arguments: list[str]) -> str:
         if word.startswith(flag + "="):
             return word.split("=", 1)[1]
     return ""
+
+
+def _check_resumed_only(overwrite: bool) -> None:
+    """Raise ValueError if a run that is resumed is to be replaced as well."""
+    if overwrite:
+        raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
 
 
 def tidy_session() -> Session:

@@ -8,9 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.live import shown_live
+from a2tg_jax.results.ply_export import export_ply
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
 from a2tg_jax.training.loop import Watch
@@ -32,8 +34,8 @@ class View:
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
-    model: str | None = None
-    """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
+    model: LastModel = None
+    """Name of a run's model, as a2tg info prints it."""
     host: str = LOOPBACK
     """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi. Anyone who has the
     printed address, which contains a random token, can see the scene; the connection is not encrypted."""
@@ -54,31 +56,40 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a page that shows a scene in any browser.
+    """Write a page that shows a scene in any browser, or a PLY file for other programs.
 
-    The page is a folder for a web server, or one HTML file that opens from the disk.
+    The page is a folder for a web server, or one HTML file that opens from the disk. The PLY file holds the Gaussians
+    in the original world as programs for 3DGS read them, flat, without textures.
 
     Examples:
       a2tg export runs/fox --web site/fox
       a2tg export runs/fox --web fox.html --single-file
+      a2tg export runs/fox --ply fox.ply
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
-    web: Path
-    """Output folder, or output file with --single-file."""
+    web: Path | None = None
+    """Output folder of the page, or output file with --single-file."""
+    ply: Path | None = None
+    """Output file of the Gaussians."""
     single_file: bool = False
     """Write one HTML file that needs no other."""
     photographs: bool = False
     """Put the photographs of the run's cameras beside the page."""
-    model: str | None = None
-    """Name of a run's model, as a2tg info prints it (default: the last model of the main system)."""
+    model: LastModel = None
+    """Name of a run's model, as a2tg info prints it."""
 
     def run(self) -> None:
+        if self.web is None and (self.ply is None or self.single_file or self.photographs):
+            raise ValueError("a page needs --web PATH, and a file for other programs --ply PATH")
         source = open_source(self.source, self.model)
-        result = export_web(source, self.web, single_file=self.single_file, photographs=self.photographs)
-        print(exported_text(result))
-        print(f"page: {result.path}")
+        if self.ply is not None:
+            print(export_ply(source, self.ply))
+        if self.web is not None:
+            result = export_web(source, self.web, single_file=self.single_file, photographs=self.photographs)
+            print(exported_text(result))
+            print(f"page: {result.path}")
 
 
 def in_browser(scene: Scene) -> AbstractContextManager[Watch]:

@@ -102,3 +102,15 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     dtype = camera.K.dtype
     factors = jnp.asarray([[width / camera.width], [height / camera.height], [1.0]], dtype)
     return Camera(camera.viewmat, camera.K * factors, width, height)
+
+
+def crop_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return the same view at another image size and aspect: scaled to cover it, and cropped around its centre."""
+    factor = max(width / camera.width, height / camera.height)
+    scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
+    shift = (
+        jnp.zeros((3, 3), camera.K.dtype)
+        .at[:2, 2]
+        .set(jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype))
+    )
+    return Camera(camera.viewmat, scaled.K + shift, width, height)

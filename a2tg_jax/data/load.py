@@ -6,6 +6,7 @@ from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
+from a2tg_jax.data.photo_folder import check_no_video
 from a2tg_jax.data.scene import Scene, check_test_every
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.host.regular_files import is_regular
@@ -59,6 +60,7 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
     options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room}
+    check_no_video(path)
     if is_regular(path):
         return load_transforms(path, **options)
     if find_model(path) is not None:

@@ -40,8 +40,8 @@ class Colors(NamedTuple):
     """[capacity, Tv, Tu, 3] of each bucket of textures."""
 
 
-class Photographs(NamedTuple):
-    """V views of one image size, stacked."""
+class Targets(NamedTuple):
+    """Photographs over the background, of V views of one image size, with the weights of their pixels."""
 
     viewmats: Array
     Ks: Array
@@ -83,7 +83,7 @@ def _jitted() -> Jitted[..., Colors]:
 
 def _solve(
     model: Model,
-    groups: list[Photographs],
+    groups: list[Targets],
     background: Array,
     settings: RenderSettings,
     num_steps: int,
@@ -91,25 +91,25 @@ def _solve(
 ) -> Colors:
     """Return the changes of the colours."""
 
-    def over_views(function: Callable[[Camera, Photographs], Colors]) -> Colors:
+    def over_views(function: Callable[[Camera, Targets], Colors]) -> Colors:
         """Return the sum over all views of a function of camera and photograph."""
         total: Colors = jax.tree.map(jnp.zeros_like, colors_of(model))
         for group in groups:
             height, width = group.images.shape[1:3]
 
-            def step(total: Colors, view: Photographs, height: int = height, width: int = width) -> tuple[Colors, None]:
+            def step(total: Colors, view: Targets, height: int = height, width: int = width) -> tuple[Colors, None]:
                 camera = Camera(view.viewmats, view.Ks, width, height)
                 return jax.tree.map(jnp.add, total, function(camera, view)), None
 
             total, _ = jax.lax.scan(step, total, group)
         return total
 
-    def right(camera: Camera, view: Photographs) -> Colors:
+    def right(camera: Camera, view: Targets) -> Colors:
         residual = view.images - _drawn(model, camera, background, settings)
         return _transpose(model, camera, settings, view.weights * residual)
 
     def normal(change: Colors) -> Colors:
-        def of_view(camera: Camera, view: Photographs) -> Colors:
+        def of_view(camera: Camera, view: Targets) -> Colors:
             return _transpose(model, camera, settings, view.weights * draw_change(model, change, camera, settings))
 
         return over_views(of_view)
@@ -173,11 +173,11 @@ def _check(model: Model, views: Sequence[View]) -> None:
         )
 
 
-def _stacked(views: Sequence[View], background: Array) -> list[Photographs]:
+def _stacked(views: Sequence[View], background: Array) -> list[Targets]:
     """Return the views, one stack for each image size, in the dtype of the background."""
     color, dtype = np.asarray(background), background.dtype
     return [
-        Photographs(
+        Targets(
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
             jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
             jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),

@@ -60,17 +60,21 @@ def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.
             return model
 
 
+def can_shrink(model: Model) -> bool:
+    """Return whether the model has textures that can shrink: signed RGB and projected alpha."""
+    options = model.appearance.texture_options if model.appearance.is_portable else None
+    return options is not None and options.rgb == "signed" and options.alpha == "projected"
+
+
 def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
     if not views:
         raise ValueError("views must hold at least one view; got none")
     if not max_loss >= 0:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
-    appearance = model.appearance
-    options = appearance.texture_options if appearance.is_portable else None
-    if options is None or options.rgb != "signed" or options.alpha != "projected":
+    if not can_shrink(model):
         raise ValueError(
-            f"{type(appearance.base).__name__} has no textures that can shrink: Textured with signed RGB and projected "
-            "alpha, or Banded around it, has"
+            f"{type(model.appearance.base).__name__} has no textures that can shrink: Textured with signed RGB and "
+            "projected alpha, or Banded around it, has"
         )
 
 

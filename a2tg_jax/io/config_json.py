@@ -1,13 +1,12 @@
 """Configuration dataclasses as JSON-able dictionaries, and back."""
 
 import dataclasses
-import difflib
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 
 ConfigT = TypeVar("ConfigT")
 LARGEST_INTEGER = 2**64
@@ -42,7 +41,7 @@ def config_from_dict(
     for name in data:
         if name not in names:
             raise ValueError(
-                f"{_within(where, shortened(name))} is not a field of {kind.__name__}; {_instead(name, names)}"
+                f"{_within(where, shortened(name))} is not a field of {kind.__name__}{_instead(name, names)}"
             )
     optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
@@ -63,8 +62,7 @@ def _within(where: str, name: str) -> str:
 
 
 def _instead(name: str, names: list[str]) -> str:
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"did you mean {close[0]}?" if close else f"it has {', '.join(names)}"
+    return did_you_mean(name, names) or f"; it has {', '.join(names)}"
 
 
 def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:

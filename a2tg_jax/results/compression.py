@@ -133,4 +133,4 @@ def compression_text(result: Compressed) -> str:
 
 
 def _figures(trial: Trial) -> list[str]:
-    return [f"{trial.num_bytes:,}", *(f"{loss:+.3f}" for loss in trial.losses)]
+    return [f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)]

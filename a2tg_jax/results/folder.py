@@ -13,6 +13,7 @@
       point_cloud.ply            the Gaussians in the original world
       viewer.html                the model in a browser, on one page
       report.html                all of it on one page
+      finish.json                from which run and how a2tg finish made the main model
       diverged/NAME-*.npz        the state before a step whose numbers were not finite, a checkpoint
       .a2tg-old/                 the run that this one replaces, until this one has its report
 
@@ -120,6 +121,10 @@ class RunFolder:
     @property
     def per_view(self) -> Path:
         return self.path / "per_view.json"
+
+    @property
+    def finish(self) -> Path:
+        return self.path / "finish.json"
 
     @property
     def point_cloud(self) -> Path:

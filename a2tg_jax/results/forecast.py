@@ -12,6 +12,7 @@ from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import System
 from a2tg_jax.training.cost import (
     COMPILER,
@@ -25,6 +26,7 @@ from a2tg_jax.training.cost import (
     StageForecast,
     forecast_stages,
     held_bytes,
+    iteration_seconds,
     largest_view,
 )
 
@@ -38,14 +40,20 @@ PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
 ROUGHLY = 2.0
 """Factor by which the time may be shorter or longer."""
+LONG = 1800
+"""Seconds beyond which a forecast names a quicker way to train."""
+QUICK = "quick"
+"""Preset of short runs."""
+QUICK_SIDE = 640
+"""Longer side of the photographs, in pixels, with which `quick` takes minutes on two cores."""
 OPTIONS = {
     "program": "--max-memory, for the program itself takes most",
     "photographs": "--downscale, or --batch-size",
-    "model": "--densify.cap, --memory-budget or --sh-degree",
-    "gradients": "--densify.cap, --memory-budget, --batch-size or --sh-degree",
+    "model": "{limits}, --memory-budget or --sh-degree",
+    "gradients": "{limits}, --memory-budget, --batch-size or --sh-degree",
     "pixels": "--downscale",
 }
-"""Options to change, by what needs most of the memory."""
+"""Options to change, by what needs most of the memory; `limits` are those of the systems' number of Gaussians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +66,8 @@ class RunForecast:
     """Bytes in the run folder."""
     seconds: float
     """Training time on CPUs; 0 if it cannot be estimated."""
+    limits: tuple[str, ...] = ()
+    """Names of the options that limit the number of Gaussians."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -73,10 +83,9 @@ class RunForecast:
             f"disk: about {_told(self.disk_bytes)} in the run folder",
         ]
         if self.seconds:
-            least, most = (_duration(self.seconds * factor) for factor in (1 / ROUGHLY, ROUGHLY))
             cores = num_threads()
             lines.append(
-                f"time: very roughly {least} to {most} of training on {cores} core{'s' if cores > 1 else ''}; "
+                f"time: very roughly {_between(self.seconds)} of training on {cores} core{'s' if cores > 1 else ''}; "
                 "the first steps of each stage tell it better"
             )
         return "\n".join(lines)
@@ -97,8 +106,13 @@ class RunForecast:
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
         raise ValueError(
             f"the run would need about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
-            f"used: change {OPTIONS[largest]}, or allow more with --max-memory"
+            f"used: change {self._told_options(largest)}, or allow more with --max-memory"
         )
+
+    def _told_options(self, largest: str) -> str:
+        """Return the options to change if this part of the memory is the largest."""
+        own = (f"--{name.replace('_', '-')}" for name in self.limits if name != "memory_budget")
+        return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
 
 
 def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
@@ -117,7 +131,52 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
         pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
     )
     seconds = sum(stage.seconds for stage in stages.values()) if is_host else 0
-    return RunForecast({**phases, "evaluation": shown}, _disk_bytes(scene, plan, list(stages.values())), seconds)
+    systems = {id(planned.system): planned.system for planned in plan.stages}.values()
+    limits = tuple(dict.fromkeys(name for system in systems for name in system.limits()))
+    disk = _disk_bytes(scene, plan, list(stages.values()))
+    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits)
+
+
+def quick_downscale(longest_side: int) -> int:
+    """Return the downscale with which photographs of this longer side train quickly."""
+    return max(1, math.ceil(longest_side / QUICK_SIDE))
+
+
+def quick_flags(downscale: int) -> list[str]:
+    """Return the flags of a quick training with a downscale."""
+    return ["--preset", QUICK, *(["--downscale", str(downscale)] if downscale > 1 else [])]
+
+
+def quicker_text(scene: Scene, record: RunRecord) -> str:
+    """Return the flags with which a long run on CPUs gets quicker, with their forecast; empty for other runs.
+
+    Args:
+      scene: the scene of the record, downscaled as it says.
+      record: the run.
+    """
+    seconds = forecast_run(scene, record.plan).seconds
+    presets = type(record.system).presets()
+    if seconds * ROUGHLY <= LONG or QUICK not in presets:
+        return ""
+    downscale = quick_downscale(max(max(view.camera.width, view.camera.height) for view in scene.train))
+    system = dataclasses.replace(presets[QUICK], memory_budget=record.system.memory_budget)
+    quick = dataclasses.replace(record, system=system, preset=QUICK)
+    quick_seconds = _training_seconds(scene, quick.plan, downscale)
+    if quick_seconds > seconds / 2:
+        return ""
+    flags = " ".join(quick_flags(downscale * record.scene.downscale))
+    return f"quicker: {flags} takes very roughly {_between(quick_seconds)}"
+
+
+def _training_seconds(scene: Scene, plan: RunPlan, downscale: int) -> float:
+    """Return the training time on CPUs if the photographs are downscaled further."""
+    forecasts = _stages(scene, plan)
+    return sum(
+        planned.stage.iterations
+        * planned.system.batch_size
+        * iteration_seconds(scene.train, forecasts[planned.name].num_rows, downscale)
+        for planned in plan.stages
+    )
 
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
@@ -175,6 +234,11 @@ def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) ->
 
 def _told(num_bytes: float) -> str:
     return f"{num_bytes / 1e9:.1f} GB" if num_bytes >= 1e9 else f"{math.ceil(num_bytes / 1e6)} MB"
+
+
+def _between(seconds: float) -> str:
+    """Return the shortest and the longest time of a rough estimate."""
+    return f"{_duration(seconds / ROUGHLY)} to {_duration(seconds * ROUGHLY)}"
 
 
 def _duration(seconds: float) -> str:

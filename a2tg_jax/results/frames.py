@@ -1,15 +1,19 @@
 """Frames of a finished run: its test views, or a smooth path past the cameras or drawn by hand, and a video of that."""
 
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
+from PIL import Image
 from tqdm import tqdm
 
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.cameras import Camera, crop_camera
 from a2tg_jax.core.paths import path_through, smooth_path
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
@@ -20,10 +24,34 @@ from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 
 Route = Literal["test", "smooth"]
+FRAMES_PER_SECOND = 30
+LARGEST_SIDE = 8192
+WEBP_QUALITY = 80
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return width and height of a text such as 1280x720.
+
+    Raises:
+      ValueError: if it is another one, or a side is out of range.
+    """
+    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise ValueError(
+            f"size must be WIDTHxHEIGHT in pixels, each 1 to {LARGEST_SIDE}, such as 1280x720; got {shortened(text)}"
+        )
+    return size
 
 
 def render_frames(
-    run: RunFolder, out: Path, *, route: Route | Path = "smooth", num_frames: int = 120, name: str | None = None
+    run: RunFolder,
+    out: Path,
+    *,
+    route: Route | Path = "smooth",
+    num_frames: int = 120,
+    name: str | None = None,
+    size: tuple[int, int] | None = None,
 ) -> list[Path]:
     """Write one PNG per frame and return their paths. The photographs are not needed: a model knows its cameras.
 
@@ -34,6 +62,7 @@ def render_frames(
         path goes.
       num_frames: length of the path.
       name: whose model is drawn; None: the last stage of the run's main system.
+      size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' own.
 
     Raises:
       FileNotFoundError: if that stage is not finished, or there is no such path.
@@ -50,13 +79,43 @@ def render_frames(
         raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
     model = load_model(run.model(planned.name))
     cameras = dict(_cameras(model, route, num_frames))
+    if size is not None:
+        cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
     renderer = Renderer(model, cameras=cameras.values(), settings=settings_of(planned.system), has_geometry=False)
     for file_name, camera in tqdm(cameras.items(), desc="frames", unit="frame"):
         save_picture(out / file_name, to_uint8(renderer(camera).color))
     return [out / file_name for file_name in cameras]
 
 
-def write_video(folder: Path, path: Path, *, frames_per_second: int = 30) -> bool:
+def check_rate(frames_per_second: float) -> None:
+    """Raise ValueError unless a video can have so many frames a second."""
+    if not 1 <= frames_per_second <= 1000:
+        raise ValueError(f"the number of frames per second must lie in 1..1000; got {frames_per_second}")
+
+
+def write_animation(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> None:
+    """Make an animated WebP of some frames, which loops. Memory holds one frame at a time."""
+    first, *others = frames
+    duration = round(1000 / frames_per_second)
+    with replacing(path) as temporary, Image.open(first) as image:
+        image.save(
+            temporary,
+            "WEBP",
+            save_all=True,
+            append_images=map(_opened, others),
+            duration=duration,
+            loop=0,
+            quality=WEBP_QUALITY,
+        )
+
+
+def _opened(path: Path) -> Image.Image:
+    with Image.open(path) as image:
+        image.load()
+        return image
+
+
+def write_video(folder: Path, path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> bool:
     """Make an mp4 of frame_0000.png … with ffmpeg; return False if ffmpeg is not installed.
 
     Raises:

@@ -32,6 +32,8 @@ def describe_run(run: RunFolder) -> str:
         *(f"model    {name:<{width}}  {_describe_stage(run, name, measured.get(name))}" for name in names),
         f"report   {run.report if run.report.is_file() else 'none yet: a2tg eval writes it'}",
     ]
+    if is_regular(run.finish):
+        lines.append(f"finished {run.finish} says from which run and how")
     old = old_run(run)
     if old is not None:
         lines.append(f"replaces a run that is kept in {old.path} until this one has its report")

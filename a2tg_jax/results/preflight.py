@@ -8,7 +8,7 @@ from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.data import Scene
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, check_free
-from a2tg_jax.results.forecast import room_for_photographs, tell_forecast
+from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training.start import check_start, initial_number
@@ -35,6 +35,9 @@ def check_new_run(
         check_start(scene, system)
     check_room(record, scene, out)
     tell_forecast(scene, record.plan, max_memory)
+    quicker = quicker_text(scene, record)
+    if quicker:
+        print(quicker, flush=True)
     return scene
 
 

@@ -28,9 +28,11 @@ from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
+from a2tg_jax.results.finish_options import read_finish
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
+from a2tg_jax.training.options import BUDGET_OPTIONS
 from a2tg_jax.training.registry import differences, with_changes
 
 SYNTHETIC = "synthetic"
@@ -222,9 +224,17 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "on_nan": record.on_nan,
         "options": _without_none(config_to_dict(record.system), start),
     }
-    text = f"# Repeats the run: {repeating_command(run)}\n{tomli_w.dumps(table)}"
+    text = f"# Repeats the run: {repeating_command(run)}\n{_budget_note(record.system)}{tomli_w.dumps(table)}"
     with replacing(run.own(run.record)) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _budget_note(system: System) -> str:
+    """Return a comment that names the options without effect beside a memory budget; empty if there are none."""
+    replaced = [name for name, value in flatten_config(system).items() if name in BUDGET_OPTIONS and value is not None]
+    if system.memory_budget is None or not replaced:
+        return ""
+    return f"# options.memory_budget decides in place of {', '.join(f'options.{name}' for name in replaced)}\n"
 
 
 def read_record(run: RunFolder) -> RunRecord:
@@ -248,8 +258,16 @@ def read_record(run: RunFolder) -> RunRecord:
 
 
 def repeating_command(run: RunFolder) -> str:
-    """Return the command line that repeats a run."""
-    return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", f"{run.path}-again"])
+    """Return the command line that repeats a run, and its finishing if it was finished."""
+
+    def training(out: str) -> str:
+        return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", out])
+
+    if not is_regular(run.finish):
+        return training(f"{run.path}-again")
+    trained = f"{run.path}-trained"
+    finishing = ["a2tg", "finish", trained, "--out", f"{run.path}-again", *read_finish(run).flags]
+    return f"{training(trained)} && {shlex.join(finishing)}"
 
 
 def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:

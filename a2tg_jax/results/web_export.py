@@ -74,8 +74,13 @@ def exported_text(result: Exported) -> str:
     model, size = result.model, result.num_bytes
     lines = [f"{model.num:,} Gaussians, {model.num_bytes:,} bytes of numbers, {size:,} in the scene's file: "
              f"1/{model.num_bytes / max(size, 1):.1f}"]  # fmt: skip
-    lines += [f"{loss:+.3f} dB of PSNR lost, {measure}" for measure, loss in result.losses.items()]
+    lines += [f"{loss_told(loss)}, {measure}" for measure, loss in result.losses.items()]
     return "\n".join(lines)
+
+
+def loss_told(loss: float) -> str:
+    """Return a loss of PSNR in dB as "0.067 dB of PSNR lost", and a negative one as gained."""
+    return f"{abs(loss):.3f} dB of PSNR {'gained' if loss < 0 else 'lost'}"
 
 
 def _losses_of(source: Source) -> dict[str, float]:

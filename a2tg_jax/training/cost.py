@@ -95,7 +95,7 @@ def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
         floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
         programs = 1 + sum(e.num_programs(stage.iterations) for e in stage.events if isinstance(e, HostEvent))
-        seconds = stage.iterations * system.batch_size * _seconds(scene.train, num)
+        seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
         yield StageForecast(stage_bytes(scene, system, stage, num, model_bytes), model_bytes, num, programs, seconds)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
@@ -150,7 +150,7 @@ def largest_view(views: Sequence[View]) -> int:
     return max(view.camera.width * view.camera.height for view in views)
 
 
-def _seconds(views: Sequence[View], num: int) -> float:
-    """Return the seconds of an iteration with one view."""
-    pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+def iteration_seconds(views: Sequence[View], num: int, downscale: int = 1) -> float:
+    """Return the seconds of an iteration with one view, downscaled further by a factor."""
+    pixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / downscale**2
     return (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * pixels) / num_threads()

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.events import Event, FieldError, with_names
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
@@ -169,6 +169,7 @@ class System:
         if name not in presets:
             raise ValueError(
                 f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {shortened(name)!r}"
+                f"{did_you_mean(name, presets)}"
             )
         return presets[name]
 
@@ -229,6 +230,12 @@ class System:
         """Return the names of the options that make more Gaussians, for advice."""
         names = [field.name for field in dataclasses.fields(self)]
         return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
+
+    def limits(self) -> tuple[str, ...]:
+        """Return the names of the options that limit the number of Gaussians, for advice."""
+        events = (event for stage in self.stages() for event in stage.events if event.most_gaussians is not None)
+        names = (self.option_of(event, "cap") for event in events)
+        return tuple(dict.fromkeys(name for name in names if name is not None)) or ("initial_gaussians",)
 
     def check_number(self, num: int) -> None:
         """Refuse options that cannot be trained from this number of Gaussians.

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
@@ -34,7 +34,7 @@ def find_system(reference: str) -> System:
     if not attribute:
         raise ValueError(
             f"there is no system {shortened(reference)!r}; the systems are {', '.join(SYSTEMS)}, "
-            "and your own as package.module:NAME"
+            f"and your own as package.module:NAME{did_you_mean(reference, SYSTEMS)}"
         )
     try:
         found = getattr(importlib.import_module(path), attribute)

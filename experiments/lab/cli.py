@@ -13,8 +13,8 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.record import SYNTHETIC
-from lab import machine
-from lab.grid import Grid, read_grid
+from lab import machine, spreadsheet, tables
+from lab.grid import Grid, SceneAt, own_scene, read_grid
 from lab.jobs import Folders, Job, Record
 from lab.plan import plan_of
 from lab.queue import Failure, LocalPool, Pool, SubmititPool, run_all
@@ -44,7 +44,18 @@ class Lab:
 
     def grid(self, name: str) -> Grid:
         """Return a grid with the requested scenes."""
-        return read_grid(name, self.scale, scenes=self.args.only, held_out=not self.args.without_held_out)
+        held_out = not self.args.without_held_out
+        return read_grid(name, self.scale, scenes=self.args.only, held_out=held_out, own=self.own_scenes)
+
+    @property
+    def own_scenes(self) -> tuple[SceneAt, ...]:
+        """Return the scenes given by path, which take the place of the scale's."""
+        return tuple(own_scene(path, self.args.downscale) for path in self.args.scene)
+
+    @property
+    def is_smoke(self) -> bool:
+        """Return whether the scale only shows that everything runs: figures need little work and mean nothing."""
+        return self.scale == "smoke"
 
     def run(self, grids: Sequence[Grid]) -> list[Failure]:
         """Run the unfinished jobs of the grids, unless only tables are requested."""
@@ -55,12 +66,16 @@ class Lab:
             self._save()
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
         with contextlib.closing(self._pool()) as pool:
-            return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)
+            try:
+                return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)
+            except KeyboardInterrupt:
+                pool.abort()
+                raise
 
     @property
     def is_partial(self) -> bool:
         """Return whether scenes are left out."""
-        return bool(self.args.only or self.args.without_held_out)
+        return bool(self.args.only or self.args.without_held_out or self.args.scene)
 
     @property
     def pages(self) -> Path:
@@ -84,6 +99,12 @@ class Lab:
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
         print(f"\n{text}\n{path}", flush=True)
+
+    def write_rows(self, name: str, grids: Sequence[Grid]) -> None:
+        """Save the finished runs of some grids as a CSV file beside their page."""
+        found = [(grid.name, result) for grid in grids for result in tables.results_of(grid, self.records)]
+        with replacing(self.pages / f"{name}.csv") as temporary:
+            temporary.write_text(spreadsheet.rows_text(found), encoding="utf-8")
 
     def _check_inputs(self, grids: Sequence[Grid]) -> None:
         """Raise if a scene is missing, before anything is trained."""
@@ -159,8 +180,10 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         sys.exit(f"error: {error}")
     errors = [f"{failure.job.key}: {failure.reason}" for failure in failures]
     for experiment in experiments:
+        own = [grids[name] for name in experiment.grids]
         try:
-            experiment.present(lab, [grids[name] for name in experiment.grids])
+            lab.write_rows(experiment.name, own)
+            experiment.present(lab, own)
         except (ValueError, OSError) as error:
             errors.append(f"{experiment.name}: {error}")
     if errors:
@@ -193,6 +216,9 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
     add("--scale", choices=("full", "small", "smoke"), default="small", help="full is the paper's, for a GPU")
     add("--only", nargs="+", metavar="SCENE", help="run these scenes of the scale only")
+    add("--scene", action="append", type=Path, default=[], metavar="PATH",
+        help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip
+    add("--downscale", type=int, default=1, help="factor by which the photographs of --scene are downscaled")
     add("--without-held-out", action="store_true", help="leave out the held-out scenes")
     add("--out", type=Path, help="folder of records, tables and plots; runs finished in it are never run again")
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")

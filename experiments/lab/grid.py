@@ -131,12 +131,33 @@ def splats_in(mb: float, method: Method) -> int:
     return int(round(1e6 * mb) // (BYTES_PER_FLOAT * method.floats))
 
 
-def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, held_out: bool = True) -> Grid:
+def own_scene(path: Path, downscale: int) -> SceneAt:
+    """Return a scene of one's own by the path of its folder.
+
+    Raises:
+      ValueError: if there is no such folder, or the downscale is not a whole number of at least 1.
+    """
+    if not path.is_dir():
+        raise ValueError(f"there is no scene folder {path}")
+    if downscale < 1:
+        raise ValueError(f"--downscale must be at least 1; got {downscale}")
+    return SceneAt(path.resolve().name, path.resolve().as_posix(), downscale)
+
+
+def read_grid(
+    name: str,
+    scale: str,
+    *,
+    scenes: Sequence[str] | None = None,
+    held_out: bool = True,
+    own: Sequence[SceneAt] = (),
+) -> Grid:
     """Read an experiment's grid at a scale from `grids/NAME.toml`.
 
     Args:
       scenes: labels of the wanted scenes; None for those that the file, or else the scale, names.
       held_out: whether held-out scenes count.
+      own: scenes that take the place of all these; empty for none.
 
     Raises:
       ValueError: if the file lacks the scale, or a scene or method is unknown.
@@ -152,14 +173,17 @@ def read_grid(name: str, scale: str, *, scenes: Sequence[str] | None = None, hel
             raise ValueError(f"grids/{name}.toml: there is no method {label!r}; there are {', '.join(methods)}")
         return methods[label]
 
-    variants = [method(label) for label in file.get("variants", {})]
+    def methods_in(key: str) -> tuple[Method, ...]:
+        """Return the methods of an entry of the scale, or else of the file."""
+        return tuple(map(method, file[scale].get(key, file.get(key, []))))
+
     blocks = [{**settings, **block} for block in settings.get("blocks", [{}])]
-    cells = [cell for block in blocks for cell in _cells(block, scenes, held_out, name)]
+    cells = [cell for block in blocks for cell in _cells(block, own or _scenes(block, scenes, held_out, name))]
     if not cells:
         raise ValueError(f"grids/{name}.toml: no scene is left")
     return Grid(
         name, file["title"], scale, settings["preset"], tuple(dict.fromkeys(cells)), method(file["reference"]),
-        (*map(method, file.get("methods", [])), *variants), tuple(map(method, file.get("at_equal_bytes", []))),
+        (*methods_in("methods"), *methods_in("variants")), methods_in("at_equal_bytes"),
     )  # fmt: skip
 
 
@@ -175,10 +199,9 @@ def _methods(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Method]:
     return methods
 
 
-def _cells(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[Cell]:
+def _cells(block: Mapping, scenes: Sequence[SceneAt]) -> list[Cell]:
     """Return a cell for every number of Gaussians or budget, every seed and every scene of a block."""
     first, second = block["iterations"]
-    scenes = _scenes(block, wanted, held_out, name)
     sizes = (
         [(0, budget) for budget in block["budgets"]] if "budgets" in block else [(n, None) for n in block["gaussians"]]
     )

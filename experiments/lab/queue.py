@@ -10,12 +10,14 @@ dependency, and experiments run without it.
 
 import collections
 import concurrent.futures
+import contextlib
 import dataclasses
 import multiprocessing
 import os
+import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -62,6 +64,10 @@ class Pool(Protocol):
         """Return whether an error means that a job's process died, not that the job failed."""
         ...
 
+    def abort(self) -> None:
+        """End the running jobs at once; they continue from their checkpoints."""
+        ...
+
     def close(self) -> None:
         """Release processes and memory."""
         ...
@@ -86,23 +92,44 @@ class LocalPool:
         return concurrent.futures.ProcessPoolExecutor(self.slots, context, _begin_worker, (shares,))
 
     def submit(self, job: Job, folders: Folders) -> Handle:
-        try:
-            return self._executor.submit(run_job, job, folders)
-        except concurrent.futures.BrokenExecutor:
-            self._executor = self._new_executor()
-            return self._executor.submit(run_job, job, folders)
+        with _interrupts_ignored():  # The processes that begin here leave Ctrl-C to this one.
+            try:
+                return self._executor.submit(run_job, job, folders)
+            except concurrent.futures.BrokenExecutor:
+                self._executor = self._new_executor()
+                return self._executor.submit(run_job, job, folders)
 
     def is_death(self, error: Exception) -> bool:
         return isinstance(error, concurrent.futures.BrokenExecutor)
+
+    def abort(self) -> None:
+        for process in multiprocessing.active_children():
+            process.terminate()
 
     def close(self) -> None:
         self._executor.shutdown(cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C within the block, and in processes that begin in it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _begin_worker(shares: Any) -> None:
     """Prepare a process for its first job."""
+    from tqdm import tqdm
+
     import a2tg_jax
 
+    tqdm.set_lock(threading.RLock())  # Its own lock is shared by processes, and one that is ended leaks it.
     threading.Thread(target=_end_with_parent, daemon=True).start()
     cores, gpu = shares.get()
     if cores:
@@ -154,6 +181,9 @@ class SubmititPool:
     def is_death(self, error: Exception) -> bool:
         """Return whether a job was killed or out of time; it continues from its checkpoint."""
         return type(error).__name__ == "UncompletedJobError"
+
+    def abort(self) -> None:
+        """Leave it to `close`, which cancels what was sent."""
 
     def close(self) -> None:
         for handle in self._sent:

@@ -61,7 +61,10 @@ def _block(
     """Composite one block of B splats over one tile; arguments and results are those of `xla._block`."""
     splats, regions = rows
     x, y = xla.pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
-    spread = lambda tree: jax.tree.map(lambda entry: jnp.broadcast_to(entry[:, None], (BLOCK, x.shape[1])), tree)  # noqa: E731
+
+    def spread(tree: Any) -> Any:
+        return jax.tree.map(lambda entry: jnp.broadcast_to(entry[:, None], (BLOCK, x.shape[1])), tree)
+
     splat = xla.split(splats, settings.has_geometry)
     planes, splat = spread(pixel.planes_of(splat.M, tile.x, tile.y)), spread(splat)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]

@@ -1,0 +1,70 @@
+"""The command `a2tg render`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from a2tg_jax.cli.arguments import LastModel, defaulting_to
+from a2tg_jax.results.folder import open_run
+from a2tg_jax.results.frames import (
+    FRAMES_PER_SECOND,
+    Route,
+    check_rate,
+    parse_size,
+    render_frames,
+    write_animation,
+    write_video,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render frames of a finished run as PNG files.
+
+    A flight also becomes a video: MP4 if ffmpeg is installed, and otherwise an animated WebP. The photographs are not
+    needed.
+
+    Examples:
+      a2tg render runs/fox --frames 240 --fps 60
+      a2tg render runs/fox --size 1280x720
+      a2tg render runs/fox --path test --out fox-test
+      a2tg render runs/fox --path path.json --out fox-flight
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder."""
+    path: Route | Path = "smooth"
+    """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
+    frames: int = 120
+    """Number of frames of the flight."""
+    fps: float = FRAMES_PER_SECOND
+    """Frames per second of the video."""
+    size: Annotated[str | None, arg(metavar="WxH"), defaulting_to("that of the cameras")] = None
+    """Width and height of the frames in pixels, such as 1280x720. Views of another aspect are cropped."""
+    out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
+    """Output folder."""
+    model: LastModel = None
+    """Name of the model, as a2tg info prints it."""
+
+    def run(self) -> None:
+        run = open_run(self.folder)
+        out = self.out or run.path / "frames"
+        check_rate(self.fps)
+        size = None if self.size is None else parse_size(self.size)
+        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model, size=size)
+        print(f"{len(paths)} frames in {out}")
+        if self.path != "test":
+            self._write_video(out, paths)
+
+    def _write_video(self, out: Path, frames: list[Path]) -> None:
+        """Write an MP4, or an animated WebP without ffmpeg."""
+        video = out / "flight.mp4"
+        if write_video(out, video, frames_per_second=self.fps):
+            print(f"video: {video}")
+            return
+        print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
+        animation = out / "flight.webp"
+        write_animation(frames, animation, frames_per_second=self.fps)
+        print(f"animation: {animation}")

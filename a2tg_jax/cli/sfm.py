@@ -1,0 +1,40 @@
+"""The command `a2tg sfm`."""
+
+import dataclasses
+import shlex
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from a2tg_jax.data import run_sfm
+from a2tg_jax.data.sfm import Matching
+from a2tg_jax.results.forecast import quick_downscale, quick_flags
+from a2tg_jax.results.preflight import check_apart
+
+
+@dataclasses.dataclass(frozen=True)
+class Sfm:
+    """Find camera poses and sparse points for plain photographs.
+
+    COLMAP extracts features, matches them and maps the scene. Frames of a video are photographs too:
+    ffmpeg -i fox.mp4 -vf fps=2 -q:v 2 photos/fox/%04d.jpg
+
+    Example:
+      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
+    """
+
+    photos: Positional[Path]
+    """Folder of photographs of one scene."""
+    out: Positional[Path]
+    """New scene folder for the images and the sparse model, ready for a2tg train."""
+    matching: Matching = "auto"
+    """Pairs of photographs to match: all pairs (exhaustive), neighbours by name (sequential, for many photographs named
+    in the order of taking), or neighbours beyond 200 photographs (auto)."""
+
+    def run(self) -> None:
+        check_apart(self.out, self.photos)
+        found = run_sfm(self.photos, self.out, matching=self.matching)
+        print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
+        run = ["a2tg", "train", str(self.out), "--out", f"runs/{self.out.resolve().name}"]
+        command = shlex.join([*run, *quick_flags(quick_downscale(found.longest_side))])
+        print(f"scene: {self.out}; continue with: {command}")
