@@ -8,7 +8,7 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.training.start import fainter_where_dense, initial_model
+from a2tg_jax.training.start import fainter_where_dense, initial_model, wider_where_dense
 
 FOCAL, DEPTH = 100.0, 2.0
 
@@ -66,3 +66,20 @@ def test_dense_points_start_fainter_and_sparse_ones_as_asked(num_points, least, 
     opacities = np.asarray(initial_model(scene, a2tg.Gaussians2dMcmc.preset("quick")).gaussians.opacities)
     assert least <= (opacities < 0.499).mean() <= most
     assert opacities.max() == pytest.approx(0.5)
+
+
+def test_splats_without_a_filter_begin_a_pixel_wide():
+    """Both axes grow alike; what is wide enough, or seen by no camera, stays."""
+    given = splats([0.1, 0.5, 2.0], 0.5)
+    growth = np.exp(wider_where_dense(given, [camera_at(DEPTH)]).log_scales - given.log_scales)
+    np.testing.assert_allclose(growth, np.array([[10.0], [2.0], [1.0]]) * np.ones(2), rtol=1e-5)
+    unseen = wider_where_dense(given, [camera_at(-DEPTH)])
+    np.testing.assert_array_equal(unseen.log_scales, given.log_scales)
+
+
+def test_billboards_begin_wide_and_opaque():
+    scene = a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=900)
+    system = a2tg.BBSplat.preset("smoke")
+    model, plain = initial_model(scene, system), initial_model(scene, a2tg.Gaussians2d.preset("smoke"))
+    assert (model.gaussians.log_scales > plain.gaussians.log_scales[: model.num]).any()
+    np.testing.assert_allclose(model.gaussians.opacities, system.initial_opacity, rtol=1e-5)

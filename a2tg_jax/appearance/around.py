@@ -52,6 +52,10 @@ class AppearanceAround(Appearance):
         return self.inner.max_alpha
 
     @property
+    def has_low_pass(self) -> bool:  # type: ignore[override]
+        return self.inner.has_low_pass
+
+    @property
     def array_prefix(self) -> str:  # type: ignore[override]
         return INNER + self.inner.array_prefix
 

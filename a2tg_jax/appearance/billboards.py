@@ -96,6 +96,7 @@ class Billboards(Bucketed):
     """Initial RGB, in (0, 1)."""
     max_alpha: float = 0.99
     """Upper limit of alpha."""
+    has_low_pass = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.side <= MAX_SIDE:

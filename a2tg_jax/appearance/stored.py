@@ -19,6 +19,8 @@ class StoredArrays:
     """Prefix of the array names of `Appearance.base`."""
     max_alpha: float = 0.99
     """Upper limit of a splat's alpha."""
+    has_low_pass: bool = True
+    """Whether a low-pass filter shows splats that are smaller than a pixel (`AppearanceRule.has_low_pass`)."""
 
     @property
     def is_portable(self) -> bool:

@@ -35,7 +35,20 @@ def initial_model(scene: Scene, system: System) -> Model:
     gaussians = init_from_points(
         scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=degree
     )
-    return Model(fainter_where_dense(gaussians, [view.camera for view in scene.train]))
+    adapted = fainter_where_dense if system.stages()[0].appearance.has_low_pass else wider_where_dense
+    return Model(adapted(gaussians, [view.camera for view in scene.train]))
+
+
+def wider_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
+    """Widen Gaussians to a standard deviation of a pixel at least, from the camera where they are largest (host).
+
+    Without a low-pass filter smaller splats show only if they cover a pixel's centre, and then without neighbours that
+    they overlap. Gaussians that no camera sees stay.
+    """
+    pixels = _largest_sizes(gaussians, cameras)
+    growth = np.where(pixels > 0, np.maximum(1 / np.maximum(pixels, SMALLEST_SIDE), 1.0), 1.0)
+    log_scales = np.asarray(gaussians.log_scales) + np.log(growth)[:, None]
+    return dataclasses.replace(gaussians, log_scales=jnp.asarray(log_scales, gaussians.log_scales.dtype))
 
 
 def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
@@ -50,6 +63,16 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
       gaussians: initial Gaussians, with the opacity for splats larger than a pixel.
       cameras: training cameras.
     """
+    sizes = _largest_sizes(gaussians, cameras)
+    layers = np.maximum(FILTER_VARIANCE / np.maximum(sizes, SMALLEST_SIDE) ** 2, 1.0)
+    opacities = np.asarray(gaussians.opacities, np.float64)
+    shared = np.maximum(1 - (1 - opacities) ** (1 / layers), np.minimum(opacities, LEAST_OPACITY))
+    logits = np.where(shared < opacities, np.log(shared / (1 - shared)), np.asarray(gaussians.logit_opacities))
+    return dataclasses.replace(gaussians, logit_opacities=jnp.asarray(logits, gaussians.logit_opacities.dtype))
+
+
+def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the smaller standard deviation of Gaussians in pixels [N], from the camera where it is largest."""
     means, scales = np.asarray(gaussians.means, np.float64), np.asarray(gaussians.scales, np.float64).min(axis=1)
     largest = np.zeros(len(means))
     for camera in cameras:
@@ -57,11 +80,7 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
         depths = means @ viewmat[2, :3] + viewmat[2, 3]
         pixels = np.where(depths > NEAR, scales * np.sqrt(K[0, 0] * K[1, 1]) / np.maximum(depths, NEAR), 0.0)
         largest = np.maximum(largest, pixels)
-    layers = np.maximum(FILTER_VARIANCE / np.maximum(largest, SMALLEST_SIDE) ** 2, 1.0)
-    opacities = np.asarray(gaussians.opacities, np.float64)
-    shared = np.maximum(1 - (1 - opacities) ** (1 / layers), np.minimum(opacities, LEAST_OPACITY))
-    logits = np.where(shared < opacities, np.log(shared / (1 - shared)), np.asarray(gaussians.logit_opacities))
-    return dataclasses.replace(gaussians, logit_opacities=jnp.asarray(logits, gaussians.logit_opacities.dtype))
+    return largest
 
 
 def check_start(scene: Scene, system: System) -> None:
