@@ -9,10 +9,12 @@ import subprocess
 import sys
 import tomllib
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
+from a2tg_jax.cli import doctor
 from a2tg_jax.cli import main as cli
 from a2tg_jax.finish.compaction import measure_choices
 from a2tg_jax.host import startup
@@ -567,3 +569,12 @@ def test_render_tells_ffmpeg_the_rate(tmp_path, monkeypatch):
     )
     assert frames.write_video(tmp_path, tmp_path / "flight.mp4", frames_per_second=12)
     assert asked[0][asked[0].index("-framerate") + 1] == "12"
+
+
+def test_doctor_compares_the_compositors(capsys, monkeypatch):
+    assert cli.main(["doctor"]) == 0
+    told = capsys.readouterr().out
+    assert f"jax {jax.__version__}" in told and re.search(r"native: .* at most \de-\d\d from XLA's image", told)
+    assert "cuda is not available: it needs JAX on an NVIDIA GPU" in told
+    monkeypatch.setattr(doctor, "_compare", lambda: float("inf"))
+    assert "the compositors differ by inf" in fails(capsys, "doctor")

@@ -1,4 +1,4 @@
-"""The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm."""
+"""The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm, doctor."""
 
 import dataclasses
 import inspect
@@ -13,6 +13,7 @@ from typing import Annotated, Any, TextIO
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import defaulting_to, parse
+from a2tg_jax.cli.doctor import Doctor
 from a2tg_jax.cli.finish import Finish
 from a2tg_jax.cli.render import Render
 from a2tg_jax.cli.sfm import Sfm
@@ -48,6 +49,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
   a2tg compress runs/scene             write a small file of the trained model
   a2tg info runs/scene                 print what a run folder holds
+  a2tg doctor                          print what this machine computes with, and test it
 
 Run a2tg COMMAND --help for a command, a2tg train --system NAME --help for the options of a system, and
 a2tg --version for the version. The systems: {", ".join(SYSTEMS)}.
@@ -115,7 +117,7 @@ class Info:
 Command = Demo | Train | Eval | Finish | Render | View | Export | Compress | Info | Sfm
 COMMANDS: dict[str, type] = {
     "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "view": View, "export": Export,
-    "compress": Compress, "info": Info, "sfm": Sfm,
+    "compress": Compress, "info": Info, "sfm": Sfm, "doctor": Doctor,
 }  # fmt: skip
 
 

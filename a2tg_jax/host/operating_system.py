@@ -143,3 +143,15 @@ def has_display() -> bool:
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def cuda_of_driver() -> tuple[int, int] | None:
+    """Return the newest CUDA version that the NVIDIA driver supports; None without a driver."""
+    number = ctypes.c_int()
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1").cuDriverGetVersion(
+            ctypes.byref(number)
+        )
+    except (OSError, AttributeError):
+        return None
+    return number.value // 1000, number.value % 1000 // 10

@@ -4,7 +4,7 @@ import functools
 import importlib.util
 import os
 import warnings
-from collections.abc import Callable
+from typing import Literal
 
 import jax
 
@@ -20,10 +20,11 @@ MAX_TILE_SIZE = 64
 IS_COMPILED_AHEAD = False
 """Set to compile for a GPU on a machine without one."""
 
-REMEDIES = {
+REMEDIES: dict[Literal["cuda", "native"], str] = {
     "cuda": "JAX on an NVIDIA GPU and NVRTC: pip install 'a2tg-jax[cuda13]'",
     "native": "JAX on the CPU and llvmlite: pip install llvmlite",
 }
+"""What the compositors need that do not run everywhere."""
 
 
 def choose(wanted: Wanted, tile_size: int) -> Compositor:
@@ -36,14 +37,18 @@ def choose(wanted: Wanted, tile_size: int) -> Compositor:
         raise ValueError(f"compositor must be 'auto', 'cuda', 'native', 'xla' or 'autodiff'; got {wanted!r}")
     if not 1 <= tile_size <= MAX_TILE_SIZE:
         raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
-    is_available: dict[str, Callable[[], bool]] = {"cuda": has_cuda, "native": has_native}
-    if wanted in is_available and not is_available[wanted]():
+    if (wanted == "cuda" or wanted == "native") and not is_available(wanted):
         raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or say 'auto'")
     if wanted != "auto":
         return wanted
     if has_native():
         return "native"
     return "cuda" if has_cuda() and not wants_determinism() else "xla"
+
+
+def is_available(compositor: Literal["cuda", "native"]) -> bool:
+    """Return whether a compositor of `REMEDIES` runs here."""
+    return has_cuda() if compositor == "cuda" else has_native()
 
 
 def wants_determinism() -> bool:

@@ -1,0 +1,82 @@
+"""`a2tg doctor`: what this machine computes with, and whether all its compositors agree."""
+
+import dataclasses
+import os
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.host.cores import VARIABLE, num_threads
+from a2tg_jax.host.operating_system import cuda_of_driver
+from a2tg_jax.host.startup import compilation_cache_folder
+from a2tg_jax.rasterize.kernels import choice
+from a2tg_jax.rasterize.splats import Wanted
+from a2tg_jax.render import RenderSettings, render_image
+
+PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
+MOST_DIFFERENCE = 1e-3
+"""Largest difference of colours in [0, 1] between compositors that is rounding."""
+WIDTH, HEIGHT, NUM = 96, 64, 400
+
+
+@dataclasses.dataclass(frozen=True)
+class Doctor:
+    """Print what this machine computes with, and render an image by each compositor to compare them.
+
+    Put its output into a report of a problem.
+    """
+
+    def run(self) -> None:
+        machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+        _tell("a2tg-jax", f"{version('a2tg-jax')}, {machine}")
+        _tell("packages", ", ".join(f"{name} {_version(name)}" for name in PACKAGES))
+        _tell("devices", ", ".join(f"{device.platform} {device.device_kind}" for device in jax.devices()))
+        cuda = cuda_of_driver()
+        _tell("driver", f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found")
+        _tell("threads", f"{num_threads()} ({VARIABLE}={os.environ.get(VARIABLE) or 'not set'})")
+        _tell("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set")
+        _tell("cache", str(compilation_cache_folder()))
+        _tell("compositor", f"{choice.choose('auto', RenderSettings.tile_size)} is the choice of 'auto'")
+        for name, remedy in choice.REMEDIES.items():
+            if not choice.is_available(name):
+                _tell("", f"{name} is not available: it needs {remedy}")
+        largest = _compare()
+        if not largest <= MOST_DIFFERENCE:
+            raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
+
+
+def _tell(name: str, text: str) -> None:
+    print(f"{name:12}{text}", flush=True)
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _compare() -> float:
+    """Render an image by each compositor; return the largest difference from XLA's, infinite if it is not finite."""
+    rng = np.random.default_rng(0)
+    gaussians = init_from_points(rng.uniform(-1, 1, (NUM, 3)), rng.uniform(0, 1, (NUM, 3)), opacity=0.5)
+    viewmat = jnp.eye(4, dtype=jnp.float32).at[2, 3].set(4)
+    K = jnp.asarray([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]], jnp.float32)
+    names: list[Wanted] = ["xla", *(name for name in choice.REMEDIES if choice.is_available(name))]
+    colors, largest = {}, 0.0
+    for name in names:
+        start = time.perf_counter()
+        output = render_image(gaussians, Camera(viewmat, K, WIDTH, HEIGHT), settings=RenderSettings(compositor=name))
+        colors[name] = np.asarray(output.color)
+        told = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
+        if name != "xla":
+            difference = float(np.nan_to_num(abs(colors[name] - colors["xla"]), nan=np.inf).max())
+            told, largest = f"{told}, at most {difference:.1g} from XLA's image", max(largest, difference)
+        _tell("render", told)
+    return largest
