@@ -1,4 +1,4 @@
-"""Compile the Pallas kernels for a GPU on a machine without one, and print the memory that they need.
+"""Compile the CUDA kernels for a GPU on a machine without one, and print the memory that they need.
 
     pip install --no-deps jax-cuda13-plugin==X.Y.Z jax-cuda13-pjrt==X.Y.Z     # of the installed jax X.Y.Z
     python -m benchmarks.deviceless h200.txtpb --ptxas ptxas
@@ -9,6 +9,7 @@ With ptxas, registers and spills of each kernel are printed beside the temporary
 
 import argparse
 import dataclasses
+import functools
 import os
 import pathlib
 import re
@@ -19,35 +20,35 @@ NUM_GAUSSIANS, NUM_PAIRS = 1_000_000, 10_000_000
 WIDTH, HEIGHT, TILE_SIZE = 1920, 1088, 16
 SPILLS = re.compile(r"(\d+) bytes spill stores, (\d+) bytes spill loads")
 REGISTERS = re.compile(r"Used (\d+) registers")
+NAMES = re.compile(r"Compiling entry function '(\w+)'")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", type=pathlib.Path)
     parser.add_argument("--ptxas", help="NVIDIA's assembler, for registers and spills")
-    parser.add_argument("--architecture", default="sm_90a")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as dump:
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_dump_to={dump}"
-        os.environ.setdefault("JAX_PLATFORMS", "cpu")
-        for name, function, inputs in programs():
-            compiled = compile_for(args.target, function, inputs)
-            memory = compiled.memory_analysis().temp_size_in_bytes / 1e6
-            print(f"{name:32s} temporary memory {memory:6.1f} MB  {assembled(pathlib.Path(dump), args)}", flush=True)
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    for name, kernel, function, inputs, spec in programs():
+        compiled = compile_for(args.target, function, inputs)
+        memory = compiled.memory_analysis().temp_size_in_bytes / 1e6
+        registers = assembled(spec, args.ptxas)[kernel] if args.ptxas else ""
+        print(f"{name:32s} temporary memory {memory:6.1f} MB  {registers}", flush=True)
 
 
 def programs():
-    """Yield names, functions and the shapes of their arguments: forward and backward, plain and textured."""
+    """Yield names, kernels, functions, shapes of their arguments, and specs: both passes, plain and textured."""
     import jax
     import jax.numpy as jnp
 
-    from a2tg_jax.appearance import PlainRule, TexturedRule, TextureOptions
+    from a2tg_jax.appearance import PlainRule, StaticRule, TexturedRule, TextureOptions
     from a2tg_jax.rasterize.compositor import composite
-    from a2tg_jax.rasterize.kernels import pallas
+    from a2tg_jax.rasterize.kernels import choice
+    from a2tg_jax.rasterize.kernels.traced import KernelSpec
     from a2tg_jax.rasterize.splats import CompositingSettings, Splats
     from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
-    pallas.IS_COMPILED_AHEAD = True
+    choice.IS_COMPILED_AHEAD = True
     num, grid = NUM_GAUSSIANS, TileGrid(WIDTH, HEIGHT, TILE_SIZE)
     floats = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
     integers = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.int32)  # noqa: E731
@@ -57,8 +58,9 @@ def programs():
 
     for name, rule in (("plain", PlainRule()), ("textured", textured)):
         for statistic in (None, "position"):
-            settings = CompositingSettings(grid, 0.2, False, statistic, "pallas", 1)
+            settings = CompositingSettings(grid, 0.2, False, statistic, "cuda", 1)
             inputs = splats, rule, floats(num), lists, floats(3, 3), floats(num, 4)
+            spec = KernelSpec.of(settings, StaticRule.of(rule), splats, rule.texels, rule.regions)
 
             def forward(*inputs, settings=settings):
                 return composite(settings, *inputs)
@@ -72,8 +74,8 @@ def programs():
                 return jax.grad(loss, argnums=(0, 1, 2))(splats, rule.texels, probe)
 
             if not statistic:
-                yield f"{name}, forward", forward, inputs
-            yield f"{name}, backward{' with statistic' if statistic else ''}", backward, inputs
+                yield f"{name}, forward", "forward", forward, inputs, spec
+            yield f"{name}, backward{' with statistic' if statistic else ''}", "backward", backward, inputs, spec
 
 
 def compile_for(target: pathlib.Path, function, inputs):
@@ -88,18 +90,20 @@ def compile_for(target: pathlib.Path, function, inputs):
     return jax.jit(function).lower(*placed).compile()
 
 
-def assembled(dump: pathlib.Path, args: argparse.Namespace) -> str:
-    """Return registers and spills of the kernels compiled since the last call."""
-    found = []
-    for path in sorted(dump.glob("*.ptx")):
-        kernel = re.search(r"\.entry (_\w+_kernel)", path.read_text())
-        if args.ptxas and kernel:
-            command = [args.ptxas, f"-arch={args.architecture}", "-v", str(path), "-o", os.devnull]
-            log = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-            for registers, spills in zip(REGISTERS.findall(log), SPILLS.findall(log), strict=True):
-                found.append(f"{registers} registers, {int(spills[0]) + int(spills[1])} bytes spilled")
-        path.unlink()
-    return "; ".join(found)
+@functools.cache
+def assembled(spec, ptxas: str) -> dict[str, str]:
+    """Return registers and spills of the kernels of a spec, by name."""
+    from a2tg_jax.rasterize.kernels.cuda import launch, nvrtc
+    from a2tg_jax.rasterize.kernels.cuda.source import source
+
+    capability = launch.DEFAULT_CAPABILITY
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "tiles.ptx"
+        path.write_text(nvrtc.ptx(source(spec, "cuda"), capability), encoding="utf-8")
+        command = [ptxas, f"-arch=sm_{capability.replace('.', '')}", "-v", str(path), "-o", os.devnull]
+        log = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    figures = zip(NAMES.findall(log), REGISTERS.findall(log), SPILLS.findall(log), strict=True)
+    return {name: f"{used} registers, {int(a) + int(b)} bytes spilled" for name, used, (a, b) in figures}
 
 
 if __name__ == "__main__":

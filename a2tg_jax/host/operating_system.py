@@ -147,11 +147,9 @@ def has_display() -> bool:
 
 def cuda_of_driver() -> tuple[int, int] | None:
     """Return the newest CUDA version that the NVIDIA driver supports; None without a driver."""
-    number = ctypes.c_int()
+    number, library = ctypes.c_int(), "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
-        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1").cuDriverGetVersion(
-            ctypes.byref(number)
-        )
+        ctypes.CDLL(library).cuDriverGetVersion(ctypes.byref(number))
     except (OSError, AttributeError):
         return None
     return number.value // 1000, number.value % 1000 // 10
