@@ -39,7 +39,7 @@ def _kernel(spec, name):
 @functools.cache
 def _program(spec):
     # PoCL 3.1's optimiser makes wrong sums of these loops with barriers; Oclgrind, which interprets them, agrees with
-    # the code that is not optimised, and reports neither races nor reads of what was never written.
+    # the code that is not optimised, and reports no races.
     return cl.Program(queue().context, source(spec, "opencl")).build(["-cl-std=CL1.2", "-cl-opt-disable"])
 
 
