@@ -111,10 +111,11 @@ def test_any_appearance_rule_is_compiled():
 
     def loss(gaussians, params, compositor):
         rule = HalvesRule(params, first, 0.2)
-        output = render_appearance(gaussians, camera, rule, settings=RenderSettings(compositor=compositor))
+        settings = RenderSettings(compositor=compositor, capacity=1024)
+        output = render_appearance(gaussians, camera, rule, settings=settings)
         return jnp.sum(output.color**2), output.color
 
-    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
     (_, expected), wanted = differentiate(gaussians, params, "xla")
     (_, image), found = differentiate(gaussians, params, "native")
     assert jnp.abs(wanted[1]).max() > 1e-3
@@ -215,10 +216,11 @@ def test_mixed_precisions_are_composited_in_the_larger():
     gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
 
     def loss(gaussians, textures, camera):
-        color = render_image(gaussians, camera, textures, layout, settings=RenderSettings(compositor="native")).color
+        settings = RenderSettings(compositor="native", capacity=1024)
+        color = render_image(gaussians, camera, textures, layout, settings=settings).color
         return jnp.sum(color**2), color
 
-    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
     with jax.numpy_dtype_promotion("standard"):
         (_, expected), wanted = differentiate(gaussians, textures, as_camera(scene, "float32"))
         (_, image), found = differentiate(gaussians, textures, as_camera(scene, "float64"))

@@ -1,5 +1,6 @@
 """Rendering where several devices each render a view, in a process that has rendered nothing before."""
 
+import os
 import subprocess
 import sys
 
@@ -58,6 +59,6 @@ else:
 
 
 def test_the_first_rendering_may_be_inside_a_shard_map(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2")
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
