@@ -3,8 +3,9 @@
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Compiling takes most of the time of these tests; unoptimised code is ready in a third of it.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+# Compiling takes most of the time of these tests. Unoptimised code is ready in a third of it, and in half of that
+# without MLIR's fusions. Command lines that tests start inherit both.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 
 import pathlib
 

@@ -55,7 +55,7 @@ class Worker:
         environment = os.environ | {
             "JAX_PLATFORMS": "cpu", "PYTHONDONTWRITEBYTECODE": "1", "MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": "1",
             "TMPDIR": str(self.work / "tmp"), "XDG_CACHE_HOME": str(self.work / "tmp"), "A2TG_NUM_THREADS": "1",
-            "XLA_FLAGS": "--xla_backend_optimization_level=0",
+            "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false",
         }  # fmt: skip
         with open(self.work / "worker.log", "ab") as log:
             self._process = subprocess.Popen(
