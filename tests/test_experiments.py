@@ -530,9 +530,13 @@ def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
 
 
 def test_processes_begin_without_ctrl_c():
-    with queue._interrupts_ignored():
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with queue._interrupts_ignored():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_experiments_and_benchmarks_have_one_writer_of_tables():
