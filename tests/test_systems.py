@@ -3,14 +3,13 @@
 import copy
 import dataclasses
 import functools
-import os
-import subprocess
 import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_fusions import passes_in_its_own_process
 from toy_system import Toy
 
 import a2tg_jax as a2tg
@@ -253,14 +252,8 @@ def test_photographs_stay_on_the_device_while_they_fit(scene):
     nothing.close()
 
 
-def test_results_do_not_depend_on_where_photographs_are(scene, monkeypatch):
-    """To the bit with XLA's own fusions, which a process of its own uses: without, the layout of a batch decides."""
-    if "fusion_emitters=false" in os.environ["XLA_FLAGS"]:
-        flags = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
-        name = f"{__file__}::test_results_do_not_depend_on_where_photographs_are"
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", name]
-        done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False)
-        assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
+def test_results_do_not_depend_on_where_photographs_are(scene, monkeypatch, request):
+    if passes_in_its_own_process(request):
         return
     system = tiny("gaussians-2d-mcmc")
     resident = a2tg.fit(scene, system, progress=False).model

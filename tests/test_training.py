@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from kept_checkpoints import fit_keeping_checkpoints
+from own_fusions import passes_in_its_own_process
 
 from a2tg_jax import (
     A2tg,
@@ -91,8 +92,11 @@ def test_resumed_run_is_the_same(scene, trained, tmp_path, which):
     assert_same(resumed, result)
 
 
-def test_shapes_of_earlier_runs_change_nothing(scene, trained, tmp_path):
+def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
     """Buckets with the room of another run's textures, one of them for a size that nobody has here."""
+    if passes_in_its_own_process(request):
+        return
+    trained = request.getfixturevalue("trained")
     model = trained[0].model
     capacities = (*(len(bucket) + 2 for bucket in model.params.buckets), 1)
     session = Session()
@@ -275,8 +279,10 @@ def test_wrong_arguments_of_fit_are_refused(scene, trained):
         fit_stage(scene, CONFIG, 2, progress=False)
 
 
-def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch):
+def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch, request):
     """More views a batch than there are of a size, and a cap below the Gaussians asked for."""
+    if passes_in_its_own_process(request):
+        return
     larger = synthetic_scene(num_views=8, width=48, height=30, num_points=150).train
     mixed = dataclasses.replace(scene, train=(scene.train[0], larger[1], scene.train[2]))
     config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=McmcConfig(cap=40))

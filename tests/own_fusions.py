@@ -1,0 +1,17 @@
+"""Tests that compare bits between programs of different layout, which hold with XLA's own fusions only."""
+
+import os
+import subprocess
+import sys
+
+
+def passes_in_its_own_process(request) -> bool:
+    """Run a test in a process with XLA's own fusions; False, if this is that process."""
+    if "fusion_emitters=false" not in os.environ["XLA_FLAGS"]:
+        return False
+    flags = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    name = f"{request.node.path}::{request.node.name}"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", name]
+    done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
+    return True
