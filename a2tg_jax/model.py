@@ -27,9 +27,9 @@ class Parameters(NamedTuple):
     """The floats of a model, or gradients of them."""
 
     gaussians: Gaussians
-    """Those of the Gaussians."""
+    """Floats of the Gaussians."""
     params: Any
-    """Those of the appearance."""
+    """Floats of the appearance."""
 
     def __repr__(self) -> str:
         return short_tuple_repr(self)
@@ -84,7 +84,7 @@ class Model:
 
     @property
     def parameters(self) -> Parameters:
-        """What is differentiated and trained: all floats of the model."""
+        """All floats of the model, which training differentiates and changes."""
         return Parameters(self.gaussians, self.params)
 
     def with_parameters(self, parameters: Parameters) -> "Model":

@@ -59,7 +59,7 @@ def run(spec, name, num_tiles, inputs, results, totals):
 
 
 def launch(spec, name, num_tiles, inputs, results, totals=()):
-    """As `kernels.cuda.launch.launch`."""
+    """Run a kernel on the CPU, with the arguments and results of `kernels.cuda.launch.launch`."""
     _kernel(spec, name)  # Here, for the callback's thread is not in 64-bit mode, and would trace for float32.
     given, wanted = _kinds([*inputs, *totals]), _kinds([*results, *totals])
 

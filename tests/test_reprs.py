@@ -1,4 +1,4 @@
-"""What a notebook and a console show of values: a line each, and pictures."""
+"""Values in a console, a line each, and in a notebook, as pictures."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""Which transformations of JAX the renderer supports, and with which compositor (docs/transformations.md)."""
+"""Transformations of JAX that each compositor supports (docs/transformations.md)."""
 
 import dataclasses
 import functools
@@ -146,6 +146,14 @@ def moved(parameters, direction, step):
     return jax.tree.map(lambda x, d: x + step * d, parameters, direction)
 
 
+def assert_differences(found, ahead, behind, step):
+    """Derivatives are the central differences of two gradients, `step` before and after."""
+    wanted = jax.tree.map(lambda a, b: (a - b) / (2 * step), ahead, behind)
+    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(wanted))
+    compare = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5 * largest)
+    jax.tree.map(compare, found, wanted)
+
+
 def dot(a, b):
     return sum(jnp.sum(x * y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
@@ -170,10 +178,7 @@ def test_derivatives_of_autodiff_are_those_of_differences():
     np.testing.assert_allclose(slope, (more - less) / (2 * step), rtol=1e-6)
 
     curvature = jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (direction,))[1])(parameters)
-    wanted = jax.tree.map(lambda a, b: (a - b) / (2 * step), ahead, behind)
-    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(wanted))
-    compare = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5 * largest)
-    jax.tree.map(compare, curvature, wanted)
+    assert_differences(curvature, ahead, behind, step)
 
 
 @pytest.mark.usefixtures("x64")
@@ -189,10 +194,7 @@ def test_gradient_of_a_gradient():
     found = jax.jit(jax.grad(lambda x: dot(jax.grad(loss)(x), direction)))(parameters)
     gradient_of, step = jax.jit(jax.grad(loss)), 3e-6
     ahead, behind = (gradient_of(moved(parameters, direction, by)) for by in (step, -step))
-    wanted = jax.tree.map(lambda a, b: (a - b) / (2 * step), ahead, behind)
-    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(wanted))
-    compare = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5 * largest)
-    jax.tree.map(compare, found, wanted)
+    assert_differences(found, ahead, behind, step)
 
 
 @pytest.mark.usefixtures("x64")

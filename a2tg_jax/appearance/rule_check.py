@@ -24,7 +24,7 @@ ODD_SHAPE = (5, 7)
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """What the element-wise functions of a rule are called with."""
+    """Numbers and dtype of the arguments of a rule's element-wise functions."""
 
     num_numbers: int
     """Number K of numbers of a splat."""

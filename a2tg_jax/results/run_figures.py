@@ -52,7 +52,7 @@ class Figures:
 
 
 class LevelMap(NamedTuple):
-    """What varies between the Gaussians of a model."""
+    """Level of each Gaussian in a property that varies, such as its degree."""
 
     file: str
     told: str

@@ -48,7 +48,7 @@ class Route:
 
 @dataclasses.dataclass(frozen=True)
 class Door:
-    """Where a server listens, and what requests must know to be let in."""
+    """Address at which a server listens, and the token that lets requests in."""
 
     name: str = LOOPBACK
     """Name or address by which the server was asked to listen."""

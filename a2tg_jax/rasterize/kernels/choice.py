@@ -24,7 +24,7 @@ REMEDIES: dict[Literal["cuda", "native"], str] = {
     "cuda": "JAX on an NVIDIA GPU and NVRTC: pip install 'a2tg-jax[cuda13]'",
     "native": "JAX on the CPU and llvmlite: pip install llvmlite",
 }
-"""What the compositors need that do not run everywhere."""
+"""Requirements of the compositors that do not run everywhere."""
 
 
 def choose(wanted: Wanted, tile_size: int) -> Compositor:

@@ -1,5 +1,7 @@
 """Splats and their texture regions as plain arrays for kernels, and cotangents back from such arrays."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -41,6 +43,22 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
         normals=packed[:, normal:first].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
         numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
     )
+
+
+def split_image(image: Array) -> tuple[Array, Array]:
+    """Split a kernel's image [tiles, D + 1, P] into channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
+    image = image[:, None]
+    return image[:, :, :-1], image[:, :, -1]
+
+
+def unpack_gradients(
+    settings: CompositingSettings, found: Sequence[Array], splats: Splats, texels: Array, probe: Array
+) -> tuple[Splats, Array, Array]:
+    """Unpack a kernel's gradients, of `KernelSpec.gradient_shapes`, as those of splats, texels and probe."""
+    packed, d_texels, d_probe = found
+    d_splats = unpack_splats(packed, splats, settings.has_geometry)
+    d_probe = d_probe.astype(probe.dtype) if settings.statistic else jnp.zeros_like(probe)
+    return d_splats, d_texels.astype(texels.dtype), d_probe
 
 
 def pack_regions(regions: TextureRegion | None) -> Array:

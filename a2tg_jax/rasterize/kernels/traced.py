@@ -12,9 +12,13 @@ from jax import Array
 from a2tg_jax.appearance import Arguments, StaticRule
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.rasterize import pixel
+from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.kernels.tracing import example, trace
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats, num_channels
+
+CUTOFF_SLACK = 1e-3
+"""Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +74,10 @@ class KernelSpec:
             statistic=settings.statistic,
             num_colors=settings.num_colors,
         )
+
+    def gradient_shapes(self, splats: Splats, texels: Array, probe: Array) -> tuple[tuple[int, ...], ...]:
+        """Return the shapes of a kernel's gradients of packed splats, texels and probe; without a statistic [1, 4]."""
+        return (len(splats.M), self.num_floats), texels.shape, probe.shape if self.statistic else (1, 4)
 
 
 class Functions:
@@ -131,7 +139,16 @@ class Functions:
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
 
-def place_of(primitive: str, spec: KernelSpec) -> str:
+def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], Any]) -> str | None:
+    """Return why a kind of kernels cannot be made for a spec; None if `translate` makes them."""
+    try:
+        translate(spec)
+    except Untranslatable as error:
+        return str(error) + (_place_of(error.primitive, spec) if error.primitive else "")
+    return None
+
+
+def _place_of(primitive: str, spec: KernelSpec) -> str:
     """Return in which function of a rule a primitive occurs, as in " in MyRule.shade"; "" if in none."""
     rule = spec.rule.rule
     for name, given in spec.arguments.of(()).items():

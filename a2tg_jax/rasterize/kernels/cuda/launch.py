@@ -21,13 +21,8 @@ DEFAULT_CAPABILITY = "9.0"
 
 def capability() -> str:
     """Return the least compute capability of this process's GPUs."""
-    devices = [device for device in jax.local_devices() if device.platform == "gpu"] if _has_gpu() else []
-    found = [device.compute_capability for device in devices]
+    found = [device.compute_capability for device in jax.local_devices() if device.platform == "gpu"]
     return min(found, key=lambda text: [int(part) for part in text.split(".")], default=DEFAULT_CAPABILITY)
-
-
-def _has_gpu() -> bool:
-    return jax.default_backend() == "gpu"
 
 
 def launch(

@@ -39,13 +39,6 @@ def _library() -> ctypes.CDLL:
     return ctypes.CDLL(str(path))
 
 
-def version() -> tuple[int, int]:
-    """Return NVRTC's version, that of its CUDA."""
-    major, minor = ctypes.c_int(), ctypes.c_int()
-    _check(_library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
-    return major.value, minor.value
-
-
 @functools.cache
 def ptx(source: str, capability: str) -> str:
     """Compile CUDA C++ to PTX.

@@ -9,14 +9,12 @@ import jax.numpy as jnp
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Corner, TextureRegion
 from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
-from a2tg_jax.rasterize.kernels.traced import Functions, KernelSpec
+from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions, KernelSpec
 from a2tg_jax.rasterize.kernels.tracing import example, trace
 
 Dialect = Literal["cuda", "opencl"]
 MOST_THREADS = 256
 WARP = 32
-CUTOFF_SLACK = 1e-3
-"""Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
 
 
 def num_threads(tile_size: int) -> int:
@@ -37,13 +35,14 @@ def source(spec: KernelSpec, dialect: Dialect) -> str:
       Untranslatable: if the appearance rule uses a primitive or a dtype that has no translation.
     """
     functions = Functions(spec)
-    constants = "".join(f"#define {name} {value}\n" for name, value in _constants(spec, functions.num_planes).items())
+    constants = _constants(spec, functions.num_planes)
+    defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
     real = f"typedef {'float' if spec.dtype == 'float32' else 'double'} real;\n"
     folder = resources.files(__package__)
     header, kernels = (folder.joinpath(name).read_text(encoding="utf-8") for name in (f"{dialect}.h", "tiles.c"))
     if dialect == "opencl" and spec.dtype == "float64":
         real = "#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" + real
-    return "\n".join([constants + real, header, *_pixel_functions(spec, functions), kernels])
+    return "\n".join([defines + real, header, *_pixel_functions(spec, functions, constants["COUNT"]), kernels])
 
 
 def _constants(spec: KernelSpec, num_planes: int) -> dict[str, Any]:
@@ -67,8 +66,8 @@ def _constants(spec: KernelSpec, num_planes: int) -> dict[str, Any]:
     }
 
 
-def _pixel_functions(spec: KernelSpec, functions: Functions) -> list[str]:
-    """Return the functions that tiles.c calls."""
+def _pixel_functions(spec: KernelSpec, functions: Functions, count: int) -> list[str]:
+    """Return the functions that tiles.c calls; `blend_vjp` writes `count` sums."""
     num_columns, has_texture = spec.num_columns, spec.num_columns > 0
     planes, numbers = Argument("planes", functions.num_planes), Argument("numbers", spec.num_floats - 1)
     M, tile = Argument("numbers", 9), (Argument("tile_x"), Argument("tile_y"))
@@ -77,7 +76,6 @@ def _pixel_functions(spec: KernelSpec, functions: Functions) -> list[str]:
     pixel = Argument("x"), Argument("y"), Argument("transmittance"), Argument("is_live", kind="int")
     state = Argument("transmittance_after"), Argument("is_live_after", kind="int")
     channels, after = Argument("channels", spec.num_channels), Argument("channels_after", spec.num_channels)
-    count = _constants(spec, functions.num_planes)["COUNT"]
     printed = [
         c_function("prepare", functions.prepare, [M, *tile], [planes]),
         c_function("prepare_vjp", functions.prepare_vjp, [M, *tile, planes], [Argument("d_M", 9)]),

@@ -16,10 +16,9 @@ from jax import Array
 from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import Outline
-from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 from a2tg_jax.rasterize.kernels.native import ffi, sums, threads
-from a2tg_jax.rasterize.kernels.packing import pack_inputs, unpack_splats
-from a2tg_jax.rasterize.kernels.traced import KernelSpec, place_of
+from a2tg_jax.rasterize.kernels.packing import pack_inputs, split_image, unpack_gradients
+from a2tg_jax.rasterize.kernels.traced import KernelSpec, refusal_of
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -40,11 +39,7 @@ def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats)
 def _refusal(spec: KernelSpec) -> str | None:
     from a2tg_jax.rasterize.kernels.native.passes import compiled_passes
 
-    try:
-        compiled_passes(spec)
-    except Untranslatable as error:
-        return str(error) + (place_of(error.primitive, spec) if error.primitive else "")
-    return None
+    return refusal_of(spec, compiled_passes)
 
 
 def forward(
@@ -57,8 +52,7 @@ def forward(
     shape = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
     inputs = pack_inputs(settings, splats, texels, regions, cutoff, lists)
     (image,) = ffi.call(name, [(shape, splats.M.dtype)], *inputs)
-    image = image[:, None]
-    return image[:, :, :-1], image[:, :, -1]
+    return split_image(image)
 
 
 def backward(
@@ -68,14 +62,11 @@ def backward(
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
     spec = KernelSpec.of(settings, static, splats, texels, regions)
     name = _registered(spec, "backward", _backward_handler)
-    dtype, num = splats.M.dtype, splats.M.shape[0]
-    shapes = (num, spec.num_floats), texels.shape, probe.shape if spec.statistic else (1, 4)
+    dtype, shapes = splats.M.dtype, spec.gradient_shapes(splats, texels, probe)
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
     inputs = (*pack_inputs(settings, splats, texels, regions, cutoff, lists), *cotangents)
-    packed, d_texels, d_probe = ffi.call(name, [(shape, dtype) for shape in shapes], *inputs)
-    d_splats = unpack_splats(packed, splats, spec.has_geometry)
-    d_probe = d_probe.astype(probe.dtype) if spec.statistic else jnp.zeros_like(probe)
-    return d_splats, d_texels.astype(texels.dtype), d_probe
+    found = ffi.call(name, [(shape, dtype) for shape in shapes], *inputs)
+    return unpack_gradients(settings, found, splats, texels, probe)
 
 
 def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:

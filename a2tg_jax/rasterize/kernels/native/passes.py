@@ -28,7 +28,7 @@ from a2tg_jax.rasterize.kernels.native.lanes import BOOL, INT, Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.texels import NativeTexture, Place, TexelWriter
 from a2tg_jax.rasterize.kernels.native.writer import LONG
-from a2tg_jax.rasterize.kernels.traced import Functions, KernelSpec
+from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions, KernelSpec
 
 INTEGERS = ("first", "last", "columns", "width", "height")
 FORWARD = ("ids", "starts", "splats", "regions", "texels", "result")
@@ -36,8 +36,6 @@ BACKWARD = (
     *("ids", "starts", "splats", "regions", "texels", "g", "suffix_sum", "jacobian", "d_splats", "d_texels", "d_probe"),
     *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
-CUTOFF_SLACK = 1e-3
-"""Margin of the squared distance within which a pixel is composited; `pixel.show` then decides exactly."""
 
 
 def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
