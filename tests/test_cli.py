@@ -1,5 +1,6 @@
 """The command line, from bad input to a whole tiny run that is interrupted and resumed."""
 
+import dataclasses
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from PIL import Image
 
 from a2tg_jax.cli import doctor
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.finish.compaction import measure_choices
 from a2tg_jax.host import startup
 from a2tg_jax.io.compact import load_compact
@@ -25,7 +27,7 @@ from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import compression, finishing, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.kept_lpips import sha256_of
-from a2tg_jax.results.record import SceneSource, read_record
+from a2tg_jax.results.record import SceneSource, read_record, write_record
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.training import SYSTEMS, find_system
 
@@ -399,6 +401,26 @@ def test_finished_run_resumes_to_the_same_metrics(tiny_run, capsys):
     assert cli.main(["eval", str(run.path)]) == 0
     assert "a2tg-textures" in capsys.readouterr().out
     assert json.loads(run.metrics.read_text())["models"]["a2tg-textures"]["test"] == before
+
+
+def test_validation_views_take_the_place_of_test_views(tiny_run, tmp_path, capsys):
+    """No figure of a run for choosing is of a test view, and each says of which views it is."""
+    run, *_ = tiny_run
+    copy = RunFolder(shutil.copytree(run.path, tmp_path / "copy"))
+    record = dataclasses.replace(read_record(run), scene=SceneSource("synthetic", 5, validation=True))
+    write_record(copy, record)
+    assert read_record(copy) == record and train_defaults(["--config", str(copy.record)]).validation
+    assert cli.main(["eval", str(copy.path)]) == 0
+    assert "validation PSNR (dB)" in capsys.readouterr().out
+    per_view = json.loads(copy.per_view.read_text())["a2tg-textures"]
+    whole = json.loads(run.per_view.read_text())["a2tg-textures"]
+    assert per_view.keys() == {"train", "validation"}
+    assert list(per_view["validation"]) == list(whole["train"])[::8]
+    assert per_view["train"].keys() == whole["train"].keys() - per_view["validation"].keys()
+    report = copy.report.read_text(encoding="utf-8")
+    assert "held out for validation" in report and "validation views: PSNR" in report and "test views" not in report
+    assert cli.main(["info", str(copy.path)]) == 0
+    assert "; validation " in capsys.readouterr().out
 
 
 def test_resume_refuses_other_numbers(tiny_run, capsys):

@@ -62,6 +62,24 @@ def test_every_grid_names_runs_that_can_be_trained(name, scale):
     assert len(set(places)) == len(places) == at_equal_number + len(grid.cells) * len(grid.at_equal_bytes)
 
 
+def test_choices_are_made_on_validation_views(tmp_path):
+    """No run for choosing holds test views, nor is it taken for a run that does, and its pages say so."""
+    final = next(read_grid("claim", "smoke").jobs({}))
+    choosing = next(read_grid("claim", "smoke", validation=True).jobs({}))
+    assert choosing == dataclasses.replace(final, validation=True) and choosing.key != final.key
+    assert choosing.start is None or choosing.start.validation
+    folders = Folders(tmp_path, tmp_path)
+    whole, scene = folders.load_scene(final), folders.load_scene(choosing)
+    assert [view.name for view in scene.test] == [view.name for view in whole.train[::8]]
+    assert {view.name for view in (*scene.train, *scene.test)} == {view.name for view in whole.train}
+    lab = Lab(argument_parser("").parse_args(["--scale", "smoke", "--validation", "--out", str(tmp_path)]))
+    assert lab.grid("claim").validation
+    lab.write("page", "# Title\n")
+    assert "validation views" in (tmp_path / "page.md").read_text()
+    named = Lab(argument_parser("").parse_args(["--scale", "smoke", "--validation", "--tables-only"]))
+    assert named.out.name == "smoke-validation"
+
+
 def test_every_grid_belongs_to_an_experiment_that_says_what_it_shows():
     known = experiments()
     assert {name for experiment in known.values() for name in experiment.grids} == set(NAMES)

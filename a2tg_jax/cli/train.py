@@ -101,6 +101,8 @@ class Train:
     """Hold out every k-th image for testing."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
+    validation: bool = False
+    """Hold out every eighth training image in place of the test images, to choose options without seeing these."""
     compare: UseAppendAction[tuple[str, ...]] = ()
     """System to train for comparison; may be repeated. It takes every option above and below that it has."""
     baseline: bool = False
@@ -149,7 +151,7 @@ class Train:
         """Record of the run that the flags ask for."""
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
-        source = SceneSource(path, self.downscale, self.test_every, self.alpha)
+        source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.validation)
         return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset, self.on_nan)
 
     def _resumed(self, run: RunFolder) -> RunRecord:
@@ -190,6 +192,7 @@ def train_defaults(arguments: list[str]) -> Train:
         downscale=file.downscale,
         test_every=file.test_every,
         alpha=file.alpha,
+        validation=file.validation,
         compare=file.compare,
         on_nan=file.on_nan,
         options=file.chosen(path),

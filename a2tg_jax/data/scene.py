@@ -24,6 +24,8 @@ LONGEST_PREVIEW = 800
 """Longest side in pixels of the picture of a view in a notebook."""
 NUM_THUMBNAILS = 8
 """Number of training views in the picture of a scene."""
+VALIDATION_EVERY = 8
+"""Interval of validation views among the training views."""
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
 GENERIC_NAMES = {
@@ -236,6 +238,20 @@ def scene_name(folder: Path) -> str:
     parts = folder.resolve().parts
     told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
     return "/".join(parts[told[-1] if told else -1 :])
+
+
+def with_validation_views(scene: Scene) -> Scene:
+    """Return the scene for choosing options: every eighth training view is held out in place of the test views.
+
+    Cameras, points and world stay those of the whole scene. Test views are left out, so that no choice can see them.
+
+    Raises:
+      ValueError: if there is one training view only.
+    """
+    if len(scene.train) < 2:
+        raise ValueError(f"{scene.name}: validation views are taken from at least 2 training views; there is 1")
+    train = [view for index, view in enumerate(scene.train) if index % VALIDATION_EVERY]
+    return dataclasses.replace(scene, train=tuple(train), test=scene.train[::VALIDATION_EVERY])
 
 
 def check_test_every(test_every: int) -> None:

@@ -31,7 +31,12 @@ TITLES = {
 
 
 def measure_corrected(
-    model: Model, scene: Scene, plan: RunPlan, settings: RenderSettings, lpips_weights: str | os.PathLike[str] | None
+    model: Model,
+    scene: Scene,
+    plan: RunPlan,
+    settings: RenderSettings,
+    lpips_weights: str | os.PathLike[str] | None,
+    held_out: str = "test",
 ) -> dict[str, Evaluation]:
     """Return the further figures of a model, by split and way, if any system of its run learns exposures or poses.
 
@@ -41,13 +46,13 @@ def measure_corrected(
     has_poses = any(planned.system.refine_poses for planned in plan.stages)
     measure = functools.partial(evaluate, settings=settings, lpips_weights=lpips_weights)
     found: dict[str, Evaluation] = {}
-    for split, views in (("test", scene.test), ("train", scene.train)):
+    for split, views in ((held_out, scene.test), ("train", scene.train)):
         if not views:
             continue
         if has_exposure:
             found[f"{split}_color_fit"] = measure(views, model, fit_colors=True)
         if has_poses:
-            moved = align_poses(views, model, settings=settings) if split == "test" else refined_views(views, model)
+            moved = refined_views(views, model) if split == "train" else align_poses(views, model, settings=settings)
             found[f"{split}_aligned"] = measure(moved, model)
             if has_exposure:
                 found[f"{split}_aligned_color_fit"] = measure(moved, model, fit_colors=True)

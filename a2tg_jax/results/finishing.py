@@ -52,7 +52,7 @@ class Finished:
     @property
     def text(self) -> str:
         """Table of bytes and PSNR, before and after each step."""
-        rows = ("", "bytes", "train PSNR (dB)", "test PSNR (dB)")
+        rows = ("", "bytes", "train PSNR (dB)", "held-out PSNR (dB)")
         lines = aligned([rows, *((name, *found.column) for name, found in self.steps.items())])
         kept = kept_step(self.steps)
         is_last = kept == list(self.steps)[-1]
@@ -62,7 +62,7 @@ class Finished:
 def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_weights: Path | None = None) -> Finished:
     """Finish the last model of a run's main system, and evaluate it in a new run folder.
 
-    Choices are made on training views; test views are measured alone.
+    Choices are made on training views; held-out views are only measured.
 
     Args:
       source: the run; it is not changed.

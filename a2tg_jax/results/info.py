@@ -11,7 +11,7 @@ from a2tg_jax.results.folder import RunFolder, iteration_of, read_json
 from a2tg_jax.results.record import read_record, repeating_command
 from a2tg_jax.results.replacement import old_run
 
-SPLITS = ("test", "train")
+SPLITS = ("test", "validation", "train")
 
 
 def describe_run(run: RunFolder) -> str:
@@ -41,7 +41,7 @@ def describe_run(run: RunFolder) -> str:
 
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
-    """Return the PSNR in a metrics.json: model → test or train → dB.
+    """Return the PSNR in a metrics.json: model → test or validation, train → dB.
 
     Raises:
       ValueError: if the file holds anything else in their place.

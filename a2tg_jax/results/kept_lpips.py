@@ -33,7 +33,7 @@ def with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict
 
 
 def _with_lpips(found: ModelResult, kept: Mapping[str, Any], network: str) -> ModelResult:
-    test = None if found.test is None else _merged(found.test, kept["test"], network)
+    test = None if found.test is None else _merged(found.test, kept[found.held_out], network)
     corrected = {key: _merged(evaluation, kept[key], network) for key, evaluation in found.corrected.items()}
     train = _merged(found.train, kept["train"], network)
     return dataclasses.replace(found, train=train, test=test, corrected=corrected)

@@ -22,7 +22,7 @@ import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.mask_files import AlphaMeaning
-from a2tg_jax.data.scene import scene_name
+from a2tg_jax.data.scene import scene_name, with_validation_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -42,6 +42,7 @@ DEFAULT_SYSTEM = "a2tg"
 LONGEST_REASON = 500
 OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
+HeldOut = Literal["test", "validation"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +57,13 @@ class SceneSource:
     """Interval k of test views: every k-th view is held out."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask."""
+    validation: bool = False
+    """Whether every eighth training view is held out for choosing options, in place of the test views."""
+
+    @property
+    def held_out(self) -> HeldOut:
+        """Kind of the views that are held out."""
+        return "validation" if self.validation else "test"
 
     @property
     def name(self) -> str:
@@ -72,10 +80,13 @@ class SceneSource:
         Raises:
           FileNotFoundError, ValueError: as `load_scene` does.
         """
+        every = self.test_every
         if self.path == SYNTHETIC:
             width, height = SYNTHETIC_SIZE
-            return synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=self.test_every)
-        return load_scene(self.path, downscale=self.downscale, test_every=self.test_every, alpha=self.alpha, room=room)
+            scene = synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=every)
+        else:
+            scene = load_scene(self.path, downscale=self.downscale, test_every=every, alpha=self.alpha, room=room)
+        return with_validation_views(scene) if self.validation else scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +153,7 @@ class RunFile:
     downscale: int = 1
     test_every: int = 8
     alpha: AlphaMeaning = "transparency"
+    validation: bool = False
     system: str = DEFAULT_SYSTEM
     preset: str | None = None
     compare: tuple[str, ...] = ()
@@ -218,6 +230,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "downscale": record.scene.downscale,
         "test_every": record.scene.test_every,
         "alpha": record.scene.alpha,
+        **({"validation": True} if record.scene.validation else {}),
         "system": record.name,
         **({} if record.preset is None else {"preset": record.preset}),
         "compare": list(record.compare),
@@ -247,7 +260,7 @@ def read_record(run: RunFolder) -> RunRecord:
     file = read_run_file(run.record)
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
-    source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha)
+    source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.validation)
     system = file.chosen(str(run.record))
     record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan)
     try:

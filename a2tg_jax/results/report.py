@@ -80,13 +80,15 @@ class ShownComparison:
 def write_report(run: RunFolder, result: RunResult, views: Iterable[ShownComparison], figures: Figures) -> None:
     """Write report.html from the results, some views, and the figures in the run folder."""
     shown = next(iter(result.models.values()))
-    num_test = len(shown.test.per_view) if shown.test else 0
+    held_out = result.record.scene.held_out
+    num_held_out = len(shown.test.per_view) if shown.test else 0
     page = _page(
         sections=SECTIONS,
         title=f"{next(iter(result.plan.chains))} on {result.scene}",
         about=(inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0],
-        num_views=len(shown.train.per_view) + num_test,
-        num_test_views=num_test,
+        num_views=len(shown.train.per_view) + num_held_out,
+        num_held_out=num_held_out,
+        purpose={"test": "testing", "validation": "validation"}[held_out],
         viewer=run.viewer.name if run.viewer.is_file() else None,
         warnings=learning_lines(result),
         cards=_cards(result),
@@ -95,7 +97,7 @@ def write_report(run: RunFolder, result: RunResult, views: Iterable[ShownCompari
         corrections={key.partition("_")[2] for key in result.models[result.main].corrected},
         comparisons=views,
         figures=figures,
-        views=[(split, *_views(result, split)) for split in ("test", "train") if getattr(shown, split)],
+        views=[(split, *_views(result, split)) for split in (held_out, "train") if split in shown.splits],
         files=_files(run, result),
         configuration=_configuration(result),
         versions=versions(),
@@ -133,7 +135,7 @@ def _cards(result: RunResult) -> list[tuple[str, str]]:
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     others = sum(measured.seconds for measured in result.models.values()) - own
     return [
-        (f"{'Test' if last.test else 'Training'} PSNR", f"{last.shown.psnr:.2f} dB"),
+        (f"{last.held_out.capitalize() if last.test else 'Training'} PSNR", f"{last.shown.psnr:.2f} dB"),
         *gains,
         ("SSIM", f"{last.shown.ssim:.4f}"),
         ("Gaussians", f"{last.num_gaussians:,}"),
@@ -172,7 +174,7 @@ def _views(result: RunResult, split: str) -> Table:
     """Return PSNR and SSIM of each view by each model, whose bytes stand beside its name."""
     names = _main_first(result)
     sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
-    found = zip(*(getattr(result.models[name], split).per_view for name in names), strict=True)
+    found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)
     rows, best = [], set()
     for at, views in enumerate(found):
         rows.append([views[0].name, *(f"{view.psnr:.2f} / {view.ssim:.4f}" for view in views)])

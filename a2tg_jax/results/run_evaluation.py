@@ -29,7 +29,7 @@ from a2tg_jax.results.images import (
 )
 from a2tg_jax.results.kept_lpips import sha256_of, with_kept_lpips
 from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import read_record
+from a2tg_jax.results.record import HeldOut, read_record
 from a2tg_jax.results.report import Comparison, ShownComparison, write_report
 from a2tg_jax.results.run_figures import write_figures
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
@@ -60,7 +60,7 @@ def evaluate_run(
     scene = scene or record.scene.load()
     measured = {
         name: dataclasses.replace(
-            _measure(model, scene, plan, plan[name].system, _seconds(run, name), lpips_weights),
+            _measure(model, scene, plan, plan[name].system, _seconds(run, name), lpips_weights, record.scene.held_out),
             sha256=sha256_of(run.model(name)),
         )
         for name, model in models.items()
@@ -107,6 +107,7 @@ def _measure(
     system: System,
     seconds: float,
     lpips_weights: str | os.PathLike[str] | None,
+    held_out: HeldOut,
 ) -> ModelResult:
     views = (*scene.test, *scene.train)
     found = evaluate(views, model, settings=settings_of(system), lpips_weights=lpips_weights)
@@ -119,7 +120,8 @@ def _measure(
         num_published_bytes=model.num_published_bytes,
         num_padding_bytes=model.num_padding_bytes,
         seconds=seconds,
-        corrected=measure_corrected(model, scene, plan, settings_of(system), lpips_weights),
+        corrected=measure_corrected(model, scene, plan, settings_of(system), lpips_weights, held_out),
+        held_out=held_out,
     )
 
 

@@ -13,15 +13,15 @@ import jax
 from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.corrected import corrected_title
 from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import RunRecord
+from a2tg_jax.results.record import HeldOut, RunRecord
 
-FIGURES = (
-    "test PSNR (dB)", "test SSIM", "test LPIPS", "train PSNR (dB)", "train SSIM", "train LPIPS", "Gaussians",
-    "texels a Gaussian", "memory (MB)", "as published (MB)", "padding (MB)", "frames a second", "training time",
-)  # fmt: skip
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
+FIGURES = (
+    "Gaussians", "texels a Gaussian", "memory (MB)", "as published (MB)", "padding (MB)", "frames a second",
+    "training time",
+)  # fmt: skip
 NUM_QUALITIES = 2 * len(QUALITIES)
-"""Number of the first figures, of test and training views."""
+"""Number of the first figures, of held-out and training views."""
 EQUAL_BYTES = 0.01
 """Largest relative difference of two sizes that are called equal."""
 
@@ -32,7 +32,7 @@ class ModelResult:
 
     train: Evaluation
     test: Evaluation | None
-    """Metrics of the test views; None without test views."""
+    """Metrics of the held-out views; None without such views."""
     num_gaussians: int
     num_texels: int
     """Number of texels; 0 without textures."""
@@ -48,16 +48,18 @@ class ModelResult:
     """SHA-256 of the model's file."""
     corrected: Mapping[str, Evaluation] = dataclasses.field(default_factory=dict)
     """Metrics up to exposure and pose (`results.corrected`), if a system of the run learns these."""
+    held_out: HeldOut = "test"
+    """Kind of the held-out views."""
 
     @property
     def splits(self) -> dict[str, Evaluation]:
         """All evaluations, by their names in metrics.json."""
-        test = {} if self.test is None else {"test": self.test}
-        return {"train": self.train, **test, **self.corrected}
+        held_out = [] if self.test is None else [(str(self.held_out), self.test)]
+        return {"train": self.train, **dict(held_out), **self.corrected}
 
     @property
     def shown(self) -> Evaluation:
-        """Evaluation of the test views, or of the training views if there are none."""
+        """Evaluation of the held-out views, or of the training views if there are none."""
         return self.test or self.train
 
 
@@ -115,7 +117,7 @@ def metrics_json(result: RunResult) -> dict[str, Any]:
 
 
 def per_view_json(result: RunResult) -> dict[str, Any]:
-    """Return the content of per_view.json: model → train or test → view → metrics."""
+    """Return the content of per_view.json: model → train, test or validation → view → metrics."""
     return {
         name: {
             split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
@@ -141,8 +143,9 @@ def versions() -> dict[str, str]:
 def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
     """Return titles and rows of the headline table: a column for each model, a row for each metric present."""
     models = result.models.values()
+    qualities = [f"{split} {name}" for split in (result.record.scene.held_out, "train") for name in QUALITIES]
     columns = [_figures(measured) for measured in models]
-    rows = [[name, *cells] for name, *cells in zip(FIGURES, *columns, strict=True)]
+    rows = [[name, *cells] for name, *cells in zip((*qualities, *FIGURES), *columns, strict=True)]
     keys = dict.fromkeys(key for measured in models for key in measured.corrected)
     further = [
         row for key in keys for row in _corrected_rows(key, [measured.corrected.get(key) for measured in models])

@@ -35,7 +35,8 @@ class Lab:
     def __init__(self, args: argparse.Namespace):
         self.args = args
         self.scale: str = args.scale
-        self.out: Path = args.out or EXPERIMENTS / "results" / args.scale
+        name = f"{args.scale}-validation" if args.validation else args.scale
+        self.out: Path = args.out or EXPERIMENTS / "results" / name
         self.work: Path = args.work or EXPERIMENTS.parent / "runs" / "experiments" / args.scale
         network = None if args.lpips_weights is None else load_lpips(args.lpips_weights).network
         self.folders = Folders(args.scenes, self.work, args.lpips_weights, network)
@@ -45,7 +46,8 @@ class Lab:
     def grid(self, name: str) -> Grid:
         """Return a grid with the requested scenes."""
         held_out = not self.args.without_held_out
-        return read_grid(name, self.scale, scenes=self.args.only, held_out=held_out, own=self.own_scenes)
+        only, validation = self.args.only, self.args.validation
+        return read_grid(name, self.scale, scenes=only, held_out=held_out, own=self.own_scenes, validation=validation)
 
     @property
     def own_scenes(self) -> tuple[SceneAt, ...]:
@@ -95,6 +97,8 @@ class Lab:
 
     def write(self, name: str, text: str) -> None:
         """Print a page and save it among the results."""
+        if self.args.validation:
+            text = f"*Measured on validation views, taken from the training views; test views were not used.*\n\n{text}"
         path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -220,6 +224,8 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip
     add("--downscale", type=int, default=1, help="factor by which the photographs of --scene are downscaled")
     add("--without-held-out", action="store_true", help="leave out the held-out scenes")
+    add("--validation", action="store_true",
+        help="hold out every eighth training view in place of the test views, to choose options by")  # fmt: skip
     add("--out", type=Path, help="folder of records, tables and plots; runs finished in it are never run again")
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")
     add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet); without them LPIPS is left out")

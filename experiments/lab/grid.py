@@ -89,6 +89,8 @@ class Grid:
     """Methods at the cell's number of Gaussians."""
     at_equal_bytes: tuple[Method, ...]
     """Methods at the final bytes of the reference."""
+    validation: bool = False
+    """Whether validation views are held out in place of the test views."""
 
     def runs(self, records: Mapping[str, Record]) -> Iterator[Run]:
         """Yield every run that can be named already, in the order of the cells."""
@@ -117,7 +119,7 @@ class Grid:
         basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
         for changes in (basis, cell.scene.options, method.options):
             system = with_changes(system, changes, f"{self.name}: {method.label}")
-        return Job(cell.scene.path, cell.scene.downscale, system, len(system.stages()) - 1)
+        return Job(cell.scene.path, cell.scene.downscale, system, len(system.stages()) - 1, self.validation)
 
 
 def splats_in(mb: float, method: Method) -> int:
@@ -151,6 +153,7 @@ def read_grid(
     scenes: Sequence[str] | None = None,
     held_out: bool = True,
     own: Sequence[SceneAt] = (),
+    validation: bool = False,
 ) -> Grid:
     """Read an experiment's grid at a scale from `grids/NAME.toml`.
 
@@ -158,6 +161,7 @@ def read_grid(
       scenes: labels of the wanted scenes; None for those that the file, or else the scale, names.
       held_out: whether held-out scenes count.
       own: scenes that take the place of all these; empty for none.
+      validation: whether validation views are held out in place of the test views.
 
     Raises:
       ValueError: if the file lacks the scale, or a scene or method is unknown.
@@ -184,6 +188,7 @@ def read_grid(
     return Grid(
         name, file["title"], scale, settings["preset"], tuple(dict.fromkeys(cells)), method(file["reference"]),
         (*methods_in("methods"), *methods_in("variants")), methods_in("at_equal_bytes"),
+        validation,
     )  # fmt: skip
 
 

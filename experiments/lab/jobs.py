@@ -45,6 +45,8 @@ class Job:
     system: a2tg.System
     stage: int
     """Index of the system's stage, from 0."""
+    validation: bool = False
+    """Whether validation views are held out in place of the test views."""
 
     @property
     def start(self) -> "Job | None":
@@ -70,7 +72,8 @@ class Job:
 @functools.lru_cache(maxsize=10_000)
 def _key(job: Job) -> str:
     numbers = [fingerprint(job.system, index) for index in range(job.stage + 1)]
-    digest = hashlib.sha256(repr((job.scene, job.downscale, numbers)).encode()).hexdigest()[:12]
+    held_out = ("validation",) if job.validation else ()
+    digest = hashlib.sha256(repr((job.scene, job.downscale, numbers, *held_out)).encode()).hexdigest()[:12]
     return f"{job.scene.replace('/', '-')}-{job.downscale}-{job.system.stages()[job.stage].name}-{digest}"
 
 
@@ -124,7 +127,8 @@ class Folders:
 
     def load_scene(self, job: Job) -> a2tg.Scene:
         is_folder = job.scene != "synthetic"
-        return SceneSource(str(self.scenes / job.scene) if is_folder else job.scene, job.downscale).load()
+        path = str(self.scenes / job.scene) if is_folder else job.scene
+        return SceneSource(path, job.downscale, validation=job.validation).load()
 
 
 def run_job(job: Job, folders: Folders) -> Record:
@@ -188,7 +192,7 @@ def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Rec
 
 
 def _quality(scene: a2tg.Scene, model: a2tg.Model, folders: Folders) -> Record:
-    """Return quality on the test views and on some training views."""
+    """Return quality on the held-out views and on some training views."""
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
     background = background_of(scene)
     on_test = a2tg.evaluate(scene.test, model, background=background, lpips_weights=folders.lpips_weights)
