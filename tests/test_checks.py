@@ -13,7 +13,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.checks import check_floats, check_shape, described
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.text import shortened
-from a2tg_jax.training.losses import depth_normals, mean_opacity, mean_scale
+from a2tg_jax.training.losses import depth_normals, mean_scale
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 SETTINGS = a2tg.RenderSettings(capacity=1024)
@@ -92,7 +92,6 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.normal_consistency(IMAGE, MAP[None], MAP, CAMERA), "depth must be [12, 16]; got [1, 12, 16]"),
         (lambda: a2tg.normal_consistency(MAP, MAP, MAP, CAMERA), "normal must be [12, 16, 3]; got [12, 16]"),
         (lambda: depth_normals(MAP, MAP[:5] > 0, CAMERA), "is_valid must be [12, 16]; got [5, 16]"),
-        (lambda: mean_opacity(FLAT_SH, 7), "gaussians.sh must be [7, 16, 3]"),
         (lambda: mean_scale(some_gaussians(), jnp.ones(7)), "num_live must be []; got [7]"),
         (lambda: moved(gaussians=FLAT_SH), "gaussians.sh must be [7, 16, 3]"),
         (lambda: moved(num_live=jnp.ones(7)), "num_live must be []; got [7]"),

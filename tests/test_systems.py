@@ -361,6 +361,16 @@ def test_like_takes_options_of_the_same_name():
     assert other.stages()[0] == main.stages()[0]
 
 
+def test_the_opacity_term_acts_on_what_a_billboard_shows(scene):
+    """Billboards do not use the Gaussians' opacity: the term fades their pictures."""
+    alphas = []
+    for weight in (0.0, 0.5):
+        system = tiny("bbsplat", loss={"opacity_weight": weight})
+        model = a2tg.fit(scene, system, progress=False).model
+        alphas.append(float(jnp.mean(model.appearance.opacities(model.gaussians, model.params, model.layout))))
+    assert alphas[0] > 1.05 * alphas[1]
+
+
 def test_gradients_of_a_sweep_are_those_of_its_numbers(scene):
     """A traced weight is the weight: twice the opacity term fades Gaussians more."""
     means = []

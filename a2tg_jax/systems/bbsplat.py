@@ -7,8 +7,11 @@ from typing import ClassVar, Self
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.mcmc import FillingMcmc, Mcmc
 from a2tg_jax.systems.stage1 import ANY_RATE, FLOATS_PER_TEXEL, MCMC_OPTIONS, QUICK, SMOKE, continued, growing_stage
-from a2tg_jax.training.options import Ranges, System
-from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.options import LossConfig, Ranges, System
+from a2tg_jax.training.stage import LearningRates, Stage
+
+AUTHORS_OPACITY_WEIGHT = 0.01
+AUTHORS_RATES = LearningRates(sh_degree0=5e-3, sh_rest=2.5e-4)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +43,8 @@ class BBSplat(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 2_000
     """Further iterations without densification; 0: none."""
+    loss: LossConfig = dataclasses.field(default_factory=lambda: LossConfig(opacity_weight=AUTHORS_OPACITY_WEIGHT))
+    rates: LearningRates = dataclasses.field(default_factory=lambda: AUTHORS_RATES)
     densify: BillboardMcmcConfig = dataclasses.field(default_factory=BillboardMcmcConfig)
     billboard: BillboardConfig = dataclasses.field(default_factory=BillboardConfig)
 
@@ -65,11 +70,11 @@ class BBSplat(System):
         return {
             "paper": cls(),
             "quick": cls(
-                **QUICK,
+                **QUICK, loss=LossConfig(),
                 densify=BillboardMcmcConfig(cap=2_000), billboard=BillboardConfig(rgb=1e-2, alpha=4e-3),
             ),
             "smoke": cls(
-                **SMOKE, stage2_iterations=0, densify=BillboardMcmcConfig(cap=800),
+                **SMOKE, stage2_iterations=0, loss=LossConfig(), densify=BillboardMcmcConfig(cap=800),
                 billboard=BillboardConfig(side=8, rgb=1e-2, alpha=1e-2),
             ),
         }  # fmt: skip

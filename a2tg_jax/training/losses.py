@@ -139,10 +139,9 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
     return normalize(normal), is_defined
 
 
-def mean_opacity(gaussians: Gaussians, num_live: Array | int) -> Array:
-    """Return the mean opacity of the first `num_live` rows (the opacity regulariser of 3DGS-MCMC)."""
-    check_gaussians(gaussians)
-    return _live_mean(gaussians.opacities, num_live)
+def mean_opacity(opacities: Array, num_live: Array | int) -> Array:
+    """Return the mean of the first `num_live` of N opacities (the opacity regulariser of 3DGS-MCMC)."""
+    return _live_mean(opacities, num_live)
 
 
 def mean_scale(gaussians: Gaussians, num_live: Array | int) -> Array:

@@ -31,7 +31,7 @@ class LossConfig:
     distortion_weight: float = 0.0
     """Depth distortion of 2DGS."""
     opacity_weight: float = 0.0
-    """Mean opacity of the live Gaussians (3DGS-MCMC uses 0.01)."""
+    """Mean opacity of the live splats, or mean alpha of their pictures (3DGS-MCMC and BBSplat use 0.01)."""
     scale_weight: float = 0.0
     """Mean scale of the live Gaussians (3DGS-MCMC uses 0.01)."""
 

@@ -72,8 +72,8 @@ def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
 
 
 def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Return the mean opacity of the live Gaussians (3DGS-MCMC)."""
-    return mean_opacity(model.gaussians, model.live_count)
+    """Return the mean opacity of the live splats as their appearance has it (3DGS-MCMC; BBSplat: the mean alpha)."""
+    return mean_opacity(model.appearance.opacities(model.gaussians, model.params, model.layout), model.live_count)
 
 
 def scale(model: Model, target: Target, output: RenderOutput) -> Array:
