@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 OPTIONS = ("--std=c++17",)
-LEAST_ISA = {9: "8.1", 10: "8.8", 12: "8.8"}
+LEAST_ISA = {7: "8.1", 8: "8.1", 9: "8.1", 10: "8.8", 12: "8.8"}
 """PTX version that the kernels need, by the major compute capability: 8.1 brought atomic sums of four floats."""
 
 
@@ -64,9 +64,12 @@ def ptx(source: str, capability: str) -> str:
 
 
 def _declared(text: str, capability: str) -> str:
-    """Declare the PTX version that the kernels need, not NVRTC's own: a driver refuses versions newer than itself."""
-    least = LEAST_ISA.get(int(capability.split(".")[0]), "8.1")
-    return re.sub(r"^\.version \S+", f".version {least}", text, count=1, flags=re.MULTILINE)
+    """Declare the PTX version that the kernels need, not NVRTC's own: a driver refuses versions newer than itself.
+
+    The version stays NVRTC's own for capabilities that are not known here.
+    """
+    least = LEAST_ISA.get(int(capability.split(".")[0]))
+    return text if least is None else re.sub(r"^\.version \S+", f".version {least}", text, count=1, flags=re.MULTILINE)
 
 
 def _text(program: ctypes.c_void_p, what: str) -> str:
