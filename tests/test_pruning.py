@@ -90,7 +90,8 @@ def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along(share):
     np.testing.assert_array_equal(change.moments.mu[0].quats[:, 0], change.rows)
     np.testing.assert_array_equal(change.moments.nu[0].means[:, 2], 2 * change.rows)
     moved = SplitByGradient(400).gather(statistics, change.rows)
-    np.testing.assert_array_equal(moved.total, np.asarray(statistics.total)[change.rows])
+    np.testing.assert_array_equal(moved.gradients.total, np.asarray(statistics.gradients.total)[change.rows])
+    np.testing.assert_array_equal(moved.pixels, np.asarray(statistics.pixels)[change.rows])
 
 
 def test_so_many_are_kept_as_were_asked_for():

@@ -13,8 +13,15 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState, adam_init
-from a2tg_jax.densify.splitting import SplitByGradient, draw_distinct_hosts, draw_weights, split_rows
-from a2tg_jax.events import Now, Times
+from a2tg_jax.densify.splitting import (
+    SplitByGradient,
+    SplitStatistics,
+    draw_distinct_hosts,
+    draw_weights,
+    logits_of_halves,
+    split_rows,
+)
+from a2tg_jax.events import Now, Seen, Times
 from a2tg_jax.mcmc import plan_growth, plan_relocation
 from a2tg_jax.model import Model
 
@@ -22,7 +29,7 @@ NUM, LIVE = 400, 300
 KEY = jax.random.key(0)
 
 
-def some_state(seed: int = 0) -> tuple[Model, AdamState, GradientStatistics]:
+def some_state(seed: int = 0) -> tuple[Model, AdamState, SplitStatistics]:
     """A model with 100 rows to spare, moments of ones, and statistics that differ."""
     rng = np.random.default_rng(seed)
     opacities = np.where(np.arange(NUM) % 10 == 3, 0.001, rng.uniform(0.1, 0.9, NUM))
@@ -30,7 +37,7 @@ def some_state(seed: int = 0) -> tuple[Model, AdamState, GradientStatistics]:
     moments = adam_init((model.gaussians, model.params))
     moments = dataclasses.replace(moments, mu=jax.tree.map(jnp.ones_like, moments.mu))
     statistics = GradientStatistics(jnp.asarray(rng.uniform(0, 3, NUM), jnp.float32), jnp.full(NUM, 3, jnp.int32))
-    return model, moments, statistics
+    return model, moments, SplitStatistics(statistics, jnp.full(NUM, 5.0))
 
 
 def by_weight(weights):
@@ -41,7 +48,7 @@ def by_weight(weights):
 def test_hosts_are_drawn_by_gradient_and_size():
     model, _, statistics = some_state()
     scales = np.asarray(model.gaussians.scales)
-    wanted = np.asarray(statistics.total) / 3 * np.sqrt(scales[:, 0] * scales[:, 1])
+    wanted = np.asarray(statistics.gradients.total) / 3 * np.sqrt(scales[:, 0] * scales[:, 1])
     np.testing.assert_allclose(draw_weights(model, statistics), wanted, rtol=1e-5)
     # The frequencies of a single draw are those of the weights, whatever the opacities.
     grown = jax.jit(
@@ -112,8 +119,42 @@ def test_hosts_and_copies_become_halves(seed):
     np.testing.assert_array_equal(np.asarray(new_moments.mu[0].means)[:330, 0], np.where(is_split, 0, 1)[:330])
     shares = np.bincount(rows[:330], minlength=NUM)
     np.testing.assert_allclose(
-        new_statistics.total[:330], (np.asarray(statistics.total) / np.maximum(shares, 1))[rows[:330]], rtol=1e-5
+        new_statistics.gradients.total[:330],
+        (np.asarray(statistics.gradients.total) / np.maximum(shares, 1))[rows[:330]],
+        rtol=1e-5,
     )
+    np.testing.assert_allclose(new_statistics.pixels[:330], np.where(is_split, 5 / 1.6, 5)[:330], rtol=1e-6)
+
+
+@pytest.mark.parametrize("opacity", [0.03, 0.5, 0.9999])
+def test_two_halves_of_a_splat_below_the_filter_are_no_more_opaque_than_halves_of_a_large_one(opacity):
+    """Opacity is −log(1 − o) times the area that the filter draws: it falls by 1/1.6² for each half, at any size."""
+    pixels = np.asarray([0.0, 0.01, 0.3, 0.7, 0.8, 1.0, 1.13, 1.2, 50.0])
+    before = jnp.log(opacity) - jnp.log1p(-opacity)
+    after = np.asarray(jax.nn.sigmoid(logits_of_halves(jnp.full(9, before), jnp.asarray(pixels))), np.float64)
+    assert after[0] == after[-1] == pytest.approx(opacity, rel=1e-5)
+    drawn = lambda opacity, pixels: -np.log1p(-opacity) * np.maximum(pixels**2, 0.5)  # noqa: E731
+    ratio = drawn(after, pixels / 1.6)[1:] / drawn(opacity, pixels)[1:]
+    np.testing.assert_allclose(ratio, 1 / 1.6**2, rtol=2e-3)
+    assert np.isfinite(logits_of_halves(jnp.asarray([90.0, -90.0]), jnp.asarray([0.1, 0.1]))).all()
+
+
+def test_sizes_on_the_screen_are_the_largest_of_the_views_that_show_a_splat():
+    scene = a2tg.synthetic_scene(num_points=50, downscale=4)
+    model = a2tg.Model(random_gaussians(3, 0, np.full(3, 0.5)))
+    cameras = [view.camera for view in scene.train[:2]]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    visible = jnp.asarray([[True, True, False], [True, False, False]])
+    event = SplitByGradient(10)
+    found = event.observe(event.init(model), model, Seen(stacked, jnp.zeros((2, 3, 3)), visible, jnp.zeros((2, 3, 3))))
+    scales = np.asarray(model.gaussians.scales, np.float64).min(axis=1)
+
+    def size(index, camera):
+        depth = (np.asarray(camera.viewmat) @ [*np.asarray(model.gaussians.means[index]), 1])[2]
+        return max(0.0, float(scales[index] * np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / depth)) if depth > 0.2 else 0.0
+
+    wanted = [max(size(0, cameras[0]), size(0, cameras[1])), size(1, cameras[0]), 0.0]
+    np.testing.assert_allclose(found.pixels, wanted, rtol=1e-5)
 
 
 def test_the_dead_are_moved_onto_halves():

@@ -4,6 +4,10 @@
 detail is missing. Here the weight of a host is the change of the loss by a move of its own size. Host and copies become
 halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`densify`).
 
+A splat below the low-pass filter is drawn as large as the filter, however small it is. Two halves of it that kept its
+opacity would be twice as opaque together, where two halves of a large splat cover 2/1.6² = 0.78 of its area. So halves
+share opacity in proportion to what the filter adds to their area (`logits_of_halves`).
+
 Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its weight is thousands of
 times that of others: with replacement it would be the host of nearly all new Gaussians.
 """
@@ -16,15 +20,28 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.appearance.copies import DEAD_OPACITY, LARGEST_OPACITY
+from a2tg_jax.core.gaussians import logit
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.densify.clone_split import halved
+from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
+from a2tg_jax.densify.clone_split import SPLIT_SHRINK, halved
 from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, event, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
 
 LEAST_WEIGHT = 1e-12
 """Weight of a host that no view has seen."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SplitStatistics:
+    """What a step saw of N Gaussians since the last event."""
+
+    gradients: GradientStatistics
+    pixels: Array
+    """[N] largest of the smaller standard deviations on the screen, in pixels; 0 if no view has composited it."""
 
 
 @event
@@ -36,11 +53,16 @@ class SplitByGradient(FillingMcmc):
     def statistic(self) -> Statistic:
         return "position"
 
-    def init(self, model: Model) -> GradientStatistics:
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+    def init(self, model: Model) -> SplitStatistics:
+        num, dtype = model.gaussians.num, model.gaussians.means.dtype
+        return SplitStatistics(GradientStatistics.init(num, dtype), jnp.zeros(num, dtype))
 
-    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
-        return state.observe_views(seen.gradients, seen.is_visible)
+    def observe(self, state: SplitStatistics, model: Model, seen: Seen) -> SplitStatistics:
+        gaussians = model.gaussians
+        of_view = functools.partial(pixel_sizes, gaussians.means, gaussians.scales)
+        sizes = jnp.where(seen.is_visible, jax.vmap(of_view)(seen.cameras.viewmat, seen.cameras.K), 0.0)
+        gradients = state.gradients.observe_views(seen.gradients, seen.is_visible)
+        return SplitStatistics(gradients, jnp.maximum(state.pixels, jnp.max(sizes, axis=0)))
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         to_move, to_add, to_split = jax.random.split(now.keys[0], 3)
@@ -59,10 +81,10 @@ class SplitByGradient(FillingMcmc):
         return model.appearance.opacities(model.gaussians, model.params, model.layout)
 
 
-def draw_weights(model: Model, state: GradientStatistics) -> Array:
+def draw_weights(model: Model, state: SplitStatistics) -> Array:
     """Return [N] weights of hosts: average gradient by position, times the size."""
     size = jnp.exp(jnp.mean(model.gaussians.log_scales, axis=1))
-    return state.average() * size + LEAST_WEIGHT
+    return state.gradients.average() * size + LEAST_WEIGHT
 
 
 def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: Array) -> Array:
@@ -86,13 +108,38 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
 
 
 def split_rows(
-    key: Array, moves: Moves, model: Model, moments: AdamState, state: GradientStatistics
-) -> tuple[Model, AdamState, GradientStatistics]:
+    key: Array, moves: Moves, model: Model, moments: AdamState, state: SplitStatistics
+) -> tuple[Model, AdamState, SplitStatistics]:
     """Copy rows from their hosts. Hosts and copies are halved, lose Adam's moments and share the statistic."""
     is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
-    total = state.total / moves.num_shares.astype(state.total.dtype)
-    state = GradientStatistics(total[moves.rows], state.views[moves.rows])
+    pixels, found = state.pixels[moves.rows], state.gradients
+    total = found.total / moves.num_shares.astype(found.total.dtype)
+    gradients = GradientStatistics(total[moves.rows], found.views[moves.rows])
+    state = SplitStatistics(gradients, jnp.where(is_split, pixels / SPLIT_SHRINK, pixels))
     moments = clear_moments(model, moments, is_split)
     num_live = model.live_count + moves.info.num_added
     model = dataclasses.replace(gather_rows(model, moves.rows), num_live=num_live)
-    return dataclasses.replace(model, gaussians=halved(key, model.gaussians, is_split)), moments, state
+    gaussians = halved(key, model.gaussians, is_split)
+    if model.appearance.has_low_pass:
+        logits = logits_of_halves(gaussians.logit_opacities, pixels)
+        logits = jnp.where(is_split, logits, gaussians.logit_opacities)
+        gaussians = dataclasses.replace(gaussians, logit_opacities=logits)
+    return dataclasses.replace(model, gaussians=gaussians), moments, state
+
+
+def logits_of_halves(logit_opacities: Array, pixels: Array) -> Array:
+    """Return the logits of the opacities [N] of the halves of splats.
+
+    The filter draws a splat over an area of max(s², filter²). Without it, halves would have 1/1.6² of that area. Where
+    the filter makes them k times larger, k in 1..1.6², their opacity is 1 − (1 − o)^(1/k), at least that of the dead.
+
+    Args:
+      logit_opacities: [N] of the splats before.
+      pixels: [N] their standard deviations s in pixels; 0 for those that no view has shown, which keep theirs.
+    """
+    before = jnp.maximum(pixels * pixels, FILTER_VARIANCE)
+    after = jnp.maximum((pixels / SPLIT_SHRINK) ** 2, FILTER_VARIANCE)
+    ratio = SPLIT_SHRINK**2 * after / before
+    opacities = -jnp.expm1(jax.nn.log_sigmoid(-logit_opacities) / ratio)
+    shared = logit(jnp.clip(opacities, DEAD_OPACITY, LARGEST_OPACITY))
+    return jnp.where((pixels > 0) & (ratio > 1), jnp.minimum(shared, logit_opacities), logit_opacities)

@@ -10,22 +10,18 @@ import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points
+from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
 NO_ROW_LOG_SCALE = -10.0
 """Log-scales and opacity logit of spare rows."""
 KEY_OF_PARAMETERS = 0x7E8E1
-FILTER_VARIANCE = 0.5
-"""Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
 LEAST_OPACITY = INITIAL_OPACITY
 """Lower bound of the reduced opacities: the initial opacity of 3DGS."""
-NEAR = RenderSettings.near_plane
-"""Depth from which splats are drawn."""
 SMALLEST_SIDE = 1e-6
 
 
@@ -73,13 +69,11 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
 
 def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the smaller standard deviation of Gaussians in pixels [N], from the camera where it is largest."""
-    means, scales = np.asarray(gaussians.means, np.float64), np.asarray(gaussians.scales, np.float64).min(axis=1)
+    means, scales = np.asarray(gaussians.means, np.float64), np.asarray(gaussians.scales, np.float64)
     largest = np.zeros(len(means))
     for camera in cameras:
         viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
-        depths = means @ viewmat[2, :3] + viewmat[2, 3]
-        pixels = np.where(depths > NEAR, scales * np.sqrt(K[0, 0] * K[1, 1]) / np.maximum(depths, NEAR), 0.0)
-        largest = np.maximum(largest, pixels)
+        largest = np.maximum(largest, pixel_sizes(means, scales, viewmat, K))
     return largest
 
 
