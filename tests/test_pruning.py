@@ -172,4 +172,4 @@ def test_what_other_events_have_gathered_follows(scene):
 def gathered(run: StageRun) -> tuple[np.ndarray, np.ndarray]:
     """Where the Gaussians are, and what was gathered of each."""
     num = run.model.num
-    return np.asarray(run.state.model.gaussians.means)[:num], np.asarray(run.state.events[1].total)[:num]
+    return np.asarray(run.state.model.gaussians.means)[:num], np.asarray(run.state.events[1].gradients.total)[:num]
