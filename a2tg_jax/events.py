@@ -34,7 +34,7 @@ class Times(NamedTuple):
     last: Any
     every: Any
 
-    def is_due(self, iteration: Array) -> Array:
+    def is_due(self, iteration: Any) -> Array:
         """Return whether the event follows this iteration."""
         is_due: Array = (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
         return is_due

@@ -172,6 +172,17 @@ def test_same_seed_same_result(scene, trained):
     assert_same(fit(scene, CONFIG, progress=False), trained[0])
 
 
+def test_events_that_the_host_decides_are_those_of_the_step(scene, trained, monkeypatch):
+    """As on GPUs: a program for each pattern of due events, two in the first stage, and the same numbers."""
+    monkeypatch.setattr(loop, "are_events_decided_by_host", lambda: True)
+    before = jitted_step().num_compiled()
+    result = fit(scene, CONFIG, progress=False)
+    assert jitted_step().num_compiled() - before == 2 + 1 + NUM_EVENTS + result.num_regrown
+    leaves = zip(jax.tree.leaves(result.model), jax.tree.leaves(trained[0].model), strict=True)
+    for own, other in leaves:
+        np.testing.assert_allclose(own, other, rtol=1e-4, atol=1e-5)
+
+
 def test_checkpoint_of_another_configuration_is_refused(scene, trained):
     other = dataclasses.replace(CONFIG, seed=4)
     with pytest.raises(ValueError, match="another configuration"):

@@ -61,6 +61,15 @@ Watch = Callable[["StageRun", IsStopped], float]
 reuses its buffers. It returns the seconds it took, which are not counted as training."""
 
 
+def are_events_decided_by_host() -> bool:
+    """Return whether the host says which events are due, in which case a step is compiled for each pattern of them.
+
+    A GPU waits for the host at each decision inside a step, and cannot launch the step as one graph. On CPUs one
+    program for all steps takes less time to compile.
+    """
+    return jax.default_backend() != "cpu"
+
+
 def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
     """Training that nobody looks at."""
     return 0.0
@@ -235,9 +244,14 @@ class StageRun:
     def _arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
-        settings = StepSettings(self._settings(self._size(iteration)), self.system.background)
+        due = self._due(iteration) if are_events_decided_by_host() else None
+        settings = StepSettings(self._settings(self._size(iteration)), self.system.background, due)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
         return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
+
+    def _due(self, iteration: int) -> tuple[bool, ...]:
+        """Return whether each event follows this iteration inside its step."""
+        return tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments, step = self._arguments(iteration), jitted_step()

@@ -64,6 +64,9 @@ class StepSettings:
     render: RenderSettings
     """Render settings with a capacity."""
     background: Background
+    due: tuple[bool, ...] | None = None
+    """Which events of the stage are due, one program for each pattern; None: the step itself decides. On a GPU a
+    decision inside the step would wait for the host."""
 
 
 class StepInfo(NamedTuple):
@@ -167,7 +170,7 @@ def attempt(
     model, moments = _updated(stage, state, grads, rate)
     now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
     seen = _seen(stage, batch, own, found)
-    model, moments, events, info = _events(stage, clock, now, seen, model, moments, state.events)
+    model, moments, events, info = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
     corrections = tuple(
         updated(correction, known, rows, grad, progress)
         for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
@@ -283,17 +286,19 @@ def _updated(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array) 
 
 
 def _events(
-    stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState, states: Sequence[Any]
-) -> tuple[Model, AdamState, tuple[Any, ...], EventInfo]:
+    due: tuple[bool, ...] | None, stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState,
+    states: Sequence[Any],
+) -> tuple[Model, AdamState, tuple[Any, ...], EventInfo]:  # fmt: skip
     """Gather statistics for the events, and apply those inside the step."""
     infos, left, at = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)), [], 0
-    for event, times, state in zip(stage.events, clock.times, states, strict=True):
+    known = due or (None,) * len(stage.events)
+    for event, times, state, is_due in zip(stage.events, clock.times, states, known, strict=True):
         if state is not None and event.observes:
             state = event.observe(state, model, seen)
         if isinstance(event, StepEvent):
             own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
             at += event.num_keys
-            model, moments, state, info = _at_its_times(event, times, own, model, moments, state)
+            model, moments, state, info = _at_its_times(event, times, is_due, own, model, moments, state)
             possible = infos.is_possible & info.is_possible
             infos = EventInfo(possible, infos.num_refused + info.num_refused)
         left.append(state)
@@ -301,9 +306,13 @@ def _events(
 
 
 def _at_its_times(
-    event: StepEvent, times: Times | None, now: Now, model: Model, moments: AdamState, state: Any
+    event: StepEvent, times: Times | None, is_due: bool | None, now: Now, model: Model, moments: AdamState, state: Any
 ) -> tuple[Model, AdamState, Any, EventInfo]:
-    """Return the change by an event if it is due; events that are past make none."""
+    """Return the change by an event if it is due; events that are past make none.
+
+    Args:
+      is_due: whether it is, if the host knows.
+    """
     if times is None:
         change = event.apply(now, model, moments, state)
         return change.model, change.moments, change.state, change.info
@@ -318,6 +327,8 @@ def _at_its_times(
     def wait(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
         return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
 
+    if is_due is not None:
+        return (happen if is_due else wait)((model, moments, state))
     changed: tuple[Model, AdamState, Any, EventInfo]
     changed = jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
     return changed
