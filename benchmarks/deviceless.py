@@ -1,13 +1,16 @@
-"""Compile the CUDA kernels for a GPU on a machine without one, and print the memory that they need.
+"""Compile kernels and training steps for a GPU on a machine without one, and print the memory that they need.
 
     pip install --no-deps jax-cuda13-plugin==X.Y.Z jax-cuda13-pjrt==X.Y.Z     # of the installed jax X.Y.Z
     python -m benchmarks.deviceless h200.txtpb --ptxas ptxas
 
 The argument is XLA's description of the GPU (openxla/xla, xla/backends/gpu/target_config/specs). Nothing is executed.
-With ptxas, registers and spills of each kernel are printed beside the temporary memory of the whole program.
+With ptxas, registers and spills of each kernel are printed beside the temporary memory of the whole program. Of a step,
+launches are the kernels that XLA starts one after the other. Without a GPU, XLA compiles a sort as one launch of a slow
+kernel; on a GPU it is a few launches of CUB's. A branch is a place where the step waits for the host.
 """
 
 import argparse
+import collections
 import dataclasses
 import functools
 import os
@@ -18,6 +21,12 @@ import tempfile
 
 NUM_GAUSSIANS, NUM_PAIRS = 1_000_000, 10_000_000
 WIDTH, HEIGHT, TILE_SIZE = 1920, 1088, 16
+STEPS = (("plain", "gaussians-2d-mcmc", 0, 500_000), ("textured", "a2tg", 1, 1_000_000))
+"""Name, system and stage of each step, and the number of Gaussians."""
+STEP_SIZE, STEP_PHOTOGRAPHS = (1600, 1060), 8
+SIDES, SHARES = (1, 2, 4), (0.7, 0.2, 0.1)
+"""Sides of the textures of a step, and the share of the Gaussians with each."""
+LAUNCH = re.compile(r"^  \S.*? = .*? (fusion|custom-call|copy|sort|while|conditional)\(", re.MULTILINE)
 SPILLS = re.compile(r"(\d+) bytes spill stores, (\d+) bytes spill loads")
 REGISTERS = re.compile(r"Used (\d+) registers")
 NAMES = re.compile(r"Compiling entry function '(\w+)'")
@@ -34,6 +43,56 @@ def main() -> None:
         memory = compiled.memory_analysis().temp_size_in_bytes / 1e6
         registers = assembled(spec, args.ptxas)[kernel] if args.ptxas else ""
         print(f"{name:32s} temporary memory {memory:6.1f} MB  {registers}", flush=True)
+    for name, system, stage, num in STEPS:
+        compiled = compile_for(args.target, *step(system, stage, num), donate_argnums=(2,))
+        memory, kinds = compiled.memory_analysis(), launches(compiled.as_text())
+        sizes = memory.argument_size_in_bytes / 1e9, memory.temp_size_in_bytes / 1e9
+        branches = kinds.get("conditional", 0) + kinds.get("while", 0)
+        told = f"{sum(kinds.values()) - branches} launches, {branches} branches, state {sizes[0]:.2f} GB"
+        print(f"{f'step, {name}, {num:,}':32s} {told}, temporary memory {sizes[1]:.2f} GB", flush=True)
+
+
+def launches(text: str) -> dict[str, int]:
+    """Return the number of instructions of the entry computation that start work on the GPU, by their kind."""
+    entry = text[text.index("\nENTRY ") :]
+    return collections.Counter(LAUNCH.findall(entry[: entry.index("\n}")]))
+
+
+def step(name: str, index: int, num: int):
+    """Return the training step of a stage between two events, and the shapes of its arguments."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from a2tg_jax.core.gaussians import init_from_points
+    from a2tg_jax.model import Model
+    from a2tg_jax.render import RenderSettings
+    from a2tg_jax.texture import allocate_textures
+    from a2tg_jax.training import find_system
+    from a2tg_jax.training.batches import Photographs
+    from a2tg_jax.training.step import StepSettings, initial_state, train_step
+
+    rng, (width, height), views = np.random.default_rng(0), STEP_SIZE, STEP_PHOTOGRAPHS
+    stage = find_system(name).preset("paper").stages()[index]
+    gaussians = init_from_points(rng.normal(size=(num, 3)), np.full((num, 3), 0.5))
+    params, layout = stage.appearance.allocate(jax.random.key(0), gaussians[:1])
+    if jax.tree.leaves(params):
+        params, layout = allocate_textures(np.repeat(rng.choice(SIDES, (num, 1), p=SHARES), 2, axis=1))
+    model = Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+    clock = stage.clock()
+    due = tuple(times is None for times in clock.times)
+    settings = StepSettings(RenderSettings(capacity=10 * num, tile_size=TILE_SIZE, compositor="cuda"), "black", due)
+    photographs = Photographs(
+        np.zeros((views, 4, 4), np.float32), np.zeros((views, 3, 3), np.float32),
+        np.zeros((views, height, width, 3), np.uint8), None,
+    )  # fmt: skip
+    key = jax.random.key_data(jax.random.key(0))
+    arguments = stage, clock, initial_state(stage, model), photographs, np.zeros(1, np.int32), np.float32(1), key
+
+    def function(stage, clock, state, photographs, views, scale, key):
+        return train_step(settings, stage, clock, state, photographs, views, scale, jax.random.wrap_key_data(key))
+
+    return function, jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)), arguments)
 
 
 def programs():
@@ -78,7 +137,7 @@ def programs():
             yield f"{name}, backward{' with statistic' if statistic else ''}", "backward", backward, inputs, spec
 
 
-def compile_for(target: pathlib.Path, function, inputs):
+def compile_for(target: pathlib.Path, function, inputs, **options):
     """Return the program for the GPU that the file describes."""
     import jax
     from jax.experimental import topologies
@@ -87,7 +146,7 @@ def compile_for(target: pathlib.Path, function, inputs):
     mesh = topologies.make_mesh(topology, (1,), ("x",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
     placed = jax.tree.map(lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=sharding), inputs)
-    return jax.jit(function).lower(*placed).compile()
+    return jax.jit(function, **options).lower(*placed).compile()
 
 
 @functools.cache
