@@ -2,10 +2,10 @@
 
 import os
 
+from xla_flags import TEST_FLAGS
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Compiling takes most of the time of these tests. Unoptimised code is ready in a third of it, and in half of that
-# without MLIR's fusions. Command lines that tests start inherit both.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("XLA_FLAGS", TEST_FLAGS)  # Command lines that tests start inherit them.
 
 import pathlib
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from fuzz_readers import READERS, Reader
+from xla_flags import TEST_FLAGS
 
 WELL = ("read", "refused")
 SECONDS_A_CASE, SECONDS_TO_START = 60.0, 300.0
@@ -55,7 +56,7 @@ class Worker:
         environment = os.environ | {
             "JAX_PLATFORMS": "cpu", "PYTHONDONTWRITEBYTECODE": "1", "MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": "1",
             "TMPDIR": str(self.work / "tmp"), "XDG_CACHE_HOME": str(self.work / "tmp"), "A2TG_NUM_THREADS": "1",
-            "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false",
+            "XLA_FLAGS": TEST_FLAGS,
         }  # fmt: skip
         with open(self.work / "worker.log", "ab") as log:
             self._process = subprocess.Popen(

@@ -4,12 +4,14 @@ import os
 import subprocess
 import sys
 
+from xla_flags import UNOPTIMISED
+
 
 def passes_in_its_own_process(request) -> bool:
     """Run a test in a process with XLA's own fusions; False, if this is that process."""
     if "fusion_emitters=false" not in os.environ["XLA_FLAGS"]:
         return False
-    flags = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    flags = {"XLA_FLAGS": UNOPTIMISED}
     name = f"{request.node.path}::{request.node.name}"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", name]
     done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False)

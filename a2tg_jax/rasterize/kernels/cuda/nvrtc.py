@@ -33,7 +33,9 @@ def find() -> Path | None:
 def _library() -> ctypes.CDLL:
     path = find()
     if path is None:
-        raise ModuleNotFoundError("GPU kernels need NVRTC, which is not installed: pip install 'a2tg-jax[cuda13]' (or [cuda12])")
+        raise ModuleNotFoundError(
+            "GPU kernels need NVRTC, which is not installed: pip install 'a2tg-jax[cuda13]', or [cuda12]"
+        )
     for builtins in sorted(path.parent.glob("*nvrtc-builtins*")):
         ctypes.CDLL(str(builtins), mode=getattr(ctypes, "RTLD_GLOBAL", 0))
     return ctypes.CDLL(str(path))
