@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -132,6 +133,22 @@ def test_error_in_a_process_of_its_own(tmp_path):
     assert done.stderr.startswith("a2tg: error: ") and done.stderr.count("\n") == 1
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "A2TG_DEBUG": "1"})
     assert done.returncode == 1 and "Traceback" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
+def test_a_command_that_imported_pycolmap_ends_by_a_signal_with_one_line():
+    """pycolmap's import replaces the handlers of signals with some that print a C++ stack."""
+    script = """
+import sys, time
+from a2tg_jax.cli import main as cli
+from a2tg_jax.data.colmap_library import pycolmap
+cli.Info.run = lambda _: (pycolmap(), print("ready", flush=True), time.sleep(60))
+sys.exit(cli.main(["info", "run"]))
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=-1, stderr=-1, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.terminate()
+    assert process.communicate()[1] == "a2tg: interrupted\n" and process.returncode == 128 + signal.SIGTERM
 
 
 # Help
