@@ -9,6 +9,7 @@ from PIL import Image
 
 from a2tg_jax import save_model, synthetic_scene
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.arguments import flag_with_value
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.results import whole_run
@@ -75,7 +76,8 @@ MISTAKES = {
     f"{SYNTHETIC[:-3]}run": "add --resume to continue it, --overwrite",
     "train --out nowhere --resume": "is not a run folder",
     f"{SYNTHETIC[:-3]}run --resume --overwrite": "give one of them",
-    f"{SYNTHETIC[:-3]}run --resume --seed 5": "leave out --seed",
+    f"{SYNTHETIC[:-3]}run --resume --seed 5": "leave out --seed, or start a new run: a2tg train --config run/run.toml --seed 5 --out …",
+    "train --out run --resume --preset quick": "a resumed run keeps its preset, paper: leave out --preset quick",
     "train photos --out run --resume": "was trained on synthetic",
     f"{SYNTHETIC} --lpips-weights photo.png": "photo.png",
     f"{SYNTHETIC} --config nowhere.toml": "no such configuration file",
@@ -158,3 +160,9 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, place, mista
     assert printed.err.startswith("a2tg: error: ") and printed.err.count("\n") == 1
     assert MISTAKES[mistake] in printed.err and len(printed.err) < 600
     assert sorted(place.rglob("*")) == before
+
+
+def test_flags_are_told_as_they_are_typed():
+    options = {"seed": 5, "texture.upscale_at": (0.1, 0.2), "texture.is_on": True, "texture.is_off": False}
+    told = ["--seed 5", "--texture.upscale-at 0.1 0.2", "--texture.is-on", "--texture.no-is-off"]
+    assert [flag_with_value(*option) for option in options.items()] == told

@@ -5,6 +5,7 @@ import difflib
 import io
 import os
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar
 
@@ -30,6 +31,20 @@ def defaulting_to(text: str) -> Any:
 
 LastModel = Annotated[str | None, defaulting_to("the last model of the main system")]
 """Name of a model of a run; None: the last one of its main system."""
+
+
+def flag_of(name: str) -> str:
+    """Return the flag of an option."""
+    return "--" + name.replace("_", "-")
+
+
+def flag_with_value(name: str, value: Any) -> str:
+    """Return the flag of an option with its value, as it is typed."""
+    if isinstance(value, bool):
+        group, dot, own = name.rpartition(".")
+        return flag_of(name if value else f"{group}{dot}no_{own}")
+    words = value if isinstance(value, list | tuple) else [value]
+    return shlex.join([flag_of(name), *map(str, words)])
 
 
 def parse(kind: type[Parsed], program: str, arguments: Sequence[str], **options: Any) -> Parsed:

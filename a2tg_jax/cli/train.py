@@ -8,10 +8,11 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from a2tg_jax.cli.arguments import defaulting_to
+from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.text import shortened
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.lock import opened
@@ -35,6 +36,7 @@ from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import Session, System
 
 BASELINE = "gaussians-2d-mcmc"
+DEFAULT_PRESET = "paper"
 DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
     stage2_iterations=250,
@@ -92,7 +94,7 @@ class Train:
     """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
     system: str = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
-    preset: Annotated[str | None, defaulting_to("paper")] = None
+    preset: Annotated[str | None, defaulting_to(DEFAULT_PRESET)] = None
     """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
     (the conventions of the authors' program)."""
     downscale: int = 1
@@ -161,15 +163,22 @@ class Train:
             raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
         changed = changed_numbers(asked, kept)
         if changed:
-            flags = ", ".join("--" + name.replace("_", "-") for name in changed)
-            advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
-            raise ValueError(f"--resume takes every option from {run.record}; {advice}")
+            raise ValueError(f"--resume takes every option from {run.record}; {self._told_changes(run, changed)}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
         record.check()
         if record != kept:
             write_record(run, record)
         return record
+
+    def _told_changes(self, run: RunFolder, changed: list[str]) -> str:
+        """Return how to go on if these options differ from those of the run that is resumed."""
+        names = ["system"] if "system" in changed else changed
+        told, leaves = ", ".join(map(flag_of, names)), self.record.leaves()
+        if self.config is not None:
+            return f"leave out --config {self.config}, which differs in {told}"
+        flags = " ".join(flag_with_value(name, leaves[name]) for name in names)
+        return f"leave out {told}, or start a new run: a2tg train --config {run.record} {flags} --out …"
 
 
 def train_defaults(arguments: list[str]) -> Train:
@@ -179,7 +188,8 @@ def train_defaults(arguments: list[str]) -> Train:
     out = _value_of("--out", arguments)
     if out and "--resume" in arguments and "--overwrite" not in arguments:
         with opened(out) as run:
-            path = path if path or preset else str(run.record)
+            path = path or str(run.record)
+            preset = _checked_preset(run, preset)
     file = read_run_file(Path(path)) if path else RunFile()
     if preset or (system and system != file.system):
         # The numbers of the file are those of another preset or system.
@@ -197,6 +207,18 @@ def train_defaults(arguments: list[str]) -> Train:
         on_nan=file.on_nan,
         options=file.chosen(path),
     )
+
+
+def _checked_preset(run: RunFolder, preset: str) -> str:
+    """Return an empty preset, which leaves the options of a resumed run as they are.
+
+    Raises:
+      ValueError: if another preset than the run's is asked for.
+    """
+    kept = read_run_file(run.record).preset or DEFAULT_PRESET
+    if preset and preset != kept:
+        raise ValueError(f"a resumed run keeps its preset, {kept}: leave out --preset {shortened(preset)}")
+    return ""
 
 
 def _value_of(flag: str, arguments: list[str]) -> str:
