@@ -444,7 +444,7 @@ def test_resume_refuses_other_numbers(tiny_run, capsys):
     run, *_ = tiny_run
     again = ("train", "synthetic", "--out", run.path, "--resume")
     assert "leave out --texture.k-a" in fails(capsys, *again, "--texture.k-a", "9")
-    assert "leave out --preset, which differs in --downscale, " in fails(capsys, *again, "--preset", "quick")
+    assert "a resumed run keeps its preset, paper" in fails(capsys, *again, "--preset", "quick")
     assert "there is no system" in fails(capsys, *again, "--compare", "b2tg")
     assert "was trained on synthetic" in fails(capsys, "train", run.path, "--out", run.path, "--resume")
 

@@ -76,7 +76,7 @@ MISTAKES = {
     f"{SYNTHETIC[:-3]}run": "add --resume to continue it, --overwrite",
     "train --out nowhere --resume": "is not a run folder",
     f"{SYNTHETIC[:-3]}run --resume --overwrite": "give one of them",
-    f"{SYNTHETIC[:-3]}run --resume --seed 5": "leave out --seed, or start a new run: a2tg train --config run/run.toml --seed 5 --out …",
+    f"{SYNTHETIC[:-3]}run --resume --seed 5": "or start a new run: a2tg train --config run/run.toml --seed 5 ",
     "train --out run --resume --preset quick": "a resumed run keeps its preset, paper: leave out --preset quick",
     "train photos --out run --resume": "was trained on synthetic",
     f"{SYNTHETIC} --lpips-weights photo.png": "photo.png",

@@ -26,6 +26,7 @@ from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.lock import opened
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.whole_run import measure
 from a2tg_jax.training import SYSTEMS
@@ -98,6 +99,8 @@ class Compress:
     """Largest loss of PSNR in dB."""
 
     def run(self) -> None:
+        if self.out is not None:
+            check_output(self.out)
         result = compress(self.source, self.out, max_loss=self.max_loss)
         print(compression_text(result))
         print(f"file: {result.path}")

@@ -9,6 +9,7 @@ from tyro.conf import Positional
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.sfm import Matching
 from a2tg_jax.results.forecast import quick_downscale, quick_flags
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_apart
 
 
@@ -33,6 +34,7 @@ class Sfm:
 
     def run(self) -> None:
         check_apart(self.out, self.photos)
+        check_output(self.out)
         found = run_sfm(self.photos, self.out, matching=self.matching)
         print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
         run = ["a2tg", "train", str(self.out), "--out", f"runs/{self.out.resolve().name}"]

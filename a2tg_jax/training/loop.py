@@ -116,7 +116,12 @@ class StageRun:
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations)
         self.learning = LearningCheck(
-            self.views, self.order, self.stage.iterations, system.background, is_first=index == 0
+            self.views,
+            self.order,
+            self.stage.iterations,
+            system.background,
+            is_first=index == 0,
+            small_budget=system.small_budget,
         )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}

@@ -75,5 +75,10 @@ class ProgressBar:
         if len(history.iteration):
             num, megabytes = int(history.num_gaussians[-1]), float(history.megabytes[-1])
             self._bar.set_postfix_str(
-                f"loss {self._loss:.4f}, {self._psnr:.2f} dB, {num:,} Gaussians, {megabytes:.2f} MB", refresh=False
+                f"loss {self._loss:.4f}, {self._psnr:.2f} dB, {num:,} Gaussians, {told_size(megabytes)}", refresh=False
             )
+
+
+def told_size(megabytes: float) -> str:
+    """Return the size of a model in MB, or in kB where MB would round to nothing."""
+    return f"{megabytes:.2f} MB" if megabytes >= 0.01 else f"{1e3 * megabytes:.1f} kB"
