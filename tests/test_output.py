@@ -6,9 +6,12 @@ from pathlib import Path
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
+from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import warn_of_small_budget
+from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
 from a2tg_jax.training.progress import told_size
 
@@ -51,3 +54,15 @@ def test_a_limit_below_the_program_itself_says_so():
 
 def test_small_models_are_told_in_kilobytes():
     assert [told_size(size) for size in (0.0007, 0.01, 2.5)] == ["0.7 kB", "0.01 MB", "2.50 MB"]
+
+
+def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg()))
+    run.metrics.write_text("{")
+    run.model("a2tg-gaussians").parent.mkdir()
+    run.model("a2tg-gaussians").write_bytes(b"PK")
+    told = describe_run(run)
+    assert f"damaged  {run.metrics}" in told and f"a2tg eval {run.path} rewrites it" in told
+    assert "a2tg-gaussians  damaged: " in told and "a2tg-textures   not begun" in told
+    assert told.endswith(f"training is not finished; continue with: a2tg train --out {run.path} --resume")

@@ -1,14 +1,13 @@
 """Whole runs, from checks to report, begun or resumed by one process at a time."""
 
 import contextlib
-import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
-from a2tg_jax.results.folder import RunFolder, check_free, create_run
+from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
 from a2tg_jax.results.record import RunRecord, read_record, write_record
@@ -121,4 +120,4 @@ def how_to_go_on(run: RunFolder) -> str:
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     if finished and not checkpoints:
         last = f"the last model is {finished[-1]}"
-    return f"{last}; continue with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"
+    return f"{last}; continue with: {resuming_command(run)}"
