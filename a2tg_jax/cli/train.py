@@ -59,16 +59,19 @@ class Demo:
     """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
+    quiet: bool = False
+    """Show no progress of training; forecasts, warnings and results stay."""
 
     def run(self) -> None:
         if self.resume:
             _check_resumed_only(self.overwrite)
             with opened(self.out) as run:
                 scene = read_record(run).scene.load()
-                tell_result(go_on(run, scene, session=tidy_session()), self.out)
+                tell_result(go_on(run, scene, session=tidy_session(), progress=not self.quiet), self.out)
             return
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
-        tell_result(begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session()), self.out)
+        result = begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session(), progress=not self.quiet)
+        tell_result(result, self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +121,8 @@ class Train:
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: Path | None = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
+    quiet: bool = False
+    """Show no progress of training; forecasts, warnings and results stay."""
     view: bool = False
     """Show the training in a browser, where you can pause it."""
     max_memory: Annotated[str | None, defaulting_to("all available")] = None
@@ -137,6 +142,7 @@ class Train:
                 max_memory=most,
                 watched=watched,
                 session=session,
+                progress=not self.quiet,
             )
             tell_result(result, self.out)
             return
@@ -146,7 +152,8 @@ class Train:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
             tell_forecast(scene, record.plan, most)
-            tell_result(go_on(run, scene, lpips_weights=weights, watched=watched, session=session), self.out)
+            result = go_on(run, scene, lpips_weights=weights, watched=watched, session=session, progress=not self.quiet)
+            tell_result(result, self.out)
 
     @property
     def record(self) -> RunRecord:

@@ -85,7 +85,7 @@ class RunForecast:
             cores = num_threads()
             lines.append(
                 f"time: very roughly {_between(self.seconds)} of training on {cores} core{'s' if cores > 1 else ''}; "
-                "the first steps of each stage tell it better"
+                "compiling, often 10 to 30 s a stage, comes on top, and the first steps of each stage tell it better"
             )
         return "\n".join(lines)
 
