@@ -79,7 +79,7 @@ def fails(capsys, *arguments: str) -> str:
 
 
 def test_unknown_command(capsys):
-    assert "no command 'trian'; the commands are demo, train" in fails(capsys, "trian")
+    assert "no command 'trian'; did you mean train? the commands are demo, train" in fails(capsys, "trian")
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "info"])
@@ -184,7 +184,7 @@ def test_help_tells_one_default_of_each_option(capsys, monkeypatch, name):
 def test_help_names_every_preset(capsys):
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
-    told = capsys.readouterr().out.rpartition("--preset {")[2].partition("--downscale INT")[0]
+    told = capsys.readouterr().out.rpartition("--preset NAME")[2].partition("--downscale INT")[0]
     assert all(preset in told for name in SYSTEMS for preset in find_system(name).presets())
 
 

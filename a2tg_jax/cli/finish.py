@@ -33,7 +33,7 @@ class Finish:
     polish_steps: int = FinishOptions.polish_steps
     """Steps of least squares, each of which draws every training view; many fit these views too closely, and 0 leaves
     colours as they are."""
-    lpips_weights: Path | None = None
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
 
     def run(self) -> None:

@@ -3,8 +3,9 @@
 import dataclasses
 import shlex
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.sfm import Matching
@@ -24,9 +25,9 @@ class Sfm:
       a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
     """
 
-    photos: Positional[Path]
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """Folder of photographs of one scene."""
-    out: Positional[Path]
+    out: Annotated[Positional[Path], arg(metavar="SCENE")]
     """New scene folder for the images and the sparse model, ready for a2tg train."""
     matching: Matching = "auto"
     """Pairs of photographs to match: all pairs (exhaustive), neighbours by name (sequential, for many photographs named

@@ -13,6 +13,7 @@ from a2tg_jax.cli.view import in_browser
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.lock import opened
@@ -33,7 +34,7 @@ from a2tg_jax.results.summary import RunResult, summary_text
 from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.training import Session, System
+from a2tg_jax.training import SYSTEMS, Session, System, find_system
 
 BASELINE = "gaussians-2d-mcmc"
 DEFAULT_PRESET = "paper"
@@ -93,11 +94,11 @@ class Train:
     """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; not needed with --config or --resume."""
     out: Path
     """Run folder for models, checkpoints, metrics, pictures and report.html."""
-    config: Path | None = None
+    config: Annotated[Path | None, arg(metavar="FILE")] = None
     """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
     system: str = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
-    preset: Annotated[str | None, defaulting_to(DEFAULT_PRESET)] = None
+    preset: Annotated[str | None, defaulting_to(DEFAULT_PRESET, "NAME")] = None
     """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
     (the conventions of the authors' program)."""
     downscale: int = 1
@@ -119,13 +120,13 @@ class Train:
     """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
-    lpips_weights: Path | None = None
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
     quiet: bool = False
     """Show no progress of training; forecasts, warnings and results stay."""
     view: bool = False
     """Show the training in a browser, where you can pause it."""
-    max_memory: Annotated[str | None, defaulting_to("all available")] = None
+    max_memory: Annotated[str | None, defaulting_to("all available", "SIZE")] = None
     """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training refuses to start if it needs more.
     Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
@@ -213,6 +214,16 @@ def train_defaults(arguments: list[str]) -> Train:
         compare=file.compare,
         on_nan=file.on_nan,
         options=file.chosen(path),
+    )
+
+
+def other_systems_text(flag: str, system: str) -> str:
+    """Return which systems have an option that one lacks; empty if none has it."""
+    having = [name for name in SYSTEMS if flag in map(flag_of, flatten_config(find_system(name)))]
+    return (
+        f"; {system} has no such option, but {', '.join(having)} {'have' if len(having) > 1 else 'has'}"
+        if having
+        else ""
     )
 
 

@@ -72,7 +72,7 @@ class Export:
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
     web: Path | None = None
     """Output folder of the page, or output file with --single-file."""
-    ply: Path | None = None
+    ply: Annotated[Path | None, arg(metavar="FILE")] = None
     """Output file of the Gaussians."""
     single_file: bool = False
     """Write one HTML file that needs no other."""
@@ -83,7 +83,7 @@ class Export:
 
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
-            raise ValueError("a page needs --web PATH, and a file for other programs --ply PATH")
+            raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
         for out in (self.web, self.ply):
             if out is not None:
                 check_output(out)
