@@ -615,5 +615,10 @@ def test_doctor_compares_the_compositors(capsys, monkeypatch):
     told = capsys.readouterr().out
     assert f"jax {jax.__version__}" in told and re.search(r"native: .* at most \de-\d\d from XLA's image", told)
     assert "cuda is not available: it needs JAX on an NVIDIA GPU" in told
+    assert "devices     the CPU\n" in told and re.search(r"memory +[\d.]+ GB may be used\n", told)
+    assert told.splitlines()[-1].split(maxsplit=1) == ["verdict", "everything works on this machine"]
+    assert "but on the CPU" in doctor._verdict("cpu", has_driver=True)
+    monkeypatch.setattr(doctor.choice, "is_available", lambda name: False)
+    assert "but slowly: native is not available" in doctor._verdict("cpu", has_driver=False)
     monkeypatch.setattr(doctor, "_compare", lambda: float("inf"))
     assert "the compositors differ by inf" in fails(capsys, "doctor")
