@@ -5,6 +5,7 @@ import os
 import platform
 import time
 from importlib.metadata import PackageNotFoundError, version
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -64,8 +65,8 @@ def _verdict(backend: str, *, has_driver: bool) -> str:
     """Return whether everything works on a machine whose compositors agree."""
     if backend == "cpu" and has_driver:
         return "everything works, but on the CPU: JAX does not see the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
-    fastest: Wanted = "native" if backend == "cpu" else "cuda"
-    if not choice.is_available(fastest):
+    fastest: Literal["native", "cuda"] = "native" if backend == "cpu" else "cuda"
+    if backend in ("cpu", "gpu") and not choice.is_available(fastest):
         return f"everything works, but slowly: {fastest} is not available, which needs {choice.REMEDIES[fastest]}"
     return "everything works on this machine"
 

@@ -96,7 +96,7 @@ class Train:
     """Run folder for models, checkpoints, metrics, pictures and report.html."""
     config: Annotated[Path | None, arg(metavar="FILE")] = None
     """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
-    system: str = DEFAULT_SYSTEM
+    system: Annotated[str, arg(metavar="NAME")] = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
     preset: Annotated[str | None, defaulting_to(DEFAULT_PRESET, "NAME")] = None
     """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
@@ -109,7 +109,7 @@ class Train:
     """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
     validation: bool = False
     """Hold out every eighth training image in place of the test images, to choose options without seeing these."""
-    compare: UseAppendAction[tuple[str, ...]] = ()
+    compare: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
     """System to train for comparison; may be repeated. It takes every option above and below that it has."""
     baseline: bool = False
     """Compare with gaussians-2d-mcmc, the same iterations without textures."""
