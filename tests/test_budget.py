@@ -65,6 +65,7 @@ def filling(system: a2tg.System) -> FillingMcmc | FillingDensity:
     [
         ("1.5MB", 1.5), ("1.5", 1.5), (1.5, 1.5), (2, 2.0), ("800kB", 0.8), ("800 KB", 0.8), ("2GB", 2000.0),
         ("1e2 mb", 100.0), ("0.1kB", 1e-4), (None, None), ("None", None), (" .5MB ", 0.5), (1e-05, 1e-5),
+        ("1.5MiB", 1.572864), ("500 KiB", 0.512), ("2GiB", 2147.483648),
     ],
 )  # fmt: skip
 def test_how_a_budget_is_written(text, megabytes):
@@ -72,7 +73,7 @@ def test_how_a_budget_is_written(text, megabytes):
     assert megabytes_of(megabytes) == megabytes
 
 
-@pytest.mark.parametrize("text", ["", "much", "1.5MiB", "1,5MB", "MB", "1.2.3MB", "-1MB", -1.0, True, "nan"])
+@pytest.mark.parametrize("text", ["", "much", "1.5TiB", "1,5MB", "MB", "1.2.3MB", "-1MB", -1.0, True, "nan"])
 def test_what_is_no_budget_is_named(text):
     with pytest.raises(ValueError, match=r"memory_budget must be a number of MB .* such as 1.5MB, 800kB or 2GB; got"):
         megabytes_of(text)

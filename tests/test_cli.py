@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -78,7 +79,7 @@ def fails(capsys, *arguments: str) -> str:
 
 
 def test_unknown_command(capsys):
-    assert "no command 'trian'; the commands are demo, train" in fails(capsys, "trian")
+    assert "no command 'trian'; did you mean train? the commands are demo, train" in fails(capsys, "trian")
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "info"])
@@ -134,6 +135,22 @@ def test_error_in_a_process_of_its_own(tmp_path):
     assert done.returncode == 1 and "Traceback" in done.stderr
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
+def test_a_command_that_imported_pycolmap_ends_by_a_signal_with_one_line():
+    """pycolmap's import replaces the handlers of signals with some that print a C++ stack."""
+    script = """
+import sys, time
+from a2tg_jax.cli import main as cli
+from a2tg_jax.data.colmap_library import pycolmap
+cli.Info.run = lambda _: (pycolmap(), print("ready", flush=True), time.sleep(60))
+sys.exit(cli.main(["info", "run"]))
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=-1, stderr=-1, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.terminate()
+    assert process.communicate()[1] == "a2tg: interrupted\n" and process.returncode == 128 + signal.SIGTERM
+
+
 # Help
 
 
@@ -167,7 +184,7 @@ def test_help_tells_one_default_of_each_option(capsys, monkeypatch, name):
 def test_help_names_every_preset(capsys):
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
-    told = capsys.readouterr().out.rpartition("--preset {")[2].partition("--downscale INT")[0]
+    told = capsys.readouterr().out.rpartition("--preset NAME")[2].partition("--downscale INT")[0]
     assert all(preset in told for name in SYSTEMS for preset in find_system(name).presets())
 
 
@@ -427,7 +444,7 @@ def test_resume_refuses_other_numbers(tiny_run, capsys):
     run, *_ = tiny_run
     again = ("train", "synthetic", "--out", run.path, "--resume")
     assert "leave out --texture.k-a" in fails(capsys, *again, "--texture.k-a", "9")
-    assert "leave out --preset, which differs in --downscale, " in fails(capsys, *again, "--preset", "quick")
+    assert "a resumed run keeps its preset, paper" in fails(capsys, *again, "--preset", "quick")
     assert "there is no system" in fails(capsys, *again, "--compare", "b2tg")
     assert "was trained on synthetic" in fails(capsys, "train", run.path, "--out", run.path, "--resume")
 
@@ -598,5 +615,10 @@ def test_doctor_compares_the_compositors(capsys, monkeypatch):
     told = capsys.readouterr().out
     assert f"jax {jax.__version__}" in told and re.search(r"native: .* at most \de-\d\d from XLA's image", told)
     assert "cuda is not available: it needs JAX on an NVIDIA GPU" in told
+    assert "devices     the CPU\n" in told and re.search(r"memory +[\d.]+ GB may be used\n", told)
+    assert told.splitlines()[-1].split(maxsplit=1) == ["verdict", "everything works on this machine"]
+    assert "but on the CPU" in doctor._verdict("cpu", has_driver=True)
+    monkeypatch.setattr(doctor.choice, "is_available", lambda name: False)
+    assert "but slowly: native is not available" in doctor._verdict("cpu", has_driver=False)
     monkeypatch.setattr(doctor, "_compare", lambda: float("inf"))
     assert "the compositors differ by inf" in fails(capsys, "doctor")

@@ -85,3 +85,11 @@ def test_evaluation_knows_what_a_flat_colour_reaches(scene):
     assert not found.has_learned
     flat = [-10 * np.log10(np.mean((own - own.mean((0, 1))) ** 2)) for own in map(a2tg.view_image, scene.train)]
     assert found.flat_psnr == pytest.approx(np.mean(flat), rel=1e-4)
+
+
+def test_a_small_budget_is_the_advice(scene):
+    order = BatchOrder(scene.train, 1, 0)
+    check = LearningCheck(scene.train, order, 200, "black", is_first=True, small_budget="room for 3 Gaussians")
+    with pytest.warns(UserWarning, match=r"dB\. room for 3 Gaussians: raise it$"):
+        for iteration in range(1, 201):
+            check.observe(iteration, 3.0)

@@ -1,6 +1,8 @@
 """Mistakes on the command line: each is one line on stderr and exit code 2, before anything is trained or written."""
 
+import contextlib
 import dataclasses
+import io
 import json
 
 import numpy as np
@@ -9,6 +11,7 @@ from PIL import Image
 
 from a2tg_jax import save_model, synthetic_scene
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.arguments import flag_with_value, with_flags
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.results import whole_run
@@ -20,62 +23,67 @@ from a2tg_jax.training.start import initial_model
 SYNTHETIC = "train synthetic --out new"
 MISTAKES = {
     # Commands, flags and their values
-    "trian": "did you mean train?",
+    "trian": "no command 'trian'; did you mean train? the commands are demo",
     "--verbose": "there is no command '--verbose'",
-    "train": "Missing from a2tg train",
-    "train synthetic": "--out PATH",
+    "train": "SCENE is missing: scene folder",
+    "train synthetic": "and report.html, for example --out runs/NAME",
     "train --out new": "SCENE",
     "train synthetic more --out new": "Unrecognized options: more",
     f"{SYNTHETIC} --texture.fracton 0.5": "did you mean --texture.fraction",
+    f"{SYNTHETIC} --sytem bytewise": "Unrecognized options: --sytem; did you mean --system?",
+    "export done --ply": "--ply wants a value",
     f"{SYNTHETIC} --itertions 5": "did you mean --stage1-iterations or --stage2-iterations?",
     f"{SYNTHETIC} --cap 5": "did you mean --densify.cap or --texture.cap?",
-    f"{SYNTHETIC} --seed": "Missing value for argument '--seed'",
-    f"{SYNTHETIC} --seed 0.5": "'0.5'",
+    f"{SYNTHETIC} --seed": "--seed wants a value",
+    f"{SYNTHETIC} --seed 0.5": "--seed wants a whole number; got '0.5'",
     f"{SYNTHETIC} --batch-size two": "'two'",
-    f"{SYNTHETIC} --texture.select best": "Expected one of ('fraction', 'threshold', 'budget')",
+    f"{SYNTHETIC} --texture.select best": "--texture.select wants one of fraction, threshold, budget; got 'best'",
     f"{SYNTHETIC} --texture.upscale-at soon": "--texture.upscale-at",
-    f"{SYNTHETIC} --on-nan hope": "Expected one of ('stop', 'restore')",
+    f"{SYNTHETIC} --on-nan hope": "--on-nan wants one of stop, restore; got 'hope'",
     f"{SYNTHETIC} --system b2tg": "there is no system 'b2tg'",
     f"{SYNTHETIC} --system bytwise": "did you mean bytewise?",
     f"{SYNTHETIC} --system os:sep": "'os:sep' is no system",
     f"{SYNTHETIC} --preset fast": "presets paper",
     f"{SYNTHETIC} --preset quik": "did you mean quick?",
     f"{SYNTHETIC} --compare b2tg": "there is no system 'b2tg'",
-    f"{SYNTHETIC} --system gaussians-2d --texture.cap 4": "Unrecognized options: --texture.cap",
+    f"{SYNTHETIC} --system gaussians-2d --texture.cap 4": "gaussians-2d has no such option, but a2tg, bytewise have",
     # Numbers out of range
-    f"{SYNTHETIC} --batch-size 0": "batch_size must be at least 1",
+    f"{SYNTHETIC} --batch-size 0": "--batch-size must be at least 1",
     f"{SYNTHETIC} --seed -1": "seed must lie in",
     f"{SYNTHETIC} --rates.means nan": "rates.means must be a finite number",
     f"{SYNTHETIC} --rates.quats -1": "rates.quats must be at least 0",
-    f"{SYNTHETIC} --loss.ssim-weight inf": "loss.ssim_weight must be a finite number",
+    f"{SYNTHETIC} --loss.ssim-weight inf": "--loss.ssim-weight must be a finite number",
     f"{SYNTHETIC} --texture.fraction 2": "texture.fraction must lie in 0..1",
     f"{SYNTHETIC} --texture.rate -0.1": "texture.rate must be at least 0",
     f"{SYNTHETIC} --texture.cap 32": "texture.cap must lie in 1..16",
-    f"{SYNTHETIC} --texture.upscale-at 0.5 0.2": "texture.upscale_at must be ascending",
+    f"{SYNTHETIC} --texture.upscale-at 0.5 0.2": "--texture.upscale-at must be ascending",
     f"{SYNTHETIC} --stage1-iterations 0": "at least 1 iteration",
     f"{SYNTHETIC} --densify.cap 1": "densify.cap must be at least 2",
     f"{SYNTHETIC} --system gaussians-2d --densify.threshold -1": "densify.threshold must be at least 0",
     f"{SYNTHETIC} --system bbsplat --billboard.side 1": "billboard.side must lie in 2..16",
     f"{SYNTHETIC} --system supergaussians --kernels.colors -1": "kernels.colors must be at least 0",
     f"{SYNTHETIC} --system textured-gaussians --texture.side 17": "texture.side must lie in 1..16",
-    f"{SYNTHETIC} --memory-budget 5XB": "memory_budget must be a number of MB",
-    f"{SYNTHETIC} --memory-budget 100B": "memory_budget must be a number of MB",
+    f"{SYNTHETIC} --memory-budget 5XB": "--memory-budget must be a number of MB",
+    f"{SYNTHETIC} --memory-budget 100B": "--memory-budget must be a number of MB",
     f"{SYNTHETIC} --memory-budget 0.0003": "there must be 2",
     f"{SYNTHETIC} --memory-budget 1kB --initial-gaussians 800": "fewer than training starts from",
     f"{SYNTHETIC} --texture.select budget --texture.budget-mb 0.001": "Gaussians of one texel each take",
     f"{SYNTHETIC} --texture.select budget": "budget_mb must say",
     f"{SYNTHETIC} --downscale 0": "downscale",
-    f"{SYNTHETIC} --test-every -1": "test_every",
+    f"{SYNTHETIC} --test-every -1": "--test-every must",
     # Places and files
     "train nowhere --out new": "nowhere",
     "train photos --out new": "photos",
+    "train bad.toml --out new": "bad.toml is not a scene folder",
+    "train synthetic --out bad.toml/run": "run cannot be made, for",
     "train scene --out scene/run": "overlap: choose an output folder",
     f"{SYNTHETIC[:-3]}photo.png": "photo.png is a file",
     f"{SYNTHETIC[:-3]}photos": "not a run folder",
     f"{SYNTHETIC[:-3]}run": "add --resume to continue it, --overwrite",
     "train --out nowhere --resume": "is not a run folder",
     f"{SYNTHETIC[:-3]}run --resume --overwrite": "give one of them",
-    f"{SYNTHETIC[:-3]}run --resume --seed 5": "leave out --seed",
+    f"{SYNTHETIC[:-3]}run --resume --seed 5": "or start a new run: a2tg train --config run/run.toml --seed 5 ",
+    "train --out run --resume --preset quick": "a resumed run keeps its preset, paper: leave out --preset quick",
     "train photos --out run --resume": "was trained on synthetic",
     f"{SYNTHETIC} --lpips-weights photo.png": "photo.png",
     f"{SYNTHETIC} --config nowhere.toml": "no such configuration file",
@@ -86,16 +94,16 @@ MISTAKES = {
     "demo --out run --resume --overwrite": "give one of them",
     "eval run --lpips-weights nowhere.npz": "nowhere.npz",
     "eval photos": "is not a run folder",
-    "finish done": "--out PATH",
+    "finish done": "--out is missing: new run folder, for example",
     "finish photos --out new": "is not a run folder",
     "finish done --out done/new": "overlap: choose an output folder",
     "finish done --out photos": "not a run folder",
-    "finish done --out new --max-loss -1": "max_loss must be at least 0 dB",
-    "finish done --out new --polish-steps -1": "polish_steps must be at least 0",
+    "finish done --out new --max-loss -1": "--max-loss must be at least 0 dB",
+    "finish done --out new --polish-steps -1": "--polish-steps must be at least 0",
     "finish done --out new --polish-steps 0": "nothing that these options can shrink or polish",
     "finish run --out new": "has no finished",
     "eval run": "no finished stage",
-    "info": "Missing from a2tg info",
+    "info": "RUN is missing: run folder",
     "info photo.png": "is not a run folder",
     "render done --frames -3": "number of frames must be at least 1",
     "render done --fps 0": "frames per second must lie in 1..1000",
@@ -107,13 +115,13 @@ MISTAKES = {
     "render run": "has no finished",
     "compress nowhere.npz": "nowhere.npz",
     "compress photo.png": "photo.png",
-    "compress done --max-loss nan": "max_loss",
-    "compress done --max-loss -1": "max_loss",
+    "compress done --max-loss nan": "--max-loss",
+    "compress done --max-loss -1": "--max-loss",
     "compress done --out photos": "other than the model",
     "view nowhere.npz": "nowhere.npz",
     "view photo.png": "photo.png",
     "view done --port 99999": "port",
-    "export done": "--web PATH",
+    "export done": "give --web PATH for a page, or --ply FILE",
     "export done --ply x.ply --single-file": "--web PATH",
     "export done --ply photos": "must be the path of a file",
     "export run --web site": "no finished",
@@ -158,3 +166,37 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, place, mista
     assert printed.err.startswith("a2tg: error: ") and printed.err.count("\n") == 1
     assert MISTAKES[mistake] in printed.err and len(printed.err) < 600
     assert sorted(place.rglob("*")) == before
+
+
+def test_help_names_values_without_none():
+    text = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(text):
+        cli.main(["train", "--help"])
+    for name in (
+        "--config FILE",
+        "--preset NAME",
+        "--max-memory SIZE",
+        "--memory-budget SIZE",
+        "--initial-gaussians INT",
+    ):
+        assert f"{name} " in text.getvalue()
+    assert "None}" not in text.getvalue()
+
+
+@pytest.mark.parametrize("words, value", [(["0.1", "0.2"], (0.1, 0.2)), (["None"], None), ([], ())])
+def test_values_that_may_be_none(words, value):
+    command = cli._parse("train", ["s", "--out", "o", "--texture.upscale-at", *words, "--memory-budget", "None"])
+    assert command.options.texture.upscale_at == value and command.options.memory_budget is None
+
+
+def test_only_options_that_were_typed_are_told_as_flags():
+    typed = ["--memory-budget", "1kB", "--seed=5"]
+    assert with_flags("raise memory_budget, or texture.cap", typed) == "raise --memory-budget, or texture.cap"
+    assert with_flags("seed must be small, as every seed", typed) == "--seed must be small, as every seed"
+    assert with_flags("run.toml: options.memory_budget", typed) == "run.toml: options.memory_budget"
+
+
+def test_flags_are_told_as_they_are_typed():
+    options = {"seed": 5, "texture.upscale_at": (0.1, 0.2), "texture.is_on": True, "texture.is_off": False}
+    told = ["--seed 5", "--texture.upscale-at 0.1 0.2", "--texture.is-on", "--texture.no-is-off"]
+    assert [flag_with_value(*option) for option in options.items()] == told

@@ -5,17 +5,20 @@ import difflib
 import io
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar
 
 import tyro
 from tyro.conf import arg
 
+from a2tg_jax.cli.errors import UNRECOGNIZED, plain, told_unknown, unknown_words
+from a2tg_jax.cli.values import registry
+
 Parsed = TypeVar("Parsed")
 
 WIDE = "1000"
 """Terminal width at which no error message is wrapped."""
-UNRECOGNIZED = "Unrecognized options: "
 LEAST_LIKENESS = 0.75
 """Smallest similarity, of 1, of an unknown flag and one that is suggested instead."""
 NEARLY_AS_LIKE = 0.05
@@ -23,22 +26,56 @@ NEARLY_AS_LIKE = 0.05
 MOST_SUGGESTED = 3
 
 
-def defaulting_to(text: str) -> Any:
+def defaulting_to(text: str, metavar: str | None = None) -> Any:
     """Return the annotation of an option whose help tells its default in words, in place of None."""
-    return arg(help_behavior_hint=f"(default: {text})")
+    return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
 
 
-LastModel = Annotated[str | None, defaulting_to("the last model of the main system")]
+LastModel = Annotated[str | None, defaulting_to("the last model of the main system", "NAME")]
 """Name of a model of a run; None: the last one of its main system."""
 
 
-def parse(kind: type[Parsed], program: str, arguments: Sequence[str], **options: Any) -> Parsed:
+def flag_of(name: str) -> str:
+    """Return the flag of an option."""
+    return "--" + name.replace("_", "-")
+
+
+def flag_with_value(name: str, value: Any) -> str:
+    """Return the flag of an option with its value, as it is typed."""
+    if isinstance(value, bool):
+        group, dot, own = name.rpartition(".")
+        return flag_of(name if value else f"{group}{dot}no_{own}")
+    words = value if isinstance(value, list | tuple) else [value]
+    return shlex.join([flag_of(name), *map(str, words)])
+
+
+def with_flags(message: str, arguments: Sequence[str]) -> str:
+    """Return a message with flags in place of the names of the options that were typed as flags.
+
+    A name of one word is replaced at the beginning only, for it may be a word of the message.
+    """
+    for flag in [word.partition("=")[0] for word in arguments if word.startswith("--")]:
+        name = flag[2:].replace("-", "_")
+        before = r"(?<![\w./-])" if re.search(r"[._]", name) else "^"
+        message = re.sub(rf"{before}{re.escape(name)}(?!\w|\.\w)", flag, message)
+    return message
+
+
+def parse(
+    kind: type[Parsed],
+    program: str,
+    arguments: Sequence[str],
+    *,
+    hint: Callable[[str], str] = lambda flag: "",
+    **options: Any,
+) -> Parsed:
     """Parse arguments into an instance of `kind`. Help is printed and ends in SystemExit.
 
     Args:
       kind: a dataclass.
       program: name of the command in the help.
       arguments: without the command's name.
+      hint: gives what to say of an unknown flag, or an empty text if it knows nothing of it.
       options: further arguments of `tyro.cli`.
 
     Raises:
@@ -47,15 +84,16 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], **options:
     errors = io.StringIO()
     width = contextlib.nullcontext() if {"-h", "--help"} & set(arguments) else _columns(WIDE)
     try:
-        with width, contextlib.redirect_stderr(errors):
+        with registry(), width, contextlib.redirect_stderr(errors):
             parsed: Parsed = tyro.cli(kind, prog=program, args=arguments, **options)
             return parsed
     except SystemExit as end:
         if not end.code:
             raise
-        told = one_line(errors.getvalue())
-    suggested = _suggested(told, kind, options) if told.startswith(UNRECOGNIZED) else ""
-    raise ValueError(f"{told}{suggested} (see {program} --help)")
+        told = plain(one_line(errors.getvalue()))
+    if told.startswith(UNRECOGNIZED):
+        told = told_unknown(unknown_words(told), lambda flag: hint(flag) or _suggested(flag, kind, options))
+    raise ValueError(f"{told} (see {program} --help)")
 
 
 def one_line(box: str) -> str:
@@ -89,17 +127,16 @@ def _tails(name: str) -> list[str]:
     return [words, *(words[match.end() :] for match in re.finditer(r"[.-]", words))]
 
 
-def _suggested(told: str, kind: type, options: dict[str, Any]) -> str:
-    """Return "; did you mean FLAG?" for the first unrecognised option; empty if none is near."""
-    unknown = [word for word in told.removeprefix(UNRECOGNIZED).split(", ") if word.startswith("--")]
-    near = nearest(unknown[0].partition("=")[0], _flags(kind, options)) if unknown else []
+def _suggested(flag: str, kind: type, options: dict[str, Any]) -> str:
+    """Return "; did you mean FLAG?" for an unrecognised flag; empty if none is near."""
+    near = nearest(flag, _flags(kind, options))
     return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
 def _flags(kind: type, options: dict[str, Any]) -> list[str]:
     """Return every flag of a command, as its help lists them."""
     text = io.StringIO()
-    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(text):
+    with registry(), contextlib.suppress(SystemExit), contextlib.redirect_stdout(text):
         tyro.cli(kind, args=["--help"], **options)
     return re.findall(r"^[│ ]*(--[\w.-]+)", text.getvalue(), flags=re.MULTILINE)
 

@@ -5,6 +5,7 @@ import os
 import platform
 import time
 from importlib.metadata import PackageNotFoundError, version
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import numpy as np
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.cores import VARIABLE, num_threads
+from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import choice
@@ -36,10 +38,12 @@ class Doctor:
         machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
         _tell("a2tg-jax", f"{version('a2tg-jax')}, {machine}")
         _tell("packages", ", ".join(f"{name} {_version(name)}" for name in PACKAGES))
-        _tell("devices", ", ".join(f"{device.platform} {device.device_kind}" for device in jax.devices()))
+        _tell("devices", ", ".join(map(_described, jax.devices())))
         cuda = cuda_of_driver()
         _tell("driver", f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found")
-        _tell("threads", f"{num_threads()} ({VARIABLE}={os.environ.get(VARIABLE) or 'not set'})")
+        asked = os.environ.get(VARIABLE)
+        _tell("threads", f"{num_threads()} ({VARIABLE}{f'={asked}' if asked else ' is not set'})")
+        _tell("memory", f"{memory_limit() / 1e9:.1f} GB may be used")
         _tell("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set")
         _tell("cache", str(compilation_cache_folder()))
         _tell("compositor", f"{choice.choose('auto', RenderSettings.tile_size)} is the choice of 'auto'")
@@ -49,6 +53,22 @@ class Doctor:
         largest = _compare()
         if not largest <= MOST_DIFFERENCE:
             raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
+        _tell("verdict", _verdict(jax.default_backend(), has_driver=cuda is not None))
+
+
+def _described(device: jax.Device) -> str:
+    """Return a device in words: the CPU, or platform and model of an accelerator."""
+    return "the CPU" if device.platform == "cpu" else f"{device.platform} ({device.device_kind})"
+
+
+def _verdict(backend: str, *, has_driver: bool) -> str:
+    """Return whether everything works on a machine whose compositors agree."""
+    if backend == "cpu" and has_driver:
+        return "everything works, but on the CPU: JAX does not see the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
+    fastest: Literal["native", "cuda"] = "native" if backend == "cpu" else "cuda"
+    if backend in ("cpu", "gpu") and not choice.is_available(fastest):
+        return f"everything works, but slowly: {fastest} is not available, which needs {choice.REMEDIES[fastest]}"
+    return "everything works on this machine"
 
 
 def _tell(name: str, text: str) -> None:

@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.results.finish_options import FinishOptions
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_apart, check_weights
 
 
@@ -32,12 +33,13 @@ class Finish:
     polish_steps: int = FinishOptions.polish_steps
     """Steps of least squares, each of which draws every training view; many fit these views too closely, and 0 leaves
     colours as they are."""
-    lpips_weights: Path | None = None
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
 
     def run(self) -> None:
         check_weights(self.lpips_weights)
         check_apart(self.out, self.folder)
+        check_output(self.out)
         options = FinishOptions(self.max_loss, self.polish_steps)
         done = finish_run(open_run(self.folder), self.out, options, lpips_weights=self.lpips_weights)
         print(done.text)

@@ -1,6 +1,7 @@
 """The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm, doctor."""
 
 import dataclasses
+import functools
 import inspect
 import os
 import sys
@@ -12,12 +13,12 @@ from typing import Annotated, Any, TextIO
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import defaulting_to, parse
+from a2tg_jax.cli.arguments import defaulting_to, parse, with_flags
 from a2tg_jax.cli.doctor import Doctor
 from a2tg_jax.cli.finish import Finish
 from a2tg_jax.cli.render import Render
 from a2tg_jax.cli.sfm import Sfm
-from a2tg_jax.cli.train import Demo, Train, tell_result, train_defaults
+from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
@@ -26,6 +27,7 @@ from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.lock import opened
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.whole_run import measure
 from a2tg_jax.training import SYSTEMS
@@ -68,7 +70,7 @@ class Eval:
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
-    lpips_weights: Path | None = None
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, the LPIPS in metrics.json is kept if the
     models are the same."""
 
@@ -92,12 +94,14 @@ class Compress:
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
     """Model file (*.npz), or run folder, whose last model is taken."""
-    out: Annotated[Path | None, defaulting_to("NAME.a2tgz beside the model")] = None
+    out: Annotated[Path | None, defaulting_to("NAME.a2tgz beside the model", "FILE")] = None
     """Output file."""
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
 
     def run(self) -> None:
+        if self.out is not None:
+            check_output(self.out)
         result = compress(self.source, self.out, max_loss=self.max_loss)
         print(compression_text(result))
         print(f"file: {result.path}")
@@ -136,8 +140,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(version("a2tg-jax") if name == "--version" else OVERVIEW)
         return 0
     if name not in COMMANDS:
-        told = f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}"
-        return _fail(told + did_you_mean(name, COMMANDS))
+        near = did_you_mean(name, COMMANDS)
+        return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
     try:
         configure_cpu()
     except ValueError as error:
@@ -146,7 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.path.append(os.getcwd())  # Users' own systems are modules there.
     try:
         with warnings.catch_warnings(), signals.raised():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = functools.partial(_show_warning, arguments)
             _parse(name, arguments).run()
             sys.stdout.flush()
     except KeyboardInterrupt as stop:
@@ -160,7 +164,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         if os.environ.get("A2TG_DEBUG"):
             raise
-        return _fail(str(error))
+        return _fail(with_flags(str(error), arguments))
     return 0
 
 
@@ -179,11 +183,13 @@ def _parse(name: str, arguments: list[str]) -> Command:
     kind = COMMANDS[name]
     options: dict[str, Any] = {"description": inspect.getdoc(kind)}
     if kind is Train:
-        options["default"] = train_defaults(arguments)
+        options["default"] = defaults = train_defaults(arguments)
+        options["hint"] = lambda flag: other_systems_text(flag, defaults.system)
     return parse(kind, f"a2tg {name}", arguments, **options)
 
 
 def _show_warning(
+    arguments: Sequence[str],
     message: Warning | str,
     category: type[Warning],
     filename: str,
@@ -191,4 +197,4 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    print(f"a2tg: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"a2tg: warning: {with_flags(' '.join(str(message).split()), arguments)}", file=sys.stderr)

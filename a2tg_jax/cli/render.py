@@ -17,6 +17,7 @@ from a2tg_jax.results.frames import (
     write_animation,
     write_video,
 )
+from a2tg_jax.results.output import check_output
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Render:
         out = self.out or run.path / "frames"
         check_rate(self.fps)
         size = None if self.size is None else parse_size(self.size)
+        check_output(out)
         paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model, size=size)
         print(f"{len(paths)} frames in {out}")
         if self.path != "test":

@@ -3,12 +3,14 @@
 import dataclasses
 import shlex
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.sfm import Matching
 from a2tg_jax.results.forecast import quick_downscale, quick_flags
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_apart
 
 
@@ -23,9 +25,9 @@ class Sfm:
       a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
     """
 
-    photos: Positional[Path]
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """Folder of photographs of one scene."""
-    out: Positional[Path]
+    out: Annotated[Positional[Path], arg(metavar="SCENE")]
     """New scene folder for the images and the sparse model, ready for a2tg train."""
     matching: Matching = "auto"
     """Pairs of photographs to match: all pairs (exhaustive), neighbours by name (sequential, for many photographs named
@@ -33,6 +35,7 @@ class Sfm:
 
     def run(self) -> None:
         check_apart(self.out, self.photos)
+        check_output(self.out)
         found = run_sfm(self.photos, self.out, matching=self.matching)
         print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
         run = ["a2tg", "train", str(self.out), "--out", f"runs/{self.out.resolve().name}"]

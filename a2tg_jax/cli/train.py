@@ -8,10 +8,12 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from a2tg_jax.cli.arguments import defaulting_to
+from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.lock import opened
@@ -32,9 +34,10 @@ from a2tg_jax.results.summary import RunResult, summary_text
 from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.training import Session, System
+from a2tg_jax.training import SYSTEMS, Session, System, find_system
 
 BASELINE = "gaussians-2d-mcmc"
+DEFAULT_PRESET = "paper"
 DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
     stage2_iterations=250,
@@ -57,16 +60,19 @@ class Demo:
     """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
+    quiet: bool = False
+    """Show no progress of training; forecasts, warnings and results stay."""
 
     def run(self) -> None:
         if self.resume:
             _check_resumed_only(self.overwrite)
             with opened(self.out) as run:
                 scene = read_record(run).scene.load()
-                tell_result(go_on(run, scene, session=tidy_session()), self.out)
+                tell_result(go_on(run, scene, session=tidy_session(), progress=not self.quiet), self.out)
             return
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
-        tell_result(begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session()), self.out)
+        result = begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session(), progress=not self.quiet)
+        tell_result(result, self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,11 +94,11 @@ class Train:
     """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; not needed with --config or --resume."""
     out: Path
     """Run folder for models, checkpoints, metrics, pictures and report.html."""
-    config: Path | None = None
+    config: Annotated[Path | None, arg(metavar="FILE")] = None
     """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
-    system: str = DEFAULT_SYSTEM
+    system: Annotated[str, arg(metavar="NAME")] = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
-    preset: Annotated[str | None, defaulting_to("paper")] = None
+    preset: Annotated[str | None, defaulting_to(DEFAULT_PRESET, "NAME")] = None
     """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
     (the conventions of the authors' program)."""
     downscale: int = 1
@@ -103,7 +109,7 @@ class Train:
     """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
     validation: bool = False
     """Hold out every eighth training image in place of the test images, to choose options without seeing these."""
-    compare: UseAppendAction[tuple[str, ...]] = ()
+    compare: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
     """System to train for comparison; may be repeated. It takes every option above and below that it has."""
     baseline: bool = False
     """Compare with gaussians-2d-mcmc, the same iterations without textures."""
@@ -114,11 +120,13 @@ class Train:
     """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
-    lpips_weights: Path | None = None
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
+    quiet: bool = False
+    """Show no progress of training; forecasts, warnings and results stay."""
     view: bool = False
     """Show the training in a browser, where you can pause it."""
-    max_memory: Annotated[str | None, defaulting_to("all available")] = None
+    max_memory: Annotated[str | None, defaulting_to("all available", "SIZE")] = None
     """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training refuses to start if it needs more.
     Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
@@ -135,6 +143,7 @@ class Train:
                 max_memory=most,
                 watched=watched,
                 session=session,
+                progress=not self.quiet,
             )
             tell_result(result, self.out)
             return
@@ -144,7 +153,8 @@ class Train:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
             tell_forecast(scene, record.plan, most)
-            tell_result(go_on(run, scene, lpips_weights=weights, watched=watched, session=session), self.out)
+            result = go_on(run, scene, lpips_weights=weights, watched=watched, session=session, progress=not self.quiet)
+            tell_result(result, self.out)
 
     @property
     def record(self) -> RunRecord:
@@ -161,15 +171,22 @@ class Train:
             raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
         changed = changed_numbers(asked, kept)
         if changed:
-            flags = ", ".join("--" + name.replace("_", "-") for name in changed)
-            advice = f"leave out {flags}" if self.preset is None else f"leave out --preset, which differs in {flags}"
-            raise ValueError(f"--resume takes every option from {run.record}; {advice}")
+            raise ValueError(f"--resume takes every option from {run.record}; {self._told_changes(run, changed)}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
         record.check()
         if record != kept:
             write_record(run, record)
         return record
+
+    def _told_changes(self, run: RunFolder, changed: list[str]) -> str:
+        """Return how to go on if these options differ from those of the run that is resumed."""
+        names = ["system"] if "system" in changed else changed
+        told, leaves = ", ".join(map(flag_of, names)), self.record.leaves()
+        if self.config is not None:
+            return f"leave out --config {self.config}, which differs in {told}"
+        flags = " ".join(flag_with_value(name, leaves[name]) for name in names)
+        return f"leave out {told}, or start a new run: a2tg train --config {run.record} {flags} --out …"
 
 
 def train_defaults(arguments: list[str]) -> Train:
@@ -179,7 +196,8 @@ def train_defaults(arguments: list[str]) -> Train:
     out = _value_of("--out", arguments)
     if out and "--resume" in arguments and "--overwrite" not in arguments:
         with opened(out) as run:
-            path = path if path or preset else str(run.record)
+            path = path or str(run.record)
+            preset = _checked_preset(run, preset)
     file = read_run_file(Path(path)) if path else RunFile()
     if preset or (system and system != file.system):
         # The numbers of the file are those of another preset or system.
@@ -197,6 +215,28 @@ def train_defaults(arguments: list[str]) -> Train:
         on_nan=file.on_nan,
         options=file.chosen(path),
     )
+
+
+def other_systems_text(flag: str, system: str) -> str:
+    """Return which systems have an option that one lacks; empty if none has it."""
+    having = [name for name in SYSTEMS if flag in map(flag_of, flatten_config(find_system(name)))]
+    return (
+        f"; {system} has no such option, but {', '.join(having)} {'have' if len(having) > 1 else 'has'}"
+        if having
+        else ""
+    )
+
+
+def _checked_preset(run: RunFolder, preset: str) -> str:
+    """Return an empty preset, which leaves the options of a resumed run as they are.
+
+    Raises:
+      ValueError: if another preset than the run's is asked for.
+    """
+    kept = read_run_file(run.record).preset or DEFAULT_PRESET
+    if preset and preset != kept:
+        raise ValueError(f"a resumed run keeps its preset, {kept}: leave out --preset {shortened(preset)}")
+    return ""
 
 
 def _value_of(flag: str, arguments: list[str]) -> str:

@@ -12,6 +12,7 @@ from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.live import shown_live
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.ply_export import export_ply
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text
@@ -71,7 +72,7 @@ class Export:
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
     web: Path | None = None
     """Output folder of the page, or output file with --single-file."""
-    ply: Path | None = None
+    ply: Annotated[Path | None, arg(metavar="FILE")] = None
     """Output file of the Gaussians."""
     single_file: bool = False
     """Write one HTML file that needs no other."""
@@ -82,7 +83,10 @@ class Export:
 
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
-            raise ValueError("a page needs --web PATH, and a file for other programs --ply PATH")
+            raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
+        for out in (self.web, self.ply):
+            if out is not None:
+                check_output(out)
         source = open_source(self.source, self.model)
         if self.ply is not None:
             print(export_ply(source, self.ply))

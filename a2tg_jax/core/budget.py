@@ -14,7 +14,9 @@ from a2tg_jax.host.text import shortened
 
 BYTES_PER_FLOAT = 4
 MEGABYTE = 10**6
-MEGABYTES = {"": "1", "kb": "1e-3", "mb": "1", "gb": "1e3"}
+MEGABYTES = {
+    "": "1", "kb": "1e-3", "mb": "1", "gb": "1e3", "kib": "0.001024", "mib": "1.048576", "gib": "1073.741824",
+}  # fmt: skip
 """Megabytes of each unit; a number without a unit is in megabytes."""
 LARGEST_SHORTFALL = 0.005
 """Largest unused fraction of a budget without a warning."""

@@ -1,16 +1,22 @@
 """The one place that imports pycolmap."""
 
+import sys
 from types import ModuleType
+
+from a2tg_jax.host.operating_system import signal_handlers_kept
 
 
 def pycolmap() -> ModuleType:
     """Return the module pycolmap, imported at its first use because that takes a third of a second.
 
     zlib must be loaded before it: otherwise Python's own zlib (np.savez_compressed, gzip, PNG) crashes on its next use
-    with "free(): invalid pointer" (pycolmap 4.2.1).
+    with "free(): invalid pointer" (pycolmap 4.2.1). Its import also installs glog's handlers of signals, which print a
+    C++ stack at SIGTERM; the handlers from before are restored.
     """
     import zlib  # noqa: F401
 
-    import pycolmap
+    if "pycolmap" not in sys.modules:
+        with signal_handlers_kept():
+            import pycolmap  # noqa: F401
 
-    return pycolmap
+    return sys.modules["pycolmap"]

@@ -62,6 +62,8 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
     options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room}
     check_no_video(path)
     if is_regular(path):
+        if path.suffix.lower() != ".json":
+            raise FileNotFoundError(f"{path} is not a scene folder, and no transforms.json")
         return load_transforms(path, **options)
     if find_model(path) is not None:
         return load_colmap(path, **options)

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ UNKNOWN_MEMORY = 2**63 - 1
 """Memory of a machine that does not report it."""
 LOCKED_BYTE = 1 << 30
 """Position of the byte that Windows locks: past the end, as Windows keeps others from reading what is locked."""
+HANDLER_SIZE = 1024
+"""Bytes with room for C's struct sigaction, whose size depends on the system; glibc's has 152."""
 
 
 def try_lock(number: int) -> bool:
@@ -74,6 +77,25 @@ def allow_recent_port(listening: socket.socket) -> None:
 def ending_signals() -> tuple[int, ...]:
     """Return the signals, besides Ctrl-C's, that ask a process to end. Windows has no SIGHUP."""
     return tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+@contextlib.contextmanager
+def signal_handlers_kept() -> Iterator[None]:
+    """Restore the C handlers of all signals after the block, in which a library may replace them.
+
+    Python's `signal.getsignal` does not see those. Windows has no sigaction; there nothing is restored.
+    """
+    sigaction: Any = getattr(_c_library(), "sigaction", None)
+    before = {}
+    for signum in signal.valid_signals() if sigaction else ():
+        handler = ctypes.create_string_buffer(HANDLER_SIZE)
+        if sigaction(int(signum), None, handler) == 0:
+            before[int(signum)] = handler
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            sigaction(number, handler, None)
 
 
 def num_cores() -> int:

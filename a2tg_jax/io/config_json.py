@@ -40,9 +40,7 @@ def config_from_dict(
     names = [field.name for field in dataclasses.fields(kind) if field.name not in given]  # type: ignore[arg-type]
     for name in data:
         if name not in names:
-            raise ValueError(
-                f"{_within(where, shortened(name))} is not a field of {kind.__name__}{_instead(name, names)}"
-            )
+            raise ValueError(f"{_within(where, shortened(name))} is an unknown key{_instead(name, names)}")
     optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
         if name not in data and name not in optional:

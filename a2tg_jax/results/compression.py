@@ -23,7 +23,7 @@ from a2tg_jax.io.rows import check_kind
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.corrected import refined_views
-from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 from a2tg_jax.results.summary import aligned
@@ -87,7 +87,7 @@ def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
     planned = plan[plan.main[-1]]
     path = run.model(planned.name)
     if not is_regular(path):
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with: {resuming_command(run)}")
     return path, settings_of(planned.system)
 
 

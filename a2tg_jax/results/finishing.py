@@ -13,7 +13,7 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.finish_options import FinishOptions
-from a2tg_jax.results.folder import RunFolder, check_free, create_run, write_json
+from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command, write_json
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.plan import PlannedStage
@@ -81,7 +81,9 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     planned = record.plan[record.plan.main[-1]]
     path = source.model(planned.name)
     if not path.is_file():
-        raise FileNotFoundError(f"{source.path} has no finished {planned.name}; continue with a2tg train … --resume")
+        raise FileNotFoundError(
+            f"{source.path} has no finished {planned.name}; continue with: {resuming_command(source)}"
+        )
     model, scene = load_model(path), record.scene.load()
     _check(model, planned, options)
     steps = {"before": (model, _measured(model, scene, planned))}

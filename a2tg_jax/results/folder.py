@@ -26,6 +26,7 @@ import glob
 import json
 import os
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -240,6 +241,11 @@ def open_run(path: str | os.PathLike[str]) -> RunFolder:
     if not is_regular(run.record):
         raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml); a2tg train --out makes one")
     return run
+
+
+def resuming_command(run: RunFolder) -> str:
+    """Return the command line that continues the training of a run."""
+    return shlex.join(["a2tg", "train", "--out", str(run.path), "--resume"])
 
 
 def _is_file(path: Path) -> bool:

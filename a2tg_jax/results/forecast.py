@@ -47,7 +47,6 @@ QUICK = "quick"
 QUICK_SIDE = 640
 """Longer side of the photographs, in pixels, with which `quick` takes minutes on two cores."""
 OPTIONS = {
-    "program": "--max-memory, for the program itself takes most",
     "photographs": "--downscale, or --batch-size",
     "model": "{limits}, --memory-budget or --sh-degree",
     "gradients": "{limits}, --memory-budget, --batch-size or --sh-degree",
@@ -86,7 +85,7 @@ class RunForecast:
             cores = num_threads()
             lines.append(
                 f"time: very roughly {_between(self.seconds)} of training on {cores} core{'s' if cores > 1 else ''}; "
-                "the first steps of each stage tell it better"
+                "compiling, often 10 to 30 s a stage, comes on top, and the first steps of each stage tell it better"
             )
         return "\n".join(lines)
 
@@ -104,9 +103,14 @@ class RunForecast:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
         parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
+        advice = (
+            f"change {self._told_options(largest)}, or"
+            if largest != "program"
+            else (f"the program itself takes about {_told(needed.program)} of it:")
+        )
         raise ValueError(
             f"the run would need about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
-            f"used: change {self._told_options(largest)}, or allow more with --max-memory"
+            f"used: {advice} allow more with --max-memory"
         )
 
     def _told_options(self, largest: str) -> str:

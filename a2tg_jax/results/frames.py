@@ -18,7 +18,7 @@ from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.folder import RunFolder, resuming_command
 from a2tg_jax.results.images import picture_names, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
@@ -76,7 +76,7 @@ def render_frames(
     plan = read_record(run).plan
     planned = plan[plan.main[-1] if name is None else name]
     if not run.model(planned.name).is_file():
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with: {resuming_command(run)}")
     model = load_model(run.model(planned.name))
     cameras = dict(_cameras(model, route, num_frames))
     if size is not None:

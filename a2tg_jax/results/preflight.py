@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import warnings
 from pathlib import Path
 
 from a2tg_jax.core.budget import bytes_per_gaussian
@@ -9,8 +10,10 @@ from a2tg_jax.data import Scene
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
+from a2tg_jax.results.output import check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
+from a2tg_jax.training import System
 from a2tg_jax.training.start import check_start, initial_number
 
 STATE_SIZE = 3
@@ -30,15 +33,23 @@ def check_new_run(
     if record.scene.path != SYNTHETIC:
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=overwrite)
+    check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory))
     for system in record.systems.values():
         check_start(scene, system)
     check_room(record, scene, out)
+    warn_of_small_budget(record.system)
     tell_forecast(scene, record.plan, max_memory)
     quicker = quicker_text(scene, record)
     if quicker:
         print(quicker, flush=True)
     return scene
+
+
+def warn_of_small_budget(system: System) -> None:
+    """Warn of a memory budget for so few Gaussians that they cannot show a scene."""
+    if system.small_budget:
+        warnings.warn(f"{system.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
 
 
 def check_weights(lpips_weights: Path | None) -> None:

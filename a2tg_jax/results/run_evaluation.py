@@ -16,7 +16,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.corrected import measure_corrected, write_corrections
-from a2tg_jax.results.folder import RunFolder, write_json
+from a2tg_jax.results.folder import RunFolder, resuming_command, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,
@@ -56,7 +56,7 @@ def evaluate_run(
     plan = record.plan
     models = {name: load_model(run.model(name)) for name in plan.names if run.model(name).is_file()}
     if not models:
-        raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
     scene = scene or record.scene.load()
     measured = {
         name: dataclasses.replace(

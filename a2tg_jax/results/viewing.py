@@ -21,7 +21,7 @@ from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
-from a2tg_jax.results.folder import RunFolder, open_run
+from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
@@ -83,7 +83,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     planned = record.plan[record.plan.main[-1] if name is None else name]
     path = run.model(planned.name)
     if not is_regular(path):
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with a2tg train … --resume")
+        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with: {resuming_command(run)}")
 
     def load_scene() -> Scene | None:
         try:

@@ -1,14 +1,13 @@
 """Whole runs, from checks to report, begun or resumed by one process at a time."""
 
 import contextlib
-import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
-from a2tg_jax.results.folder import RunFolder, check_free, create_run
+from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
 from a2tg_jax.results.record import RunRecord, read_record, write_record
@@ -37,6 +36,7 @@ def begin_run(
     max_memory: int | None = None,
     watched: Watched = unseen,
     session: Session | None = None,
+    progress: bool = True,
 ) -> RunResult:
     """Train and measure a new run, after checking everything about it.
 
@@ -49,6 +49,7 @@ def begin_run(
       max_memory: bytes that the process may take (`forecast.allowed_memory`).
       watched: who looks at the training of a scene meanwhile.
       session: shapes that trainings of this process share; None: a new one.
+      progress: show the progress of training.
 
     Raises:
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
@@ -58,10 +59,18 @@ def begin_run(
     run = RunFolder(out)
     with claimed(run):
         check_free(out, overwrite=overwrite)  # Another process may have been here meanwhile.
-        if overwrite and run.is_begun:
-            return go_on(run, scene, lpips_weights=lpips_weights, replaced_by=record, watched=watched, session=session)
-        write_record(create_run(out), record)
-        return go_on(run, scene, lpips_weights=lpips_weights, watched=watched, session=session)
+        replaced_by = record if overwrite and run.is_begun else None
+        if replaced_by is None:
+            write_record(create_run(out), record)
+        return go_on(
+            run,
+            scene,
+            lpips_weights=lpips_weights,
+            replaced_by=replaced_by,
+            watched=watched,
+            session=session,
+            progress=progress,
+        )
 
 
 def go_on(
@@ -72,12 +81,21 @@ def go_on(
     replaced_by: RunRecord | None = None,
     watched: Watched = unseen,
     session: Session | None = None,
+    progress: bool = True,
 ) -> RunResult:
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
     with _advised(run, is_replacing=replaced_by is not None):
         with signals.noted() as is_stopped, watched(scene) as watch:
-            train_run(run, scene, replaced_by=replaced_by, is_stopped=is_stopped, watch=watch, session=session)
+            train_run(
+                run,
+                scene,
+                replaced_by=replaced_by,
+                progress=progress,
+                is_stopped=is_stopped,
+                watch=watch,
+                session=session,
+            )
         return measure(run, scene, lpips_weights=lpips_weights)
 
 
@@ -121,4 +139,4 @@ def how_to_go_on(run: RunFolder) -> str:
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     if finished and not checkpoints:
         last = f"the last model is {finished[-1]}"
-    return f"{last}; continue with: {shlex.join(['a2tg', 'train', '--out', str(run.path), '--resume'])}"
+    return f"{last}; continue with: {resuming_command(run)}"

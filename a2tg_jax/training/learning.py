@@ -20,6 +20,10 @@ NUM_COMPARED = 16
 """Iterations before the check whose PSNR is averaged."""
 NEARLY_FLAT = 40.0
 """Photographs that one colour shows to so many dB tell nothing of whether a model has learned."""
+ADVICE = (
+    "Look at the initial points and cameras (a2tg view), then try fewer initial_gaussians, a lower initial_opacity or "
+    "lower learning rates, and --refine-poses if poses may be wrong"
+)
 FLAT_BACKGROUNDS: dict[Background, float] = {"black": 0.0, "white": 1.0, "random": 0.5}
 
 
@@ -27,7 +31,14 @@ class LearningCheck:
     """Warn once if training is not above a flat colour per view after a fifth of its first stage."""
 
     def __init__(
-        self, views: tuple[View, ...], order: BatchOrder, iterations: int, background: Background, *, is_first: bool
+        self,
+        views: tuple[View, ...],
+        order: BatchOrder,
+        iterations: int,
+        background: Background,
+        *,
+        is_first: bool,
+        small_budget: str = "",
     ):
         """Set up the check of one stage.
 
@@ -37,7 +48,9 @@ class LearningCheck:
           iterations: length of the stage.
           background: behind transparent photographs.
           is_first: whether this is the first stage; later ones are not checked.
+          small_budget: what a small memory budget has room for, for the warning.
         """
+        self._small_budget = small_budget
         self._views, self._order, self._level = views, order, FLAT_BACKGROUNDS[background]
         at = max(round(CHECKED_AFTER * iterations), LEAST_ITERATIONS)
         self._at = at if is_first and at <= iterations else None
@@ -55,11 +68,10 @@ class LearningCheck:
         reached = float(np.mean([psnr for _, psnr in self._seen]))
         flat = float(np.mean([self._flat(self._order.indices(iteration)) for iteration, _ in self._seen]))
         if not has_learned(reached, flat):
+            advice = f"{self._small_budget}: raise it" if self._small_budget else ADVICE
             warnings.warn(
                 f"training does not learn: {reached:.1f} dB on the training views after {self._at:,} iterations, where "
-                f"one flat colour per view reaches {flat:.1f} dB. Look at the initial points and cameras (a2tg view), "
-                "then try fewer initial_gaussians, a lower initial_opacity or lower learning rates, and --refine-poses "
-                "if poses may be wrong",
+                f"one flat colour per view reaches {flat:.1f} dB. {advice}",
                 stacklevel=2,
             )
 

@@ -125,12 +125,17 @@ class StageRun:
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations)
         self.learning = LearningCheck(
-            self.views, self.order, self.stage.iterations, system.background, is_first=index == 0
+            self.views,
+            self.order,
+            self.stage.iterations,
+            system.background,
+            is_first=index == 0,
+            small_budget=system.small_budget,
         )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}
         self.started = time.perf_counter()
-        self.num_regrown = self.num_refused = 0
+        self.num_regrown = self.num_refused = self.num_compiled = 0
 
     @property
     def history(self) -> History:
@@ -187,7 +192,7 @@ class StageRun:
                     self._log(iteration, info)
                     self.learning.observe(iteration, float(info.psnr))
                     bar.update(info, self.history)
-                bar.tell_pace(iteration)
+                bar.tell_pace(iteration, self.num_compiled)
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
@@ -259,6 +264,7 @@ class StageRun:
         info: StepInfo
         self.state, info = step(*arguments)
         if step.num_compiled() > num_compiled:
+            self.num_compiled += 1
             self.session.after_compiling()
         return info
 

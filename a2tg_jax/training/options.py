@@ -115,6 +115,14 @@ class System:
         megabytes = megabytes_of(self.memory_budget)
         return None if megabytes is None else bytes_of(megabytes)
 
+    @property
+    def small_budget(self) -> str:
+        """What a memory budget for fewer than `FEW_GAUSSIANS` has room for; empty for others."""
+        size = bytes_per_gaussian(self.initial_sh_degree)
+        if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * size:
+            return ""
+        return f"memory_budget has room for {int(self.budget_bytes // size)} Gaussians of {size:,.0f} bytes"
+
     def budget_cap(self, floats: float = 0) -> int | None:
         """Return the number of Gaussians that the memory budget has room for; None without a budget.
 
@@ -268,6 +276,8 @@ class System:
 
 BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
 """Options whose place a memory budget takes."""
+FEW_GAUSSIANS = 100
+"""Number of Gaussians below which a memory budget is likely to be a mistake."""
 RANGES = {
     "batch_size": (1, math.inf),
     "initial_gaussians": (2, math.inf),

@@ -1,6 +1,7 @@
-"""The progress bar of training."""
+"""The progress of training: a bar on a terminal, plain lines elsewhere, and forecasts of a stage's duration."""
 
 import datetime
+import sys
 import time
 from collections.abc import Callable
 
@@ -12,44 +13,74 @@ from a2tg_jax.training.step import StepInfo
 MOMENTUM = 0.95
 TIMED_SECONDS, TIMED_STEPS = 2.0, 3
 """Smallest number of timed steps before a forecast of the duration."""
+PLAIN_SHARE, PLAIN_SECONDS = 0.1, 3.0
+"""Share of a stage, and seconds, between plain lines."""
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
+"""tqdm's format without its rate and remaining time, which count compilation."""
 
 
 class Pace:
-    """Forecast of a stage's duration, printed once. The first step compiles and is not timed."""
+    """Time of an iteration without compilation, and forecasts of a stage's duration: early, and at a half."""
 
-    def __init__(self, total: int, now: Callable[[], float] = time.perf_counter):
+    def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter):
         """Args:
+        first: iterations done before.
         total: the last iteration.
         now: a clock in seconds.
         """
         self._total, self._now = total, now
-        self._start: tuple[int, float] | None = None
-        self._is_told = False
+        self._due = [first, (first + total) // 2]
+        self._before: tuple[int, float, int] | None = None
+        self._steps, self._seconds = 0, 0.0
+
+    def time(self, done: int, num_compiled: int) -> None:
+        """Time the iterations since the last call, unless programs were compiled meanwhile.
+
+        Args:
+          done: iterations so far.
+          num_compiled: programs compiled so far.
+        """
+        now = self._now()
+        if self._before is not None and self._before[2] == num_compiled:
+            self._steps += done - self._before[0]
+            self._seconds += now - self._before[1]
+        self._before = done, now, num_compiled
 
     def told(self, done: int) -> str | None:
-        """Return the forecast after some iterations, or None. The first call begins the timing."""
-        now = self._now()
-        if self._start is None:
-            self._start = done, now
-        steps, seconds = done - self._start[0], now - self._start[1]
-        if self._is_told or steps < TIMED_STEPS or seconds < TIMED_SECONDS:
+        """Return a forecast if one is due and enough was timed since the last, or None."""
+        left = self.left(done)
+        is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
+        if left is None or not is_due or done >= self._total:
             return None
-        self._is_told = True
-        left = datetime.timedelta(seconds=round((self._total - done) * seconds / steps))
-        return f"{1e3 * seconds / steps:,.0f} ms an iteration, about {left} for the other {self._total - done:,}"
+        growing = "; more if Gaussians are added" if len(self._due) > 1 else ""
+        told = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration, about {left} for the other "
+        self._due = [due for due in self._due[1:] if due > done]
+        self._steps, self._seconds = 0, 0.0
+        return f"{told}{self._total - done:,}, without compiling{growing}"
+
+    def left(self, done: int) -> datetime.timedelta | None:
+        """Return the remaining time without compilation; None before a step was timed."""
+        if self._steps == 0:
+            return None
+        return datetime.timedelta(seconds=round((self._total - done) * self._seconds / self._steps))
 
 
 class ProgressBar:
-    """A line with loss, PSNR, live Gaussians, memory and time left."""
+    """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
 
     def __init__(self, title: str, done: int, total: int, *, is_shown: bool):
+        is_bar = is_shown and has_terminal()
         self._bar = tqdm(
-            desc=f"{title} (compiling)", initial=done, total=total, disable=not is_shown, unit="it",
-            dynamic_ncols=True, mininterval=0.5,
+            desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
+            dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
         )  # fmt: skip
-        self._title, self._pace = title, Pace(total)
+        self._title, self._done, self._total, self._pace = title, done, total, Pace(done, total)
+        self._is_shown, self._is_plain = is_shown, is_shown and not is_bar
+        self._last_line = done, time.perf_counter()
         self._loss: float | None = None
         self._psnr = 0.0
+        if self._is_plain:
+            self._print("compiling")
 
     def __enter__(self) -> "ProgressBar":
         return self
@@ -57,10 +88,16 @@ class ProgressBar:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
-    def tell_pace(self, done: int) -> None:
-        """Print the forecast once, after a group of steps that were launched together."""
+    def tell_pace(self, done: int, num_compiled: int) -> None:
+        """Print a forecast if one is due, after a group of steps that were launched together.
+
+        Args:
+          done: iterations so far.
+          num_compiled: programs compiled so far.
+        """
+        self._pace.time(done, num_compiled)
         told = self._pace.told(done)
-        if told is not None and not self._bar.disable:
+        if told is not None and self._is_shown:
             self._bar.write(f"{self._title}: {told}")
 
     def update(self, info: StepInfo, history: History) -> None:
@@ -71,9 +108,37 @@ class ProgressBar:
             self._bar.set_description_str(self._title)
         self._loss += (1 - MOMENTUM) * (loss - self._loss)
         self._psnr += (1 - MOMENTUM) * (psnr - self._psnr)
+        self._done += 1
         self._bar.update()
+        if len(history.iteration) and not self._bar.disable:
+            self._bar.set_postfix_str(self._told(history), refresh=False)
+        if self._is_plain and self._is_line_due():
+            self._print(f"{self._done:,} of {self._total:,}, {self._told(history)}")
+
+    def _told(self, history: History) -> str:
+        left = self._pace.left(self._done)
+        words = [] if left is None or self._done == self._total else [f"{left} left"]
+        words.append(f"loss {self._loss:.4f}, {self._psnr:.2f} dB")
         if len(history.iteration):
-            num, megabytes = int(history.num_gaussians[-1]), float(history.megabytes[-1])
-            self._bar.set_postfix_str(
-                f"loss {self._loss:.4f}, {self._psnr:.2f} dB, {num:,} Gaussians, {megabytes:.2f} MB", refresh=False
-            )
+            words.append(f"{int(history.num_gaussians[-1]):,} Gaussians, {told_size(float(history.megabytes[-1]))}")
+        return ", ".join(words)
+
+    def _is_line_due(self) -> bool:
+        """Return whether a tenth of the stage is done since the last line, and some seconds."""
+        done, at = self._last_line
+        is_next = self._done - done >= PLAIN_SHARE * self._total and time.perf_counter() - at >= PLAIN_SECONDS
+        return is_next or self._done == self._total
+
+    def _print(self, text: str) -> None:
+        print(f"{self._title}: {text}", file=sys.stderr, flush=True)
+        self._last_line = self._done, time.perf_counter()
+
+
+def has_terminal() -> bool:
+    """Return whether stderr can redraw a line: it is a terminal or a notebook."""
+    return sys.stderr.isatty() or type(sys.stderr).__module__.startswith("ipykernel")
+
+
+def told_size(megabytes: float) -> str:
+    """Return the size of a model in MB, or in kB where MB would round to nothing."""
+    return f"{megabytes:.2f} MB" if megabytes >= 0.01 else f"{1e3 * megabytes:.1f} kB"

@@ -1,0 +1,27 @@
+"""Places to write to, checked before any work."""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+
+def check_output(path: Path) -> None:
+    """Raise if a file or folder cannot be made; say on stderr if that makes more than one level of folders.
+
+    Raises:
+      ValueError: naming what stands in the way.
+    """
+    place = Path(os.path.abspath(path))
+    missing = [folder for folder in (place, *place.parents) if not folder.exists()]
+    existing = place.parent if not missing else missing[-1].parent
+    if not missing and place.is_dir():
+        existing = place
+    if not existing.is_dir():
+        raise ValueError(f"{path} cannot be made, for {existing} is a file")
+    try:
+        os.rmdir(tempfile.mkdtemp(dir=existing))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
+    if len(missing) > 1:
+        print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
