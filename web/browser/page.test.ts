@@ -296,7 +296,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     expect(await page.evaluate(() => window.a2tg?.viewer.splats?.num)).toBe(300);
     writeFileSync(path, PAGE);
     await page.goto(pathToFileURL(path).href);
-    expect(await page.locator("#message:not([hidden])").textContent()).toContain("--single-file");
+    expect(await page.locator("#message:not([hidden])").textContent()).toContain("--web OUT.html");
     await page.close();
     rmSync(folder, { recursive: true });
   });
