@@ -474,7 +474,7 @@ def test_render_a_path_that_was_kept_in_the_viewer(tiny_run, tmp_path, capsys):
     assert cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--out", str(out)]) == 0
     with Image.open(out / "frame_0001.png") as frame:
         assert frame.size == (20, 16)
-    assert "2 frames" in capsys.readouterr().out
+    assert f"wrote 2 frames to {out}/\n" in capsys.readouterr().out
 
 
 def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
