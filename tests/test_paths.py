@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.capture import central_camera, turntable, vertical_of
 from a2tg_jax.core.paths import looking, path_through
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.core.turntable import turntable, vertical_of
 from a2tg_jax.io.path_file import load_views
 
 
@@ -121,6 +121,15 @@ def test_cameras_without_one_subject_have_no_turntable():
     ]
     with pytest.raises(ValueError, match="choose --path smooth"):
         turntable(views, 10)
+
+
+def test_the_most_central_camera_is_in_the_middle_and_looks_at_the_subject():
+    viewmats = np.array([camera.viewmat for camera in ring(13)])
+    assert abs(central_camera(viewmats) - 6) <= 1
+    centers = camera_centers(viewmats)
+    viewmats[5:8, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ viewmats[5:8, :3, :3]
+    viewmats[5:8, :3, 3] = -np.einsum("vij,vj->vi", viewmats[5:8, :3, :3], centers[5:8])
+    assert central_camera(viewmats) in (4, 8)
 
 
 def test_few_cameras_tell_their_mean_up():

@@ -280,7 +280,8 @@ def test_a_folder_and_a_single_file(tmp_path):
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
     assert len(scene) == result.num_bytes and decode_web_scene(scene).model.num == source.model.num
     assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in exported_text(result)
-    assert exported_text(result).endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 1 file beside it")
+    assert exported_text(result).endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 2 files beside it")
+    assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
     for _ in range(2):  # The second time, it replaces the first.
         one = export_web(source, tmp_path / "one.html")
     assert exported_text(one).endswith(f"one.html: {in_bytes(one.path.stat().st_size)}")

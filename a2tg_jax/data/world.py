@@ -6,8 +6,8 @@ c is a camera centre, d its optical axis (unit), R a rotation, s a scale; all of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.core.capture import nearest_point
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.core.turntable import nearest_point
 
 MIN_UP_LENGTH = 1e-3
 """Shortest mean of the cameras' unit up vectors that still defines up."""

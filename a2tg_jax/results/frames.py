@@ -11,8 +11,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from a2tg_jax.core.cameras import Camera, crop_camera
+from a2tg_jax.core.capture import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
-from a2tg_jax.core.turntable import turntable
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model

@@ -71,12 +71,14 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
 
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
     files = {out / SCENE_NAME: source.encoded}
+    views: list[int] = []
     if photographs:
         found = ServedPhotographs(source.model.origin, source.load_scene)
         if not found.views:
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
-        files[out / PHOTOGRAPHS_NAME] = json.dumps(sorted(found.views)).encode()
+        views = sorted(found.views)
+    files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
     return files | {out / "index.html": viewer_html().encode()}
 
 

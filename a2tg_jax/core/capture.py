@@ -1,4 +1,4 @@
-"""Turntable around the subject of a capture: its centre, its vertical, and the cameras of a closed orbit.
+"""Geometry of a capture: its subject, its vertical, its most central camera, and a turntable around the subject.
 
 c is a camera centre, d its optical axis (unit); all of it in float64 on the host.
 """
@@ -52,6 +52,16 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
     if len(viewmats) < FEWEST or is_open or abs(axis @ up) < LEAST_COSINE:
         return up
     return axis * np.sign(axis @ up)
+
+
+def central_camera(viewmats: np.ndarray) -> int:
+    """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
+    median camera; both count alike."""
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    subject = nearest_point(centers, axes)
+    misses = np.linalg.norm(np.cross(subject - centers, axes), axis=1)
+    remote = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return int(np.argmin(misses + remote))
 
 
 def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
