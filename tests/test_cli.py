@@ -556,7 +556,7 @@ def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
     assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
     text = capsys.readouterr().out
     path = run.model("a2tg-textures").with_suffix(".a2tgz")
-    assert "dB lost, training views  dB lost, test views" in text and f"file: {path}" in text
+    assert "dB lost, training views  dB lost, test views" in text and f"\n{path}: " in text
     assert load_compact(path).num_bytes == load_model(run.model("a2tg-textures")).num_bytes > 2 * path.stat().st_size
     assert path.relative_to(run.path).as_posix() in run.written()
 

@@ -1,6 +1,7 @@
 """The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm, doctor."""
 
 import dataclasses
+import functools
 import inspect
 import os
 import sys
@@ -83,7 +84,7 @@ class Compress:
     """Write the smallest file of a model within a given loss of PSNR.
 
     The loss is measured on the training views. If the photographs are missing, it is estimated from renders, for a
-    model of 30 dB. A table lists the loss and the bytes of each choice of bits.
+    model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU.
 
     Examples:
       a2tg compress runs/fox
@@ -98,9 +99,8 @@ class Compress:
     """Largest loss of PSNR in dB."""
 
     def run(self) -> None:
-        result = compress(self.source, self.out, max_loss=self.max_loss)
-        print(compression_text(result))
-        print(f"file: {result.path}")
+        tell = functools.partial(print, flush=True)
+        print(compression_text(compress(self.source, self.out, max_loss=self.max_loss, on_start=tell)))
 
 
 @dataclasses.dataclass(frozen=True)
