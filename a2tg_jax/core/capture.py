@@ -43,15 +43,15 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
     It is the axis closest to perpendicular to all right axes in least squares, or the cameras' mean up if the right
     axes do not determine it.
     """
-    up = -viewmats[:, 1, :3].mean(axis=0)
-    up = up / max(float(np.linalg.norm(up)), 1e-12)
+    up: np.ndarray = -viewmats[:, 1, :3].mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
     rights = viewmats[:, 0, :3]
     (least, middle, _), vectors = np.linalg.eigh(rights.T @ rights / len(rights))
     axis: np.ndarray = vectors[:, 0]
     is_open = middle < LEAST_SPREAD or least > LARGEST_RATIO * middle
     if len(viewmats) < FEWEST or is_open or abs(axis @ up) < LEAST_COSINE:
         return up
-    return axis * np.sign(axis @ up)
+    return np.asarray(axis * np.sign(axis @ up))
 
 
 def central_camera(viewmats: np.ndarray) -> int:
