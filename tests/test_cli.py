@@ -491,7 +491,7 @@ def test_render_a_path_that_was_kept_in_the_viewer(tiny_run, tmp_path, capsys):
     assert cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--out", str(out)]) == 0
     with Image.open(out / "frame_0001.png") as frame:
         assert frame.size == (20, 16)
-    assert "2 frames" in capsys.readouterr().out
+    assert f"wrote 2 frames to {out}/\n" in capsys.readouterr().out
 
 
 def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
@@ -573,7 +573,7 @@ def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
     assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
     text = capsys.readouterr().out
     path = run.model("a2tg-textures").with_suffix(".a2tgz")
-    assert "dB lost, training views  dB lost, test views" in text and f"file: {path}" in text
+    assert "dB lost, training views  dB lost, test views" in text and f"\n{path}: " in text
     assert load_compact(path).num_bytes == load_model(run.model("a2tg-textures")).num_bytes > 2 * path.stat().st_size
     assert path.relative_to(run.path).as_posix() in run.written()
 

@@ -8,6 +8,7 @@ import pytest
 from small_values import some_gaussians
 
 from a2tg_jax.cli import main as cli
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
@@ -98,9 +99,16 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
     text = capsys.readouterr().out
     size = (tmp_path / "scene.a2tgz").stat().st_size
     assert load_compact(tmp_path / "scene.a2tgz").num == a_model().num
-    assert f"{a_model().num_bytes:,} bytes of numbers, {size:,} on disk: 1/" in text
+    part = compression.part_told(a_model().num_bytes / size)
+    assert text.startswith("trying up to ") and "on a CPU this takes minutes\n" in text
+    told = f"{tmp_path / 'scene.a2tgz'}: {in_bytes(size)} on disk, {part} of the model's numbers, 0."
+    assert text.splitlines()[-1].startswith(told) and text.endswith(" dB of PSNR lost\n")
     assert "dB lost, if 30 dB" in text and "opacities 2 " in text and "texels" not in text
-    assert f"file: {tmp_path / 'scene.a2tgz'}" in text
+
+
+@pytest.mark.parametrize(("ratio", "told"), [(7.9, "one eighth"), (1.2, "all"), (2.4, "half"), (13.8, "1/14")])
+def test_parts_have_names(ratio, told):
+    assert compression.part_told(ratio) == told
 
 
 @pytest.mark.parametrize(

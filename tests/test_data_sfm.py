@@ -50,13 +50,13 @@ def test_too_little_in_common(tmp_path, capfd):
     for index in range(3):
         noise = np.random.default_rng(index).integers(0, 255, (64, 64, 3), np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.png")
-    with pytest.raises(ValueError, match="only 0 of 3 photographs could be placed"):
-        run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
-    assert capfd.readouterr().err == ""
+    with pytest.raises(ValueError, match="none of the 3 photographs could be placed"):
+        run_sfm(tmp_path / "photos", tmp_path / "new" / "scene", progress=False)
+    assert capfd.readouterr().err == "" and not (tmp_path / "new").exists()
 
 
 def test_failure_says_what_to_do(tmp_path):
-    with pytest.raises(ValueError, match=r"overlap.*take more of them.*texture") as told:
+    with pytest.raises(ValueError, match=r"take more.*overlap.*texture") as told:
         sfm._check_model(None, 300, tmp_path, "exhaustive")
     assert "sequential" not in str(told.value)
     with pytest.raises(ValueError, match="matching exhaustive"):
@@ -72,15 +72,15 @@ def test_no_photographs(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such folder of photographs"):
         run_sfm(tmp_path / "photos", tmp_path / "scene")
     (tmp_path / "photos").mkdir()
-    with pytest.raises(ValueError, match="holds 0 photographs"):
+    with pytest.raises(ValueError, match="photos: is empty; at least 3 photographs are needed"):
         run_sfm(tmp_path / "photos", tmp_path / "scene")
 
 
 @pytest.mark.parametrize(
     "names, words",
     [
-        (["a.HEIC", "b.heic", "c.jpg"], ["holds 1 photographs", "2 .heic", "read: .jpg,", "mogrify -format jpg"]),
-        (["a/clip.MOV"], ["holds 0 photographs", "1 .mov", "ffmpeg -i"]),
+        (["a.HEIC", "b.heic", "c.jpg"], ["holds 1 photograph;", "2 .heic", "read: .jpg,", "mogrify -format jpg"]),
+        (["a/clip.MOV"], ["holds no photographs;", "1 .mov", "ffmpeg -i"]),
         (["notes", ".DS_Store"], ["1 without suffix;"]),
         (["a.heic", "b.png", "c.png", "d.png", "notes.txt"], ["Skipped: 1 .heic;"]),
     ],
@@ -98,8 +98,15 @@ def test_what_is_skipped_is_counted(tmp_path, names, words):
 @pytest.mark.parametrize("read", [find_photos, load_scene])
 def test_a_video_is_told_how_to_become_photographs(tmp_path, read):
     (tmp_path / "a clip.mp4").touch()
-    with pytest.raises(ValueError, match=r"is a video; .*ffmpeg -i '.*a clip\.mp4' -vf fps=2"):
+    with pytest.raises(ValueError, match=r"extract frames: mkdir photos && ffmpeg -i '.*a clip\.mp4' -vf fps=2"):
         read(tmp_path / "a clip.mp4")
+
+
+def test_a_folder_of_photographs_is_told_a_command_that_works(tmp_path, monkeypatch):
+    (tmp_path / "my photos").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="`a2tg sfm 'my photos' SCENE`"):
+        load_scene(tmp_path / "my photos")
 
 
 def test_unreadable_photograph_is_named(tmp_path):

@@ -69,6 +69,7 @@ def status(live: LiveView) -> dict:
 def test_snapshots_and_figures():
     clock = Clock()
     live, run = LiveView(SCENE, "scene", clock), stage_run()
+    assert b'<html data-training="yes" ' in live.routes["/"].read()
     assert live.routes["/scene.a2tgw"].read() is None and status(live)["version"] == 0
     assert live(run, never) == 0
     encoded(live)

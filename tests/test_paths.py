@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.paths import path_through
+from a2tg_jax.core.capture import central_camera, turntable, vertical_of
+from a2tg_jax.core.paths import looking, path_through
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
 
@@ -78,6 +79,63 @@ def test_one_view_stands_still_and_equal_views_do_no_harm():
         path_through([], 3)
     with pytest.raises(ValueError, match="a path needs a view and a frame"):
         path_through([view], 0)
+
+
+# Turntables
+
+
+def ring(num: int = 12, rolled: float = 0.0) -> list[Camera]:
+    """Level cameras on an arc of 80° that look at (1, 2, 3) from above, each rolled a little."""
+    subject, up = np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0])
+    cameras = []
+    for index, angle in enumerate(np.radians(np.linspace(-40, 40, num))):
+        tilt = np.radians(26 + 11 * np.sin(2 * index))
+        outward = np.array([np.cos(tilt) * np.cos(angle), np.cos(tilt) * np.sin(angle), np.sin(tilt)])
+        viewmat = looking(subject + 4 * outward, -outward, -up)
+        roll = Rotation.from_rotvec([0, 0, rolled * (-1) ** index]).as_matrix()
+        viewmat[:3] = roll @ viewmat[:3]
+        cameras.append(Camera(viewmat.astype(np.float32), np.diag([60, 60, 1]).astype(np.float32), 64, 48))
+    return cameras
+
+
+def test_a_turntable_is_a_level_closed_loop_around_the_subject():
+    orbit = turntable(ring(rolled=0.05), 36)
+    viewmats = np.array([camera.viewmat for camera in orbit], np.float64)
+    centers, up = camera_centers(viewmats), vertical_of(np.array([c.viewmat for c in ring(rolled=0.05)]))
+    assert up[2] > 0.995
+    to_subject = [1, 2, 3] - centers
+    np.testing.assert_allclose(np.linalg.norm(to_subject, axis=1), 4.0, rtol=1e-4)
+    np.testing.assert_allclose(viewmats[:, 2, :3], to_subject / 4, atol=1e-4)
+    np.testing.assert_allclose(viewmats[:, 0, :3] @ up, 0.0, atol=1e-6)
+    assert (viewmats[:, 1, :3] @ up < 0).all() and (centers[:, 2] > 3).all()
+    steps = np.linalg.norm(centers - np.roll(centers, 1, axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-3)
+    np.testing.assert_allclose(
+        np.cross(centers[0] - [1, 2, 3], np.asarray(ring()[0].center) - [1, 2, 3])[2], 0, atol=0.05
+    )
+
+
+def test_cameras_without_one_subject_have_no_turntable():
+    views = [
+        Camera(np.eye(4, k=0) + 0.1 * np.eye(4, k=3) * index, view.K, 64, 48) for index, view in enumerate(ring(6))
+    ]
+    with pytest.raises(ValueError, match="choose --path smooth"):
+        turntable(views, 10)
+
+
+def test_the_most_central_camera_is_in_the_middle_and_looks_at_the_subject():
+    viewmats = np.array([camera.viewmat for camera in ring(13)])
+    assert abs(central_camera(viewmats) - 6) <= 1
+    centers = camera_centers(viewmats)
+    viewmats[5:8, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ viewmats[5:8, :3, :3]
+    viewmats[5:8, :3, 3] = -np.einsum("vij,vj->vi", viewmats[5:8, :3, :3], centers[5:8])
+    assert central_camera(viewmats) in (4, 8)
+
+
+def test_few_cameras_tell_their_mean_up():
+    viewmats = np.array([camera.viewmat for camera in ring(3)])
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    np.testing.assert_allclose(vertical_of(viewmats), up / np.linalg.norm(up))
 
 
 def test_files_come_back(tmp_path):

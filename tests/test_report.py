@@ -101,6 +101,14 @@ def test_every_comparison_of_psnr_names_bytes(report):
         assert ("PSNR" in table and "memory (MB)" in table) or table.count(" MB)</th>") == len(NAMES)
 
 
+def test_the_page_says_what_it_shows_in_plain_words(report):
+    assert "the part with the largest gain of after over\nbefore, of the parts" in report
+    assert '<output class="soft">Shown: after</output>' in report
+    assert re.search(r"Speed at 40×30, on this [A-Z]+<b>", report) and re.search(r"<summary>\d+ settings<", report)
+    assert "<th>package</th>" in report
+    assert re.search(r"\.compare img \{ max-height: 80vh; object-fit: contain;", report)
+
+
 def test_the_models_own_training_time_stands_apart(report):
     cards = dict(re.findall(r'<div class="card">([^<]*)<b>([^<]*)</b>', report))
     gain = "Gain over gaussians-2d-mcmc-continued, with 1.2 times its bytes (0.03 MB and 0.02 MB)"
@@ -118,8 +126,8 @@ def test_texts_of_a_scene_never_become_markup(tmp_path):
     parser.handle_data = texts.append
     parser.feed(report)
     assert tags.count("script") == 1
-    # Twice the title, the view, and its two captions below pictures and crops and on buttons.
-    assert sum(nasty in text for text in texts) == 2 + 1 + 2 * 3
+    # Twice the title, the view, its two captions below pictures and crops and on buttons, and the one that is shown.
+    assert sum(nasty in text for text in texts) == 2 + 1 + 2 * 3 + 1
 
 
 def test_the_report_says_what_is_special_about_a_run(tmp_path):

@@ -17,6 +17,7 @@ from small_values import some_gaussians
 from test_compact import textured
 
 from a2tg_jax.cli.main import main
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.compact import save_compact
@@ -279,12 +280,16 @@ def test_a_folder_and_a_single_file(tmp_path):
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
     assert len(scene) == result.num_bytes and decode_web_scene(scene).model.num == source.model.num
     assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in exported_text(result)
-    one = export_web(source, tmp_path / "one.html", single_file=True)
+    assert exported_text(result).endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 2 files beside it")
+    assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
+    for _ in range(2):  # The second time, it replaces the first.
+        one = export_web(source, tmp_path / "one.html")
+    assert exported_text(one).endswith(f"one.html: {in_bytes(one.path.stat().st_size)}")
     assert one.path.read_text(encoding="utf-8") == viewer_html_with(scene)
     with pytest.raises(ValueError, match="no photographs"):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out --single-file"):
-        export_web(source, tmp_path / "with.html", photographs=True, single_file=True)
+        export_web(source, tmp_path / "with.html", photographs=True)
 
 
 def test_a_gain_is_not_called_a_loss():

@@ -14,6 +14,8 @@ from small_values import some_gaussians
 from test_compact import MODELS, banded, every_model, order_of, plain, tables, textured
 
 from a2tg_jax.appearance import Banded, Billboards, MovableKernels, TextureOptions
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.compaction import loss_beside_renders
 from a2tg_jax.io import web_scene
 from a2tg_jax.io.rows import rows_of
@@ -28,6 +30,17 @@ def again(model: Model) -> Model:
 
 
 # What comes back
+
+
+def test_the_viewer_opens_at_a_central_training_camera():
+    """The fourth of five cameras in a row, of which the third is a test view."""
+    viewmats = np.stack([np.eye(4)] * 5)
+    viewmats[:, 0, 3], viewmats[:, 2, 3] = [3.0, 2.0, 0.0, -0.5, -3.0], 4.0
+    K = np.diag([60.0, 60.0, 1.0])
+    cameras = [Camera(viewmat, K, 64, 48) for viewmat in viewmats]
+    origin = Origin.of_cameras(cameras, is_test=[False, False, True, False, False])
+    model = dataclasses.replace(plain(), origin=origin)
+    assert decode_web_scene(encode_web_scene(model)).header["first"] == 3
 
 
 @every_model

@@ -7,6 +7,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
+from a2tg_jax.core.display import counted
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.frames import (
     FRAMES_PER_SECOND,
@@ -30,6 +31,7 @@ class Render:
     Examples:
       a2tg render runs/fox --frames 240 --fps 60
       a2tg render runs/fox --size 1280x720
+      a2tg render runs/fox --path orbit --frames 240 --out fox-orbit
       a2tg render runs/fox --path test --out fox-test
       a2tg render runs/fox --path path.json --out fox-flight
     """
@@ -37,7 +39,8 @@ class Render:
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
     path: Route | Path = "smooth"
-    """Camera path: smooth (a flight past the cameras), test (the test views), or a file (*.json) saved in a2tg view."""
+    """Camera path: smooth (a flight past the cameras), orbit (a turntable around the subject), test (the test views),
+    or a file (*.json) saved in a2tg view."""
     frames: int = 120
     """Number of frames of the flight."""
     fps: float = FRAMES_PER_SECOND
@@ -56,7 +59,7 @@ class Render:
         size = None if self.size is None else parse_size(self.size)
         check_output(out)
         paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model, size=size)
-        print(f"{len(paths)} frames in {out}")
+        print(f"wrote {counted(len(paths), 'frame')} to {out}/")
         if self.path != "test":
             self._write_video(out, paths)
 

@@ -30,8 +30,8 @@ class Sfm:
     out: Annotated[Positional[Path], arg(metavar="SCENE")]
     """New scene folder for the images and the sparse model, ready for a2tg train."""
     matching: Matching = "auto"
-    """Pairs of photographs to match: all pairs (exhaustive), neighbours by name (sequential, for many photographs named
-    in the order of taking), or neighbours beyond 200 photographs (auto)."""
+    """Pairs of photographs to match. auto: all pairs up to 200 photographs, neighbours by name beyond. exhaustive: all
+    pairs. sequential: neighbours by name, for many photographs named in the order of taking."""
 
     def run(self) -> None:
         check_apart(self.out, self.photos)

@@ -64,18 +64,18 @@ class Export:
 
     Examples:
       a2tg export runs/fox --web site/fox
-      a2tg export runs/fox --web fox.html --single-file
+      a2tg export runs/fox --web fox.html
       a2tg export runs/fox --ply fox.ply
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
     """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
     web: Path | None = None
-    """Output folder of the page, or output file with --single-file."""
+    """Output folder of the page; a name that ends in .html is one HTML file that needs no other."""
     ply: Annotated[Path | None, arg(metavar="FILE")] = None
     """Output file of the Gaussians."""
     single_file: bool = False
-    """Write one HTML file that needs no other."""
+    """Write one HTML file, whatever its name."""
     photographs: bool = False
     """Put the photographs of the run's cameras beside the page."""
     model: LastModel = None
@@ -93,7 +93,6 @@ class Export:
         if self.web is not None:
             result = export_web(source, self.web, single_file=self.single_file, photographs=self.photographs)
             print(exported_text(result))
-            print(f"page: {result.path}")
 
 
 def in_browser(scene: Scene) -> AbstractContextManager[Watch]:

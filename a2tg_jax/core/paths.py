@@ -40,7 +40,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     curve = _smoothed(knots, num_frames)
     first = cameras[0]
     return [
-        Camera(jnp.asarray(_look(*np.split(row, 3)), first.viewmat.dtype), first.K, first.width, first.height)
+        Camera(jnp.asarray(looking(*np.split(row, 3)), first.viewmat.dtype), first.K, first.width, first.height)
         for row in curve
     ]
 
@@ -109,7 +109,7 @@ def _smoothed(knots: np.ndarray, num_frames: int) -> np.ndarray:
     return np.stack([np.interp(wanted, travelled, column) for column in dense.T], axis=1)
 
 
-def _look(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
+def looking(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] at `center`, with z along `forward` and y closest to `down`."""
     z = forward / np.linalg.norm(forward)
     x = np.cross(down, z)

@@ -10,6 +10,7 @@ from a2tg_jax.data.photo_folder import check_no_video
 from a2tg_jax.data.scene import Scene, check_test_every
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.text import as_argument
 
 
 def load_scene(
@@ -50,6 +51,12 @@ def load_scene(
     return alpha_as_mask(scene, str(path)) if alpha == "mask" else scene
 
 
+def is_scene(folder: Path) -> bool:
+    """Return whether a folder holds a scene in a known format."""
+    names = (NERFSTUDIO_FILE, BLENDER_FILES[0])
+    return find_model(folder) is not None or any(is_regular(folder / name) for name in names)
+
+
 def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scene:
     """Load the scene as it lies on disk."""
     if downscale < 1 or downscale != int(downscale):
@@ -73,5 +80,5 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
         return load_blender(path, **options)
     raise FileNotFoundError(
         f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
-        f"for plain photographs, run `a2tg sfm {path} SCENE` first"
+        f"for plain photographs, run `a2tg sfm {as_argument(path)} SCENE` first"
     )

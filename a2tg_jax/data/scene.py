@@ -213,7 +213,7 @@ def assemble_scene(
     centers = camera_centers(np.stack(list(viewmats.values())))
     cloud = cloud and _usable(cloud, transform, source)
     if cloud is None or len(cloud.points) < 2:
-        message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS} random points instead"
+        message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS:,} random points instead"
         warnings.warn(message, stacklevel=3)
         points, colors = random_points(np.zeros(3), float(np.abs(centers).max()))
     else:

@@ -6,7 +6,7 @@ import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -27,10 +27,7 @@ PHOTOS_PER_CORE = 2
 """Photographs of which features are extracted together, so that the progress bar moves."""
 TICK = 0.5
 """Seconds between two readings of the clock of a phase without countable progress."""
-ADVICE = (
-    "sharp photographs that overlap by two thirds, from different places, work best: take more of them, closer "
-    "together, with texture in sight (blank walls, glass and mirrors have none) and the same zoom and light"
-)
+ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 
 
 class SfmSummary(NamedTuple):
@@ -71,7 +68,7 @@ def run_sfm(
 
     Raises:
       FileNotFoundError: if there is no such folder of photographs.
-      FileExistsError: if `out` holds a scene already.
+      FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
     """
     if matching not in get_args(Matching):
@@ -81,8 +78,9 @@ def run_sfm(
     for existing in (out / "images", out / "sparse"):
         if existing.exists():
             raise FileExistsError(f"{existing}: exists already; choose another output folder or remove it")
-    out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
+    if out.is_file():
+        raise FileExistsError(f"{out} is a file; choose a folder for the scene")
+    with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
         if matching == "auto":
             matching = "exhaustive" if len(names) <= MAX_EXHAUSTIVE else "sequential"
@@ -151,9 +149,10 @@ def _check_model(model: Any, num_photos: int, photos: Path, matching: Matching) 
     num_registered = 0 if model is None else model.num_reg_images()
     advice = ADVICE
     if matching == "sequential":
-        advice += "; only neighbours by name were matched: name them in the order of taking, or match all pairs with "
-        advice += "matching exhaustive"
-    message = f"{photos}: only {num_registered} of {num_photos} photographs could be placed; {advice}"
+        advice += "; only neighbours by name were matched: name them in the order of taking, or choose --matching "
+        advice += "exhaustive"
+    placed = f"only {num_registered} of" if num_registered else "none of the"
+    message = f"{photos}: {placed} {num_photos} photographs could be placed; {advice}"
     if num_registered < MIN_REGISTERED:
         raise ValueError(message)
     if num_registered < num_photos / 2:
@@ -182,6 +181,20 @@ def _have_one_size(photos: Path, names: list[str]) -> bool:
       ValueError: naming the first unreadable or too large photograph, because COLMAP's own reader has no bounds.
     """
     return len(set(map_in_threads(lambda name: check_picture(photos / name), names))) == 1
+
+
+@contextmanager
+def _new_folder(folder: Path) -> Iterator[None]:
+    """Make a folder. If the block fails, remove what was made, as far as it is empty."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for path in made:
+                path.rmdir()
+        raise
 
 
 @contextmanager

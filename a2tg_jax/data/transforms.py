@@ -96,7 +96,7 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
     else:
         train, test = every_kth(train, test_every)
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
-    logger.info("%s: a Blender scene, starting from %d random points", folder, len(cloud.points))
+    logger.info("%s: a Blender scene, starting from %s random points", folder, f"{len(cloud.points):,}")
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder))
 
 

@@ -6,10 +6,9 @@ c is a camera centre, d its optical axis (unit), R a rotation, s a scale; all of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.core.capture import nearest_point
 from a2tg_jax.core.similarity import Similarity, camera_centers
 
-MIN_AXIS_SPREAD = 1e-3
-"""Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""
 MIN_UP_LENGTH = 1e-3
 """Shortest mean of the cameras' unit up vectors that still defines up."""
 ZERO_SPREAD = 1e-9
@@ -30,7 +29,7 @@ def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
       ValueError: if all or most cameras stand at one place, so that there is no size to normalise.
     """
     centers = camera_centers(viewmats)
-    origin = _nearest_point(centers, viewmats[:, 2, :3])
+    origin = nearest_point(centers, viewmats[:, 2, :3])
     rotation = _rotation_to_z(-viewmats[:, 1, :3].mean(axis=0))
     zero = ZERO_SPREAD * max(float(np.linalg.norm(centers, axis=1).max()), np.finfo(np.float64).tiny)
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
@@ -44,16 +43,6 @@ def scene_scale(centers: np.ndarray) -> float:
     """Return 1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning
     rate."""
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-
-
-def _nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return argmin_x Σ |(I - d·dᵀ)(x - c)|² for lines through `centers` along unit `axes`, or the mean centre."""
-    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal_matrix = projections.mean(axis=0)
-    if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
-        mean: np.ndarray = centers.mean(axis=0)
-        return mean
-    return np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", projections, centers) / len(centers))
 
 
 def _rotation_to_z(up: np.ndarray) -> np.ndarray:

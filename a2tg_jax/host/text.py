@@ -1,7 +1,9 @@
 """Short texts for messages."""
 
 import difflib
+import shlex
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 SLACK = 10
@@ -15,6 +17,12 @@ def shortened(value: Any, most: int = 80) -> str:
     text = " ".join(text.split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def as_argument(path: Path) -> str:
+    """Return a path as a shell takes it, relative to the current folder if it lies there."""
+    here = Path.cwd()
+    return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

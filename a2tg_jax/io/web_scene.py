@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
 from a2tg_jax.appearance.textured import shown_textures
+from a2tg_jax.core.capture import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
@@ -251,7 +252,13 @@ def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
             origin.names, origin.is_test, origin.sizes, origin.viewmats, origin.Ks, strict=True
         )
     ]
-    return {"background": as_floats(origin.background), "cameras": cameras}
+    return {"background": as_floats(origin.background), "cameras": cameras, "first": _first_camera(origin)}
+
+
+def _first_camera(origin: Origin) -> int:
+    """Return the index of the camera at which the viewer opens: the most central one of the training cameras."""
+    candidates = np.flatnonzero(~origin.is_test) if not np.all(origin.is_test) else np.arange(len(origin.is_test))
+    return int(candidates[central_camera(origin.viewmats[candidates])]) if len(candidates) else 0
 
 
 def _origin_of(header: Mapping[str, Any]) -> Origin | None:

@@ -2,12 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
+    LADDER,
     Loss,
     Trial,
     loss_beside_renders,
@@ -27,8 +29,14 @@ from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 from a2tg_jax.results.summary import aligned
+from a2tg_jax.results.web_export import loss_told
 
 SUFFIX = ".a2tgz"
+PARTS = (
+    "all", "half", "one third", "one quarter", "one fifth", "one sixth", "one seventh", "one eighth", "one ninth",
+    "one tenth",
+)  # fmt: skip
+"""Names of 1/1, 1/2, 1/3, …"""
 MOST_VIEWS = 16
 """Largest number of training views measured, evenly chosen."""
 
@@ -47,7 +55,9 @@ class Compressed:
     """Names of the loss measures of the trials."""
 
 
-def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -> Compressed:
+def compress(
+    source: Path, out: Path | None = None, *, max_loss: float = 0.05, on_start: Callable[[str], None] = lambda _: None
+) -> Compressed:
     """Write the smallest compact file of a model within a given loss.
 
     Losses are those of PSNR on the training views of a run. If the photographs are missing, or a model's file is
@@ -57,6 +67,7 @@ def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -
       source: a run folder, of which the last model is taken; or a model, *.npz.
       out: the file; None is beside the model.
       max_loss: in dB.
+      on_start: called with how much there is to try, once the arguments are checked.
 
     Raises:
       FileNotFoundError: if there is no such model.
@@ -72,6 +83,8 @@ def compress(source: Path, out: Path | None = None, *, max_loss: float = 0.05) -
     if out.is_dir() or out.resolve() == path.resolve():
         raise ValueError(f"out must be a new file, or one other than the model; got {out}")
     losses = _losses(model, None if run is None else _scene_of(run), settings)
+    num_ways = sum(map(len, LADDER.values()))
+    on_start(f"trying up to {num_ways} ways to round the model's numbers; on a CPU this takes minutes")
     trials = measure_choices(model, list(losses.values()))
     chosen = smallest_within(model, list(losses.values()), max_loss, trials)
     if run is not None and out == path.with_suffix(SUFFIX):
@@ -116,7 +129,7 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
 
 
 def compression_text(result: Compressed) -> str:
-    """Return a table of all choices tried, and a summary of the file."""
+    """Return a table of all choices tried, and at the end a line about the file."""
     chosen, model = result.chosen, result.model
     groups = dict.fromkeys(trial.group for trial in result.trials)
     rows = [[f"{trial.group} {trial.precision}", *_figures(trial)] for trial in result.trials]
@@ -127,9 +140,15 @@ def compression_text(result: Compressed) -> str:
         strict=True,
     )
     kept = ", ".join(f"{group} {getattr(chosen.choices, group)}" for group in GROUPS if group in groups)
-    sizes = f"{model.num_bytes:,} bytes of numbers, {chosen.num_bytes:,} on disk"
-    ratio = f"1/{model.num_bytes / chosen.num_bytes:.1f}"
-    return "\n".join([*aligned(list(columns)), f"chosen: {kept}", f"{model.num:,} Gaussians, {sizes}: {ratio}"])
+    share = f"{part_told(model.num_bytes / chosen.num_bytes)} of the model's numbers"
+    told = f"{result.path}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_told(chosen.losses[0])}"
+    return "\n".join([*aligned(list(columns)), f"chosen: {kept}", told])
+
+
+def part_told(ratio: float) -> str:
+    """Return "one eighth" for a ratio near 8, and "1/14" for one that has no short name."""
+    whole = round(ratio)
+    return PARTS[whole - 1] if 1 <= whole <= len(PARTS) else f"1/{whole}"
 
 
 def _figures(trial: Trial) -> list[str]:

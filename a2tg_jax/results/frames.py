@@ -1,4 +1,4 @@
-"""Frames of a finished run: its test views, or a smooth path past the cameras or drawn by hand, and a video of that."""
+"""Frames of a finished run, and a video: its test views, or a path past the cameras, around the subject or by hand."""
 
 import re
 import shutil
@@ -11,6 +11,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from a2tg_jax.core.cameras import Camera, crop_camera
+from a2tg_jax.core.capture import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import shortened
@@ -23,7 +24,7 @@ from a2tg_jax.results.images import picture_names, save_picture, to_uint8
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 
-Route = Literal["test", "smooth"]
+Route = Literal["test", "smooth", "orbit"]
 FRAMES_PER_SECOND = 30
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
@@ -58,8 +59,8 @@ def render_frames(
     Args:
       run: an opened run folder.
       out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views.
-      route: the test views, a smooth path past all cameras, or a file of views that the viewer saved, through which a
-        path goes.
+      route: the test views, a smooth path past all cameras, an orbit around the subject, or a file of views that the
+        viewer saved, through which a path goes.
       num_frames: length of the path.
       name: whose model is drawn; None: the last stage of the run's main system.
       size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' own.
@@ -141,8 +142,9 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
     if model.origin is None:
         raise ValueError("the model has no cameras to render; it does not know where it was trained")
     views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
-    if route == "smooth":
-        yield from _numbered(smooth_path([camera for _, _, camera in views], num_frames))
+    if route != "test":
+        path = smooth_path if route == "smooth" else turntable
+        yield from _numbered(path([camera for _, _, camera in views], num_frames))
         return
     if not model.origin.is_test.any():
         raise ValueError("the run has no test views; render a path instead with --path smooth")

@@ -66,7 +66,7 @@ class LiveView:
         """Routes of the viewer's server."""
         photographs = ServedPhotographs(origin_of_scene(self._scene), lambda: self._scene)
         return {
-            "/": Route("text/html; charset=utf-8", viewer_html().encode()),
+            "/": Route("text/html; charset=utf-8", viewer_html(is_training=True).encode()),
             f"/{SCENE_NAME}": Route("application/octet-stream", lambda: self._scene_bytes),
             f"/{STATUS_NAME}": Route("application/json", self._status_json),
             "/pause": Route("application/json", self._status_json, act=self._paused.set),

@@ -4,9 +4,10 @@ import base64
 import dataclasses
 import hashlib
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from a2tg_jax.host.atomic import replacing
@@ -69,15 +70,18 @@ class ShownComparison:
     uris: Sequence[str]
     crops: Sequence[str]
     """Enlarged parts; may be empty."""
+    size: tuple[int, int]
+    """Width and height of the render in pixels."""
 
     @classmethod
     def of(cls, view: Comparison) -> "ShownComparison":
         parts = [] if view.crop is None else [view.crop.of(image) for image in view.images]
         crops = [jpeg_uri(part, zoom=CROP_ZOOM) for part in parts]
-        return cls(view.name, view.captions, [jpeg_uri(image) for image in view.images], crops)
+        height, width = view.images[-1].shape[:2]
+        return cls(view.name, view.captions, [jpeg_uri(image) for image in view.images], crops, (width, height))
 
 
-def write_report(run: RunFolder, result: RunResult, views: Iterable[ShownComparison], figures: Figures) -> None:
+def write_report(run: RunFolder, result: RunResult, views: Sequence[ShownComparison], figures: Figures) -> None:
     """Write report.html from the results, some views, and the figures in the run folder."""
     shown = next(iter(result.models.values()))
     held_out = result.record.scene.held_out
@@ -91,8 +95,9 @@ def write_report(run: RunFolder, result: RunResult, views: Iterable[ShownCompari
         purpose={"test": "testing", "validation": "validation"}[held_out],
         viewer=run.viewer.name if run.viewer.is_file() else None,
         warnings=learning_lines(result),
-        cards=_cards(result),
-        summary=_summary(result),
+        cards=_cards(result, views[0].size if views else None),
+        summary=(summary := _summary(result)),
+        rows_shown=[row[0] for row in summary[1]],
         lpips_network=result.lpips_network,
         corrections={key.partition("_")[2] for key in result.models[result.main].corrected},
         comparisons=views,
@@ -127,11 +132,13 @@ def _source(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _cards(result: RunResult) -> list[tuple[str, str]]:
+def _cards(result: RunResult, size: tuple[int, int] | None) -> list[tuple[str, str]]:
+    """Return the figures on top of the page; `size` is that of the renders."""
     last = result.models[result.main]
     gains = [
         (f"Gain over {name}, {bytes_compared(result, name)}", f"{gain:+.2f} dB") for name, gain in result.gains.items()
     ]
+    device = jax.devices()[0].platform.upper()
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     others = sum(measured.seconds for measured in result.models.values()) - own
     return [
@@ -140,7 +147,10 @@ def _cards(result: RunResult) -> list[tuple[str, str]]:
         ("SSIM", f"{last.shown.ssim:.4f}"),
         ("Gaussians", f"{last.num_gaussians:,}"),
         ("Memory", f"{megabytes(last.num_bytes)} MB"),
-        ("Speed", f"{last.shown.frames_per_second:.1f} fps"),
+        (
+            f"Speed{f' at {size[0]}×{size[1]}' if size else ''}, on this {device}",
+            f"{last.shown.frames_per_second:.1f} fps",
+        ),
         ("Training", minutes(own)),
         *([("Comparisons' training", minutes(others))] if others else []),
     ]
@@ -190,7 +200,7 @@ def _files(run: RunFolder, result: RunResult) -> list[tuple[str, str]]:
         run.point_cloud: "the Gaussians for other programs, without textures",
         run.metrics: "all figures",
         run.per_view: "the figures of every view",
-        run.record: "what repeats the run",
+        run.record: "the settings of this run",
     }
     return [(path.relative_to(run.path).as_posix(), what) for path, what in told.items() if path.is_file()]
 

@@ -4,9 +4,10 @@ import dataclasses
 import functools
 import io
 import json
+import shlex
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from PIL import Image
 
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import Scene, View, view_image
+from a2tg_jax.data.load import is_scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model
@@ -29,6 +31,11 @@ from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, vie
 from a2tg_jax.web.server import Route
 
 QUALITY = 90
+LOADERS: Mapping[str, Callable[[Path], Model]] = {".npz": load_model, ".a2tgz": load_compact}
+"""Readers of models, by the suffix of the file."""
+SHOWN = "a run folder, or a file *.npz, *.a2tgz or *.ply"
+MOST_LISTED = 5
+"""Largest number of run folders that a message lists."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,13 +76,31 @@ def open_source(path: Path, name: str | None = None) -> Source:
       ValueError: if it cannot be read.
     """
     if path.is_dir():
-        return _source_of_run(open_run(path), name)
+        return _source_of_run(_run_at(path), name)
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such file or folder")
     if name is not None:
         raise ValueError(f"--model needs a run folder; {path} is not a folder")
-    if path.suffix == ".ply":
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
         return _source_of_ply(path)
-    load = load_compact if path.suffix == ".a2tgz" else load_model
-    return Source(load(path), path.stem)
+    if suffix not in LOADERS:
+        raise ValueError(f"{path}: is not a scene to show; give {SHOWN}")
+    return Source(LOADERS[suffix](path), path.stem)
+
+
+def _run_at(folder: Path) -> RunFolder:
+    """Return the run folder; if the folder is none, raise FileNotFoundError with what lies there instead."""
+    if is_regular(RunFolder(folder).record):
+        return open_run(folder)
+    if is_scene(folder):
+        command = ["a2tg", "train", str(folder), "--out", f"runs/{folder.resolve().name}", "--preset", "quick"]
+        raise FileNotFoundError(f"{folder} is a scene that must be trained first: {shlex.join(command)}")
+    runs = sorted(below for below in folder.iterdir() if RunFolder(below).record.is_file())
+    if not runs:
+        raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml); give {SHOWN}")
+    listed = [shlex.quote(str(run)) for run in runs[:MOST_LISTED]] + ["…"] * (len(runs) > MOST_LISTED)
+    raise FileNotFoundError(f"{folder} holds run folders; give one of them: {', '.join(listed)}")
 
 
 def _source_of_run(run: RunFolder, name: str | None) -> Source:

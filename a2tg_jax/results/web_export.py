@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
@@ -28,7 +29,10 @@ class Exported:
     path: Path
     """Path of the page."""
     num_bytes: int
-    """Bytes of the scene file alone."""
+    """Bytes of the scene alone."""
+    num_files: int
+    total_bytes: int
+    """Bytes of all files."""
     model: Model
     losses: Mapping[str, float]
     """Loss of the scene file in dB of PSNR, by what it is measured on."""
@@ -39,15 +43,21 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
 
     Args:
       source: the model.
-      out: the folder, which is made; or the file, by custom *.html.
-      single_file: the scene stands in the page.
+      out: the folder, which is made; or the file. A name that ends in .html is a file's, unless a folder lies there.
+      single_file: one file, whatever its name.
       photographs: into the folder go the cameras' photographs too.
 
     Raises:
+      FileExistsError: if a folder is wanted where a file lies, or a file where a folder lies.
       ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
     """
+    single_file = single_file or (out.suffix.lower() == ".html" and not out.is_dir())
     if single_file and photographs:
-        raise ValueError("--photographs needs a folder beside the page: leave out --single-file")
+        raise ValueError("--photographs needs a folder: leave out --single-file, and .html at the end of --web")
+    if single_file and out.is_dir():
+        raise FileExistsError(f"{out} is a folder; with --single-file, --web must be the path of a file")
+    if not single_file and out.is_file():
+        raise FileExistsError(f"{out} is a file; choose a folder with --web, or a name that ends in .html for one file")
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
     data = source.encoded
@@ -55,26 +65,31 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
-    return Exported(out if single_file else out / "index.html", len(data), source.model, _losses_of(source))
+    page, total = out if single_file else out / "index.html", sum(map(len, files.values()))
+    return Exported(page, len(data), len(files), total, source.model, _losses_of(source))
 
 
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
     files = {out / SCENE_NAME: source.encoded}
+    views: list[int] = []
     if photographs:
         found = ServedPhotographs(source.model.origin, source.load_scene)
         if not found.views:
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
-        files[out / PHOTOGRAPHS_NAME] = json.dumps(sorted(found.views)).encode()
+        views = sorted(found.views)
+    files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
     return files | {out / "index.html": viewer_html().encode()}
 
 
 def exported_text(result: Exported) -> str:
     """Return a summary of the files written, their size and their loss."""
     model, size = result.model, result.num_bytes
-    lines = [f"{model.num:,} Gaussians, {model.num_bytes:,} bytes of numbers, {size:,} in the scene's file: "
-             f"1/{model.num_bytes / max(size, 1):.1f}"]  # fmt: skip
+    ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
+    lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
     lines += [f"{loss_told(loss)}, {measure}" for measure, loss in result.losses.items()]
+    beside = "" if result.num_files == 1 else f" with {counted(result.num_files - 1, 'file')} beside it"
+    lines.append(f"{result.path}: {in_bytes(result.total_bytes)}{beside}")
     return "\n".join(lines)
 
 

@@ -11,9 +11,10 @@ STATUS_NAME = "training.json"
 """Name of the status of a running training, which the page polls while it exists."""
 
 
-def viewer_html() -> str:
-    """Return the viewer's page, which shows the scene beside it."""
-    return resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+def viewer_html(*, is_training: bool = False) -> str:
+    """Return the viewer's page, which shows the scene beside it, and follows the training beside it if there is one."""
+    page = resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+    return page.replace("<html ", '<html data-training="yes" ', 1) if is_training else page
 
 
 def viewer_html_with(scene: bytes) -> str:

@@ -134,10 +134,12 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.fill("#from-height", "0.49");
     const slice = await shownOn(page);
     expect([half < 0.9 * all, slice < 0.3 * half]).toEqual([true, true]);
+    expect(await page.textContent("#height-range")).toBe("49 to 50 %");
     await page.click("#uncrop");
     expect(await shownOn(page)).toBe(all);
     await page.fill("#floaters", "0.8");
     expect(await shownOn(page)).toBeLessThan(0.9 * all);
+    expect(await page.textContent("#floaters-value")).toBe("80 %");
     await page.close();
   });
 });

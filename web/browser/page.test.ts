@@ -178,6 +178,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
+  test("a page without a training asks for its own files alone", async () => {
+    const page = await browser.newPage();
+    const asked: string[] = [];
+    page.on("request", (request) => asked.push(request.url().replace(served.address, "/")));
+    await page.goto(served.address);
+    await page.evaluate(() => window.a2tg?.loaded);
+    await page.waitForLoadState("networkidle");
+    expect(asked.filter((url) => url.startsWith("/")).sort()).toEqual([
+      "/",
+      "/photographs.json",
+      "/photographs/0.jpg",
+      "/scene.a2tgw",
+    ]);
+    await page.close();
+  });
+
   test("a training is followed, paused and resumed", async () => {
     const status = {
       version: 0,
@@ -192,7 +208,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     };
     const tell = (is_paused: boolean): string => JSON.stringify(Object.assign(status, { is_paused }));
     const other = await serve({
-      "/": PAGE,
+      "/": PAGE.replace("<html ", '<html data-training="yes" '),
       "/scene.a2tgw": SCENE,
       "/training.json": () => tell(status.is_paused),
       "/pause": () => tell(true),
@@ -296,7 +312,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     expect(await page.evaluate(() => window.a2tg?.viewer.splats?.num)).toBe(300);
     writeFileSync(path, PAGE);
     await page.goto(pathToFileURL(path).href);
-    expect(await page.locator("#message:not([hidden])").textContent()).toContain("--single-file");
+    expect(await page.locator("#message:not([hidden])").textContent()).toContain("--web OUT.html");
     await page.close();
     rmSync(folder, { recursive: true });
   });

@@ -50,9 +50,12 @@ export class CropControls {
   private readonly from = ["from-width", "from-depth", "from-height"].map((id) => element(id, HTMLInputElement));
   private readonly to = ["to-width", "to-depth", "to-height"].map((id) => element(id, HTMLInputElement));
   private readonly floaters = element("floaters", HTMLInputElement);
+  private readonly ranges = ["width-range", "depth-range", "height-range"].map((id) => element(id, HTMLOutputElement));
+  private readonly strictness = element("floaters-value", HTMLOutputElement);
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
+    this.tell();
     for (const slider of [...this.from, ...this.to, this.floaters]) {
       slider.addEventListener("input", () => this.apply());
     }
@@ -70,9 +73,20 @@ export class CropControls {
     const { viewer } = this;
     viewer.crop = { from: valuesOf(this.from), to: valuesOf(this.to) };
     viewer.floaters = Number(this.floaters.value);
+    this.tell();
     viewer.draw();
   }
+
+  /** Show the values of the sliders beside their names. */
+  private tell(): void {
+    for (const [k, output] of this.ranges.entries()) {
+      output.value = `${percentOf(this.from[k])} to ${percentOf(this.to[k])} %`;
+    }
+    this.strictness.value = `${percentOf(this.floaters)} %`;
+  }
 }
+
+const percentOf = (slider?: HTMLInputElement): string => (100 * Number(slider?.value)).toFixed(0);
 
 function valuesOf(sliders: readonly HTMLInputElement[]): Vec3 {
   const [x, y, z] = sliders.map((slider) => Number(slider.value));

@@ -62,6 +62,8 @@ export interface Header {
   readonly ends: Readonly<Record<Quantity, Ends>>;
   readonly background: Vec3;
   readonly cameras: readonly SceneCamera[];
+  /** Index of the camera at which the viewer opens. */
+  readonly first: number;
 }
 
 /** Read the first 22 bytes. Throws a SceneError unless they start a scene file of this version. */
@@ -87,6 +89,7 @@ export function parseHead(bytes: Uint8Array): Head {
 export function parseHeader(text: Uint8Array, head: Head): Header {
   if (crc32(text) !== head.checksum) throw damaged("the checksum of its header does not match");
   const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "the header");
+  const cameras = raw.isNull("cameras") ? [] : raw.list("cameras").map(cameraOf);
   const header: Header = {
     title: raw.text("title"),
     note: raw.text("note"),
@@ -103,7 +106,8 @@ export function parseHeader(text: Uint8Array, head: Head): Header {
     means: meansOf(raw.list("means", 3)),
     ends: endsOf(raw.fields("ends")),
     background: vector<Vec3>(raw.list("background"), 3, "background"),
-    cameras: raw.isNull("cameras") ? [] : raw.list("cameras").map(cameraOf),
+    cameras,
+    first: raw.has("first") ? raw.count("first", 0, Math.max(cameras.length - 1, 0)) : 0,
   };
   const leastBytes = 16 * header.num + 4 * (header.numTexels ?? 0);
   if (header.bytes < leastBytes) throw damaged("its header claims more rows than bytes");

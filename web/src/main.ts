@@ -89,8 +89,13 @@ function tell(splats: Splats, numBytes: number): void {
   setFigures(figures);
 }
 
+/** Whether the scene stands in the page. */
+const isHeld = (): boolean => document.getElementById("scene-data") !== null;
+/** Whether the server of the page shows a training. */
+const isTraining = (): boolean => document.documentElement.dataset.training === "yes";
+
 async function findPhotographs(panel: Panel): Promise<void> {
-  if (document.getElementById("scene-data") !== null) return;
+  if (isHeld() || isTraining()) return;
   const response = await fetch("photographs.json").catch(() => null);
   if (response?.ok !== true) return;
   const found: unknown = await response.json().catch(() => null);
@@ -106,8 +111,7 @@ function begin(): void {
   const show = async (): Promise<void> => {
     await load(viewer, panel, await openScene());
   };
-  const isHeld = document.getElementById("scene-data") !== null;
-  const loaded = (isHeld ? Promise.resolve(false) : followTraining(show)).then((isLive) =>
+  const loaded = (isTraining() ? followTraining(show) : Promise.resolve(false)).then((isLive) =>
     isLive ? undefined : show(),
   );
   loaded.catch(fail);

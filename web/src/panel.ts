@@ -87,7 +87,7 @@ export class Panel {
     }
   }
 
-  /** Go to the view in the address, or to the first camera. */
+  /** Go to the view in the address, or to the most central camera. */
   ready(): void {
     if (!this.followLink()) this.restart();
   }
@@ -106,7 +106,7 @@ export class Panel {
     const { splats } = this.viewer;
     if (splats === null) return;
     this.viewer.settle(splats);
-    this.setCurrent(splats.header.cameras.length > 0 ? 0 : null);
+    this.setCurrent(splats.header.cameras.length > 0 ? splats.header.first : null);
     this.viewer.draw();
   }
 

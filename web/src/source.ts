@@ -24,7 +24,7 @@ export async function openScene(): Promise<Source> {
     throw new SceneError(
       location.protocol === "file:"
         ? "Serve this page from a web server: browsers do not let a page opened from disk read other files. " +
-            "To get a page that opens from disk, run a2tg export RUN --web OUT --single-file."
+            "To get a page that opens from disk, run a2tg export RUN --web OUT.html."
         : `The scene file ${SCENE_FILE} could not be fetched.`,
     );
   }

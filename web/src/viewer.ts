@@ -93,9 +93,9 @@ export class Viewer implements Steered {
     splats.sort(this.depthRow);
   }
 
-  /** Go to the first camera, or to where most of the scene is seen, with the vertical that the cameras tell. */
+  /** Go to the most central camera, or to where most of the scene is seen, with the vertical that the cameras tell. */
   settle({ header }: Splats): void {
-    const [first] = header.cameras;
+    const first = header.cameras.at(header.first);
     const extent = extentOf(header.means);
     [this.up, this.isUpChosen] = [verticalOfScene(header), false];
     this.extent = first !== undefined ? 1 : Math.max(...extent.half);

@@ -195,3 +195,11 @@ test("memory is allocated only for data that the file can hold", () => {
     parseHead(Uint8Array.from(SMALL.subarray(0, HEAD_BYTES), (byte, i) => (i >= 10 && i < 14 ? 255 : byte))),
   ).toThrow(SceneError);
 });
+
+test("the header names the camera at which the viewer opens", async () => {
+  expect((await read(SMALL)).header.first).toBe(0);
+  const [camera] = (await read(SMALL)).header.cameras;
+  const raw = { name: "a", is_test: false, size: camera?.size, viewmat: camera?.viewmat, K: camera?.K };
+  expect((await read(changed({ cameras: [raw, raw], first: 1 }))).header.first).toBe(1);
+  await expect(read(changed({ cameras: [raw, raw], first: 2 }))).rejects.toThrow("first");
+});
