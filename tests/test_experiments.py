@@ -21,11 +21,13 @@ import shrink
 import upscale_gains
 from lab import pages, queue, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
-from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, own_scene, read_grid, splats_in
+from lab.figures import figures_table
+from lab.grid import GRIDS, Cell, Grid, Method, Run, read_grid, splats_in
 from lab.interrupts import interruptible
 from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
 from lab.plan import duration, plan_of, seconds_of_step
-from run import experiments
+from lab.scenes import SceneAt, own_scene
+from run import experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
@@ -126,6 +128,106 @@ def test_scenes_of_ones_own_take_the_place_of_the_scales(tmp_path):
         own_scene(tmp_path / "nowhere", 1)
     with pytest.raises(ValueError, match="at least 1"):
         own_scene(tmp_path / "garden", 0)
+
+
+OWN_GRID = """
+title = "Mine"
+table = "gains"
+reference = "bytewise"
+methods = ["2DGS*-MCMC"]
+
+[variants]
+"bytewise" = { system = "bytewise" }
+
+[small]
+budgets = [0.3]
+
+[small.scenes]
+"mine" = { path = "captures/garden", downscale = 4, options.background = "white" }
+"""
+
+
+def own_grid(tmp_path, text=OWN_GRID):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
+    grid = read_grid(own_grid(tmp_path), "small")
+    (cell,) = grid.cells
+    options = {"background": "white"}
+    place = (tmp_path / "captures" / "garden").resolve().as_posix()
+    assert (grid.name, grid.table, cell.scene) == ("mine", "gains", SceneAt("mine", place, 4, options=options))
+    job = next(grid.jobs({}))
+    assert job.system.background == "white" and job.key.startswith("garden-4-")
+    assert [method.label for method in grid.methods] == ["2DGS*-MCMC"], "a reference among the variants is one method"
+
+
+@pytest.mark.parametrize(
+    "before, after, words",
+    [
+        ("gains", "gain", "table must be one of quality, gains, choices"),
+        ("2DGS*-MCMC", "2DGS-MCMC", r"no method '2DGS-MCMC'; did you mean 2DGS\*-MCMC"),
+        ("budgets", "budget", "needs gaussians or budgets"),
+        ("path =", "folder =", "'folder', which is none of path"),
+        ("downscale = 4", "downscale = 0.5", "must be at least 1; got 0.5"),
+        ("[small]", "[full]", r"no table of --scale small, \[small\]; it has \[full\]"),
+        ("title = ", "titel = ", "no entry 'title'"),
+        ("system = ", "sytem = ", "'sytem', which is none of like, system"),
+        ('system = "bytewise"', 'like = "A2TG"', "like 'A2TG', which is no method"),
+        ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
+    ],
+)
+def test_mistakes_in_a_grid_file_are_told(tmp_path, before, after, words):
+    text = OWN_GRID.replace(before, after)
+    if before == "[small]":
+        text = text.replace("[small.scenes]", "[full.scenes]")
+    with pytest.raises(ValueError, match=words):
+        read_grid(own_grid(tmp_path, text), "small")
+
+
+def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
+    cell = dataclasses.replace(CELL, gaussians=0, budget=0.3)
+    runs = [result("own", 21.0), result("other", 20.0)]
+    runs = [tables.Result(dataclasses.replace(one.run, cell=cell), one.record) for one in runs]
+    assert "1,000 (5.00 a pixel)" in tables.gains_table(runs, "own", ["other"])
+    assert "| other | 1,000 | 1.00 | 20.00 / .800 / .200 | 21.00 | 1 |" in figures_table(runs)
+    larger = dataclasses.replace(cell, budget=0.6)
+    richer = [tables.Result(dataclasses.replace(one.run, cell=larger), one.record) for one in runs]
+    assert "fox, 0.3 MB: dB · LPIPS | fox, 0.6 MB" in tables.choices_table([*runs, *richer], "own")
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["clam"], "no experiment 'clam'; did you mean claim?"),
+        (["claim", "--scale", "smal"], "no --scale smal; did you mean small?"),
+        (["claim", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
+        (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
+        (["claim", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
+    ],
+)
+def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--out", str(tmp_path), "--work", str(tmp_path)])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and words in told and told.count("\n") == 1
+
+
+def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
+    path = tmp_path / "claim.toml"
+    path.write_text(OWN_GRID, encoding="utf-8")
+    with pytest.raises(SystemExit):
+        main([str(path)])
+    assert "rename the file" in capsys.readouterr().err
+
+
+def test_smoke_and_grid_files_leave_the_committed_results_alone(tmp_path):
+    args = parse_arguments(experiments(), [own_grid(tmp_path), "--work", str(tmp_path)])
+    assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "small"
+    args = parse_arguments(experiments(), ["claim", "--scale", "smoke", "--work", str(tmp_path)])
+    assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "smoke"
 
 
 def test_a_scale_may_have_fewer_methods():
@@ -445,7 +547,7 @@ def test_what_cannot_be_run_is_an_error_that_says_what(arguments, words, tmp_pat
     done = subprocess.run(
         [*command, "--work", str(tmp_path / "w"), *arguments], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 1 and words in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
 
 
 # Tables
@@ -535,7 +637,9 @@ def test_finished_runs_are_rows_of_a_spreadsheet():
     header, row = csv.reader(text.splitlines())
     found = dict(zip(header, row, strict=True))
     assert (found["grid"], found["scene"], found["method"], found["psnr"]) == ("claim", "fox", "own, equal", "25.0")
-    assert found["lpips"] == found["budget_mb"] == "" and found["gaussians"] == "100"
+    assert found["lpips"] == found["budget_mb"] == "" and (found["size"], found["gaussians"]) == ("100", "1000")
+    text = spreadsheet.rows_text([("claim", result("own", 25.123456789, seconds=3.14159, ms_per_step=float("nan")))])
+    assert ",25.1235," in text and ",3.1," in text and "num" not in header
 
 
 def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
