@@ -23,6 +23,7 @@ from lab.grid import SUFFIX
 from lab.interrupts import interruptible
 from lab.standard import STANDARD, file_experiment
 
+from a2tg_jax import configure_cpu
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
@@ -94,4 +95,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 if __name__ == "__main__":
     with interruptible():
+        configure_cpu()
         main()

@@ -25,8 +25,10 @@ from lab.figures import figures_table
 from lab.grid import GRIDS, Cell, Grid, Method, Run, read_grid, splats_in
 from lab.interrupts import interruptible
 from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
-from lab.plan import duration, plan_of, seconds_of_step
+from lab.plan import Machine, duration, finished_pace, plan_of
+from lab.progress import Progress
 from lab.scenes import SceneAt, own_scene
+from lab.stages import stages_of
 from run import experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
@@ -534,7 +536,7 @@ def test_submitit_sends_jobs_out(tmp_path):
     )
     told, _ = process.communicate(timeout=600)
     assert process.returncode == 0, told
-    assert len(json.loads((out / "records.json").read_text())) == 4
+    assert len(json.loads((out / "records.json").read_text())) == 2
     assert list((work / "submitit").iterdir())
 
 
@@ -629,7 +631,7 @@ def test_short_times_are_not_zero():
     times = {"fps": 10.0, "ms_per_step": [12.0, 10.0], "iterations": [60, 40], "machine": "cpu"}
     assert efficiency._row(result("own", 20.0), times)[-2] == "0.02"
     assert efficiency._row(result("own", 20.0), {**times, "iterations": [6000, 4000]})[-2] == "1.9"
-    assert duration(59) == "less than a minute"
+    assert duration(59) == "a minute"
 
 
 def test_finished_runs_are_rows_of_a_spreadsheet():
@@ -649,6 +651,15 @@ def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
     told = capsys.readouterr().err.strip()
     assert ended.value.code == 130 and told.count("\n") == 0
     assert told.endswith("run.py claim --scenes 'my scenes'")
+
+
+def test_sigterm_ends_as_ctrl_c_does(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended, interruptible():
+        signal.raise_signal(signal.SIGTERM)
+    told = capsys.readouterr().err.strip()
+    assert ended.value.code == 143 and told.count("\n") == 0 and "terminated; what is finished is kept" in told
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_processes_begin_without_ctrl_c():
@@ -744,15 +755,48 @@ def test_every_picture_on_a_page_is_committed_and_every_committed_one_is_on_a_pa
         assert shown == {name for name in listed.stdout.split() if name.endswith(".png")}
 
 
-def test_the_plan_counts_what_is_left():
-    grid = read_grid("claim", "smoke")
-    everything = plan_of([grid], {})
-    assert everything.startswith("4 stages left") and "180 iterations" in everything
+def test_the_plan_counts_what_is_left(tmp_path):
+    """It counts runs at equal bytes before the bytes are known, and estimates CPUs by the cost of a step."""
+    grid, folders = read_grid("claim", "smoke"), Folders(tmp_path, tmp_path)
+    here = Machine(jobs=2, memory=8e9, has_gpu=False)
+    everything = plan_of([grid], {}, folders, here)
+    assert "| built-in 1/2 | 400 | 0 | 30+20 | 0 of 6 | all |" in everything
+    assert "8 of 8 stages are left" in everything and "rough figure of CPUs" in everything
+    assert "on this machine, 2 at a time, with compilation" in everything and "Disk: about" in everything
+    assert "8.0 GB may be used" in everything
+    on_gpu = plan_of([grid], {}, folders, dataclasses.replace(here, has_gpu=True))
+    assert "the paper's program on its GPU" in on_gpu and "compilation" not in on_gpu
     first = next(grid.jobs({}))
-    rest = plan_of([grid], {first.key: record(), first.start.key: record()})
-    assert "iterations: less than a minute on" in rest and not rest.startswith("4 ")
+    rest = plan_of([grid], {first.key: record(), first.start.key: record()}, folders, here)
+    assert "1 of 6 | 2DGS*-MCMC; A²TG, as quick has it; 2DGS*-MCMC, equal bytes;" in rest
+    assert "the steps of finished stages" in rest
+    mb = model_bytes(first.system) / 1e6
+    finished = {key: record(mb=mb) for key in stages_of([grid], {})}
+    assert "| 6 of 6 | – |" in plan_of([grid], finished, folders, here)
     assert [duration(seconds) for seconds in (150, 3600, 9000)] == ["2 minutes", "1.0 hours", "2.5 hours"]
-    assert seconds_of_step(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
+    assert finished_pace(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
+
+
+def test_progress_names_stages_in_words(tmp_path, capsys):
+    grid = read_grid("claim", "smoke")
+    records = {}
+    progress = Progress([grid], records, tmp_path / "log.txt")
+    progress.begin(2)
+    job = next(grid.jobs({}))
+    progress.start(job.start)
+    progress.done(job.start, record(seconds=3.0))
+    records[job.key] = record(mb=0.1)
+    last = list(grid.jobs(records))[-1]
+    progress.start(last)
+    progress.failed(queue.Failure(last, "no room"))
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == f"8 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
+    assert told[1] == "1 of 8 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
+    assert told[2].startswith("1 of 8 done: built-in 1/2, A²TG, ") and "25.00 dB" in told[2]
+    assert told[3].startswith("2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians")
+    assert told[4].startswith("2 of 8 FAILED: ") and told[4].endswith(": no room")
+    log = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
+    assert len(log) == 5 and all(line.endswith(shown) for line, shown in zip(log, told, strict=True))
 
 
 def test_arguments_have_defaults():

@@ -17,8 +17,9 @@ from a2tg_jax.results.record import SYNTHETIC
 from lab import machine, spreadsheet, tables
 from lab.grid import Grid, read_grid
 from lab.jobs import Folders, Job, Record
-from lab.plan import plan_of
-from lab.queue import Failure, LocalPool, Pool, SubmititPool, run_all
+from lab.plan import Machine, plan_of
+from lab.progress import Progress
+from lab.queue import LocalPool, Pool, SubmititPool, run_all
 from lab.scenes import SceneAt, own_scene
 from lab.tables import Result
 
@@ -71,20 +72,28 @@ class Lab:
         """Return whether the scale only shows that everything runs: figures need little work and mean nothing."""
         return self.scale == "smoke"
 
-    def run(self, grids: Sequence[Grid]) -> list[Failure]:
-        """Run the unfinished jobs of the grids, unless only tables are requested."""
+    def run(self, grids: Sequence[Grid]) -> list[str]:
+        """Run the unfinished jobs of the grids, unless only tables are requested; return what failed, in words."""
         if self.args.tables_only:
             return []
         self.check_inputs(grids)
         if self.records:
             self._save()
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
+        progress = Progress(grids, self.records, self.work / "log.txt")
+
+        def keep(job: Job, record: Record) -> None:
+            self._save()
+            progress.done(job, record)
+
         with contextlib.closing(self._pool()) as pool:
+            progress.begin(pool.slots)
             try:
-                return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)
+                failures = run_all(jobs, self.folders, pool, self.records, keep, progress.failed, progress.start)
             except KeyboardInterrupt:
                 pool.abort()
                 raise
+        return [f"{progress.told(failure.job)}: {failure.reason}" for failure in failures]
 
     @property
     def is_partial(self) -> bool:
@@ -135,14 +144,6 @@ class Lab:
                     "grids/scales.toml has them (experiments/download.py fetches those of --scale full)"
                 )
 
-    def _keep(self, job: Job, record: Record) -> None:
-        self._save()
-        print(
-            f"{len(self.records):4d}  {job.key}: {record['num']} splats, {record['mb']:.2f} MB, "
-            f"{record['psnr']:.2f} dB; {record['seconds']:.0f} s, {record['ms_per_step']:.0f} ms a step",
-            flush=True,
-        )
-
     def _save(self) -> None:
         """Merge the records into the results, to which another program may have added some."""
         self.out.mkdir(parents=True, exist_ok=True)
@@ -157,9 +158,16 @@ class Lab:
         own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
         return {**own, **self._kept()}
 
+    def machine(self) -> Machine:
+        """Return what --plan plans for."""
+        return Machine(self.args.jobs or machine.default_jobs(), self._memory(), machine.num_gpus() > 0)
+
+    def _memory(self) -> float:
+        """Return the bytes that jobs of this machine may take together."""
+        return self.args.memory_gb * 1e9 if self.args.memory_gb else MEMORY_SHARE * machine.memory_bytes()
+
     def _pool(self) -> Pool:
-        args, inf = self.args, float("inf")
-        memory = args.memory_gb * 1e9 if args.memory_gb else MEMORY_SHARE * machine.memory_bytes()
+        args, inf, memory = self.args, float("inf"), self._memory()
         if args.cluster:
             parameters = {**CLUSTER_DEFAULTS.get(args.cluster, {}), **dict(map(_parameter, args.cluster_parameter))}
             is_here = args.cluster == "local"
@@ -194,12 +202,11 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         grids = {name: lab.grid(name) for name in names}
         if args.plan:
             lab.check_inputs(list(grids.values()))
-            print(plan_of(list(grids.values()), lab.records))
+            print(plan_of(list(grids.values()), lab.records, lab.folders, lab.machine()))
             return None
-        failures = lab.run(list(grids.values()))
+        errors = lab.run(list(grids.values()))
     except (ValueError, OSError, RuntimeError, NameError) as error:  # The last two are submitit's.
         stop(str(error))
-    errors = [f"{failure.job.key}: {failure.reason}" for failure in failures]
     for experiment in experiments:
         own = [grids[name] for name in experiment.grids]
         try:
@@ -217,10 +224,6 @@ def stop(message: str) -> NoReturn:
     """End the program with one line and the exit code of a call that cannot be run."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(USAGE)
-
-
-def _tell_failure(failure: Failure) -> None:
-    print(f"FAILED {failure.job.key}: {failure.reason}", flush=True)
 
 
 @contextlib.contextmanager

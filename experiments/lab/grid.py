@@ -100,7 +100,11 @@ class Grid:
 
     def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
         """Return the record of the reference in a cell, or None before it is finished."""
-        return records.get(self._job(self.reference, cell, cell.gaussians).key)
+        return records.get(self.reference_job(cell).key)
+
+    def reference_job(self, cell: Cell) -> Job:
+        """Return the last job of the reference in a cell."""
+        return self._job(self.reference, cell, cell.gaussians)
 
     def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
         """Return the last job of every run."""

@@ -93,6 +93,7 @@ def num_gaussians(system: a2tg.System) -> int:
     return max(caps, default=system.initial_gaussians or DEFAULT_GAUSSIANS)
 
 
+@functools.lru_cache(maxsize=10_000)
 def model_bytes(system: a2tg.System) -> float:
     """Return the bytes of the largest model of a system's stages; only shapes are computed, no device is used."""
     num, bases = num_gaussians(system), NUM_BASES[system.initial_sh_degree]
@@ -131,10 +132,11 @@ class Folders:
     def checkpoint(self, job: Job) -> Path:
         return self.work / "checkpoints" / f"{job.key}.npz"
 
-    def load_scene(self, job: Job) -> a2tg.Scene:
+    def load_scene(self, job: Job, room: int | None = None) -> a2tg.Scene:
+        """Return a job's scene; `room` as in `SceneSource.load`."""
         is_folder = job.scene != "synthetic"
         path = str(self.scenes / job.scene) if is_folder else job.scene
-        return SceneSource(path, job.downscale, validation=job.validation).load()
+        return SceneSource(path, job.downscale, validation=job.validation).load(room)
 
 
 def run_job(job: Job, folders: Folders) -> Record:

@@ -19,6 +19,7 @@ from lab.grid import Cell, Grid, Run
 from lab.jobs import Record
 from lab.markdown import table as markdown
 from lab.scenes import SceneAt
+from lab.stages import EQUAL_BYTES
 
 T = TypeVar("T")
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
@@ -48,9 +49,6 @@ class Result:
     def __getitem__(self, figure: str) -> float:
         value = self.record[figure]
         return float("nan") if value is None else value
-
-
-EQUAL_BYTES = ", equal bytes"
 
 
 def results_of(grid: Grid, records: Mapping[str, Record]) -> list[Result]:
