@@ -22,9 +22,8 @@ class Progress:
     def begin(self, at_a_time: int) -> None:
         """Tell how many stages there are."""
         if self._total:
-            self._tell(
-                f"{self._total} stage{'s' if self._total > 1 else ''} to train, {at_a_time} at a time at most; log: {self._log}"
-            )
+            stages = "1 stage" if self._total == 1 else f"{self._total} stages"
+            self._tell(f"{stages} to train, {at_a_time} at a time at most; log: {self._log}")
 
     def start(self, job: Job) -> None:
         """Tell that a stage starts."""
