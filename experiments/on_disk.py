@@ -24,6 +24,7 @@ MAX_LOSSES = (0.02, 0.05, 0.1, 0.3, 1.0)
 REPORTED = "0.05"
 CODER_CHOICES = ("smallest", *CODERS)
 TRIED = {**LADDER, "sh_rest": (*LADDER["sh_rest"], "float16"), "texels": (*LADDER["texels"], "float16")}
+SMOKE_TRIED = {group: (steps[0], steps[-1]) for group, steps in LADDER.items()}
 PARTS = {"sh": ("sh_",), "texels": ("texel_", "sizes"), "cameras": ("origin_",)}
 """Parts of a file that are counted together, with the first letters of their names."""
 PUBLISHED = (
@@ -55,8 +56,9 @@ def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, An
     background = background_of(scene)
     train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
     losses = [loss_on_views(model, views, background=background) for views in (train, scene.test)]
-    trials = measure_choices(model, losses, TRIED)
-    best = {str(most): smallest_within(model, losses, most, trials) for most in MAX_LOSSES}
+    trials = measure_choices(model, losses, SMOKE_TRIED if lab.is_smoke else TRIED)
+    max_losses = (float(REPORTED),) if lab.is_smoke else MAX_LOSSES
+    best = {str(most): smallest_within(model, losses, most, trials) for most in max_losses}
     reported = encode_model(model, best[REPORTED].choices)
     weights = lab.folders.lpips_weights
     before, after = (

@@ -15,24 +15,29 @@ from lab.measured import measured_once
 
 import a2tg_jax as a2tg
 
-NUM_STEPS = (2, 5, 10)
+NUM_STEPS, SMOKE_STEPS = (2, 5, 10), (1,)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Write a table of the available models, each measured once."""
     (grid,) = grids
+    num_steps = _num_steps(lab)
     rows, gains = [], []
     for result, found in measured_once(lab, EXPERIMENT.name, grid, _measure):
-        shown = [_told(found[str(steps)], found["0"]) for steps in NUM_STEPS]
-        gains.append([found[str(steps)]["psnr"] - found["0"]["psnr"] for steps in NUM_STEPS])
+        shown = [_told(found[str(steps)], found["0"]) for steps in num_steps]
+        gains.append([found[str(steps)]["psnr"] - found["0"]["psnr"] for steps in num_steps])
         size = f"{result.run.cell.budget:g} MB"
         rows.append([result.run.cell.scene.label, size, result.label, f"{found['0']['psnr']:.2f}", *shown])
     if gains:
         means = [tables.signed(gain, 2) for gain in np.mean(gains, axis=0)]
         rows.append(["*mean*", "", "", "", *means])
-    steps = [f"{steps} steps: dB · LPIPS · train dB" for steps in NUM_STEPS]
+    steps = [f"{steps} steps: dB · LPIPS · train dB" for steps in num_steps]
     header = ["scene", "bytes", "method", "test PSNR", *steps]
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{tables.markdown(header, rows)}")
+
+
+def _num_steps(lab: Lab) -> tuple[int, ...]:
+    return SMOKE_STEPS if lab.is_smoke else NUM_STEPS
 
 
 def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, dict[str, float]]:
@@ -40,7 +45,7 @@ def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, di
     scene = lab.folders.load_scene(result.run.job)
     background = background_of(scene)
     found = {"0": _quality(lab, scene, model, background)}
-    for steps in NUM_STEPS:
+    for steps in _num_steps(lab):
         start = time.perf_counter()
         polished = a2tg.polish(model, scene.train, num_steps=steps, background=background)
         found[str(steps)] = {"seconds": time.perf_counter() - start, **_quality(lab, scene, polished, background)}

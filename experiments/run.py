@@ -5,20 +5,26 @@
     python experiments/run.py appendix
 
     python experiments/run.py claim --scene ~/scenes/garden --downscale 4
+    python experiments/run.py path/to/mine.toml --scenes SCENES
 
 A stopped call continues when it is called again; finished runs are never run again. `--plan` prints what is left to
-do and about how long it takes. docs/sweeps.md says how to write a grid of your own.
+do and about how long it takes. docs/sweeps.md says how to write a grid file of your own.
 """
 
 import argparse
 import importlib
 import textwrap
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from lab import pages
-from lab.cli import Experiment, argument_parser, run_experiments
+from lab.cli import Experiment, argument_parser, run_experiments, stop
+from lab.grid import SUFFIX
 from lab.interrupts import interruptible
-from lab.standard import STANDARD
+from lab.standard import STANDARD, file_experiment
+
+from a2tg_jax import configure_cpu
+from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
     "summary", "equal_bytes", "ablation", "texture_resolution", "memory_charts", "resolution_shares", "decomposition",
@@ -43,22 +49,51 @@ def parse_arguments(known: Mapping[str, Experiment], arguments: Sequence[str] | 
     told = {**{name: experiment.summary for name, experiment in known.items()}, **OTHERS}
     listed = "\n".join(f"  {name:20s} {textwrap.shorten(text, 110)}" for name, text in told.items())
     parser = argument_parser(f"{(__doc__ or '').strip()}\n\nnames:\n{listed}")
-    parser.add_argument("names", nargs="+", metavar="NAME", choices=list(told), help="experiments to run, as above")
-    return parser.parse_args(arguments)
+    parser.add_argument("names", nargs="+", metavar="NAME", help="experiments to run, as above, or grid files")
+    args = parser.parse_args(arguments)
+    args.own_grids = [name for name in args.names if name.endswith(SUFFIX)]
+    return args
+
+
+def chosen(known: Mapping[str, Experiment], args: argparse.Namespace) -> list[Experiment]:
+    """Return the experiments of a call; unknown names end the program."""
+    for name in args.names:
+        if name not in known and name not in OTHERS and name not in args.own_grids:
+            hint = did_you_mean(name, [*known, *OTHERS]) or "; --help lists all"
+            stop(f"there is no experiment {name!r}{hint}")
+    if EVERYTHING in args.names:
+        return [*known.values(), *_file_experiments(known, args.own_grids)]
+    named = [known[name] for name in dict.fromkeys(args.names) if name in known]
+    return [*named, *_file_experiments(known, args.own_grids)]
+
+
+def _file_experiments(known: Mapping[str, Experiment], paths: Sequence[str]) -> list[Experiment]:
+    """Return the experiments of grid files, whose tables must not take the place of others."""
+    taken = dict.fromkeys(known, "an experiment")
+    found = []
+    for path in dict.fromkeys(paths):
+        if not Path(path).expanduser().is_file():
+            stop(f"there is no grid file {path}")
+        experiment = file_experiment(path)
+        if experiment.name in taken:
+            stop(f"{path}: rename the file, since its tables would have the name of {taken[experiment.name]}")
+        taken[experiment.name] = path
+        found.append(experiment)
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the experiments of a command line."""
     known = experiments()
     args = parse_arguments(known, arguments)
-    is_all = EVERYTHING in args.names
-    wanted = list(known.values()) if is_all else [known[name] for name in dict.fromkeys(args.names) if name in known]
+    wanted = chosen(known, args)
     lab = run_experiments(wanted, args) if wanted else None
     is_committed = lab is not None and lab.out.resolve().parent == pages.EXPERIMENTS / "results" and not lab.is_partial
-    if (is_all and is_committed) or (APPENDIX in args.names and not args.plan):
+    if (EVERYTHING in args.names and is_committed) or (APPENDIX in args.names and not args.plan):
         pages.refresh()
 
 
 if __name__ == "__main__":
     with interruptible():
+        configure_cpu()
         main()

@@ -21,11 +21,15 @@ import shrink
 import upscale_gains
 from lab import pages, queue, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
-from lab.grid import GRIDS, Cell, Grid, Method, Run, SceneAt, own_scene, read_grid, splats_in
+from lab.figures import figures_table
+from lab.grid import GRIDS, Cell, Grid, Method, Run, read_grid, splats_in
 from lab.interrupts import interruptible
 from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
-from lab.plan import duration, plan_of, seconds_of_step
-from run import experiments
+from lab.plan import Machine, duration, finished_pace, plan_of
+from lab.progress import Progress
+from lab.scenes import SceneAt, own_scene
+from lab.stages import stages_of
+from run import experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
@@ -128,6 +132,106 @@ def test_scenes_of_ones_own_take_the_place_of_the_scales(tmp_path):
         own_scene(tmp_path / "garden", 0)
 
 
+OWN_GRID = """
+title = "Mine"
+table = "gains"
+reference = "bytewise"
+methods = ["2DGS*-MCMC"]
+
+[variants]
+"bytewise" = { system = "bytewise" }
+
+[small]
+budgets = [0.3]
+
+[small.scenes]
+"mine" = { path = "captures/garden", downscale = 4, options.background = "white" }
+"""
+
+
+def own_grid(tmp_path, text=OWN_GRID):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
+    grid = read_grid(own_grid(tmp_path), "small")
+    (cell,) = grid.cells
+    options = {"background": "white"}
+    place = (tmp_path / "captures" / "garden").resolve().as_posix()
+    assert (grid.name, grid.table, cell.scene) == ("mine", "gains", SceneAt("mine", place, 4, options=options))
+    job = next(grid.jobs({}))
+    assert job.system.background == "white" and job.key.startswith("garden-4-")
+    assert [method.label for method in grid.methods] == ["2DGS*-MCMC"], "a reference among the variants is one method"
+
+
+@pytest.mark.parametrize(
+    "before, after, words",
+    [
+        ("gains", "gain", "table must be one of quality, gains, choices"),
+        ("2DGS*-MCMC", "2DGS-MCMC", r"no method '2DGS-MCMC'; did you mean 2DGS\*-MCMC"),
+        ("budgets", "budget", "needs gaussians or budgets"),
+        ("path =", "folder =", "'folder', which is none of path"),
+        ("downscale = 4", "downscale = 0.5", "must be at least 1; got 0.5"),
+        ("[small]", "[full]", r"no table of --scale small, \[small\]; it has \[full\]"),
+        ("title = ", "titel = ", "no entry 'title'"),
+        ("system = ", "sytem = ", "'sytem', which is none of like, system"),
+        ('system = "bytewise"', 'like = "A2TG"', "like 'A2TG', which is no method"),
+        ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
+    ],
+)
+def test_mistakes_in_a_grid_file_are_told(tmp_path, before, after, words):
+    text = OWN_GRID.replace(before, after)
+    if before == "[small]":
+        text = text.replace("[small.scenes]", "[full.scenes]")
+    with pytest.raises(ValueError, match=words):
+        read_grid(own_grid(tmp_path, text), "small")
+
+
+def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
+    cell = dataclasses.replace(CELL, gaussians=0, budget=0.3)
+    runs = [result("own", 21.0), result("other", 20.0)]
+    runs = [tables.Result(dataclasses.replace(one.run, cell=cell), one.record) for one in runs]
+    assert "1,000 (5.00 a pixel)" in tables.gains_table(runs, "own", ["other"])
+    assert "| other | 1,000 | 1.00 | 20.00 / .800 / .200 | 21.00 | 1 |" in figures_table(runs)
+    larger = dataclasses.replace(cell, budget=0.6)
+    richer = [tables.Result(dataclasses.replace(one.run, cell=larger), one.record) for one in runs]
+    assert "fox, 0.3 MB: dB · LPIPS | fox, 0.6 MB" in tables.choices_table([*runs, *richer], "own")
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["clam"], "no experiment 'clam'; did you mean claim?"),
+        (["claim", "--scale", "smal"], "no --scale smal; did you mean small?"),
+        (["claim", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
+        (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
+        (["claim", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
+    ],
+)
+def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--out", str(tmp_path), "--work", str(tmp_path)])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and words in told and told.count("\n") == 1
+
+
+def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
+    path = tmp_path / "claim.toml"
+    path.write_text(OWN_GRID, encoding="utf-8")
+    with pytest.raises(SystemExit):
+        main([str(path)])
+    assert "rename the file" in capsys.readouterr().err
+
+
+def test_smoke_and_grid_files_leave_the_committed_results_alone(tmp_path):
+    args = parse_arguments(experiments(), [own_grid(tmp_path), "--work", str(tmp_path)])
+    assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "small"
+    args = parse_arguments(experiments(), ["claim", "--scale", "smoke", "--work", str(tmp_path)])
+    assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "smoke"
+
+
 def test_a_scale_may_have_fewer_methods():
     small, smoke = (read_grid("defaults", scale) for scale in ("small", "smoke"))
     assert len(small.methods) > 10 and [method.label for method in smoke.methods] == small_ends(small.methods)
@@ -138,17 +242,13 @@ def small_ends(methods):
     return [methods[0].label, methods[-1].label]
 
 
-def test_the_grid_of_the_documentation_can_be_read(tmp_path, monkeypatch):
+def test_the_grid_of_the_documentation_can_be_read(tmp_path):
     page = (EXPERIMENTS.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
-    for name in ("methods", "scales"):
-        shutil.copy(GRIDS / f"{name}.toml", tmp_path)
-    (tmp_path / "my_rates.toml").write_text(text.replace("my_systems:Variant", "a2tg"), encoding="utf-8")
-    monkeypatch.setattr("lab.grid.GRIDS", tmp_path)
-    small, smoke = (read_grid("my_rates", scale) for scale in ("small", "smoke"))
-    assert (len(small.cells), len(smoke.cells)) == (4, 1)
-    rates = [run.job.system.texture.rate for run in small.runs({})][:3]
-    assert rates == [a2tg.A2tg.preset("quick").texture.rate, 5e-3, 1e-2]
+    grid = read_grid(own_grid(tmp_path, text), "small")
+    assert (len(grid.cells), grid.table, grid.cells[0].scene.path) == (1, "choices", "synthetic")
+    rates = [run.job.system.texture.rate for run in grid.runs({})]
+    assert rates == [a2tg.A2tg.preset("quick").texture.rate, 2.5e-3, 5e-3]
 
 
 def test_the_smoke_scale_has_few_runs():
@@ -432,7 +532,7 @@ def test_submitit_sends_jobs_out(tmp_path):
     )
     told, _ = process.communicate(timeout=600)
     assert process.returncode == 0, told
-    assert len(json.loads((out / "records.json").read_text())) == 4
+    assert len(json.loads((out / "records.json").read_text())) == 2
     assert list((work / "submitit").iterdir())
 
 
@@ -445,7 +545,7 @@ def test_what_cannot_be_run_is_an_error_that_says_what(arguments, words, tmp_pat
     done = subprocess.run(
         [*command, "--work", str(tmp_path / "w"), *arguments], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 1 and words in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
 
 
 # Tables
@@ -527,7 +627,7 @@ def test_short_times_are_not_zero():
     times = {"fps": 10.0, "ms_per_step": [12.0, 10.0], "iterations": [60, 40], "machine": "cpu"}
     assert efficiency._row(result("own", 20.0), times)[-2] == "0.02"
     assert efficiency._row(result("own", 20.0), {**times, "iterations": [6000, 4000]})[-2] == "1.9"
-    assert duration(59) == "less than a minute"
+    assert duration(59) == "a minute"
 
 
 def test_finished_runs_are_rows_of_a_spreadsheet():
@@ -535,7 +635,9 @@ def test_finished_runs_are_rows_of_a_spreadsheet():
     header, row = csv.reader(text.splitlines())
     found = dict(zip(header, row, strict=True))
     assert (found["grid"], found["scene"], found["method"], found["psnr"]) == ("claim", "fox", "own, equal", "25.0")
-    assert found["lpips"] == found["budget_mb"] == "" and found["gaussians"] == "100"
+    assert found["lpips"] == found["budget_mb"] == "" and (found["size"], found["gaussians"]) == ("100", "1000")
+    text = spreadsheet.rows_text([("claim", result("own", 25.123456789, seconds=3.14159, ms_per_step=float("nan")))])
+    assert ",25.1235," in text and ",3.1," in text and "num" not in header
 
 
 def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
@@ -545,6 +647,15 @@ def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
     told = capsys.readouterr().err.strip()
     assert ended.value.code == 130 and told.count("\n") == 0
     assert told.endswith("run.py claim --scenes 'my scenes'")
+
+
+def test_sigterm_ends_as_ctrl_c_does(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended, interruptible():
+        signal.raise_signal(signal.SIGTERM)
+    told = capsys.readouterr().err.strip()
+    assert ended.value.code == 143 and told.count("\n") == 0 and "terminated; what is finished is kept" in told
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_processes_begin_without_ctrl_c():
@@ -640,15 +751,48 @@ def test_every_picture_on_a_page_is_committed_and_every_committed_one_is_on_a_pa
         assert shown == {name for name in listed.stdout.split() if name.endswith(".png")}
 
 
-def test_the_plan_counts_what_is_left():
-    grid = read_grid("claim", "smoke")
-    everything = plan_of([grid], {})
-    assert everything.startswith("4 stages left") and "180 iterations" in everything
+def test_the_plan_counts_what_is_left(tmp_path):
+    """It counts runs at equal bytes before the bytes are known, and estimates CPUs by the cost of a step."""
+    grid, folders = read_grid("claim", "smoke"), Folders(tmp_path, tmp_path)
+    here = Machine(jobs=2, memory=8e9, has_gpu=False)
+    everything = plan_of([grid], {}, folders, here)
+    assert "| built-in 1/2 | 400 | 0 | 30+20 | 0 of 6 | all |" in everything
+    assert "8 of 8 stages are left" in everything and "rough figure of CPUs" in everything
+    assert "on this machine, 2 at a time, with compilation" in everything and "Disk: about" in everything
+    assert "8.0 GB may be used" in everything
+    on_gpu = plan_of([grid], {}, folders, dataclasses.replace(here, has_gpu=True))
+    assert "the paper's program on its GPU" in on_gpu and "compilation" not in on_gpu
     first = next(grid.jobs({}))
-    rest = plan_of([grid], {first.key: record(), first.start.key: record()})
-    assert "iterations: less than a minute on" in rest and not rest.startswith("4 ")
+    rest = plan_of([grid], {first.key: record(), first.start.key: record()}, folders, here)
+    assert "1 of 6 | 2DGS*-MCMC; A²TG, as quick has it; 2DGS*-MCMC, equal bytes;" in rest
+    assert "the steps of finished stages" in rest
+    mb = model_bytes(first.system) / 1e6
+    finished = {key: record(mb=mb) for key in stages_of([grid], {})}
+    assert "| 6 of 6 | – |" in plan_of([grid], finished, folders, here)
     assert [duration(seconds) for seconds in (150, 3600, 9000)] == ["2 minutes", "1.0 hours", "2.5 hours"]
-    assert seconds_of_step(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
+    assert finished_pace(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
+
+
+def test_progress_names_stages_in_words(tmp_path, capsys):
+    grid = read_grid("claim", "smoke")
+    records = {}
+    progress = Progress([grid], records, tmp_path / "log.txt")
+    progress.begin(2)
+    job = next(grid.jobs({}))
+    progress.start(job.start)
+    progress.done(job.start, record(seconds=3.0))
+    records[job.key] = record(mb=0.1)
+    last = list(grid.jobs(records))[-1]
+    progress.start(last)
+    progress.failed(queue.Failure(last, "no room"))
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == f"8 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
+    assert told[1] == "1 of 8 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
+    assert told[2].startswith("1 of 8 done: built-in 1/2, A²TG, ") and "25.00 dB" in told[2]
+    assert told[3].startswith("2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians")
+    assert told[4].startswith("2 of 8 FAILED: ") and told[4].endswith(": no room")
+    log = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
+    assert len(log) == 5 and all(line.endswith(shown) for line, shown in zip(log, told, strict=True))
 
 
 def test_arguments_have_defaults():

@@ -6,21 +6,28 @@ import dataclasses
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import a2tg_jax as a2tg
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.record import SYNTHETIC
 from lab import machine, spreadsheet, tables
-from lab.grid import Grid, SceneAt, own_scene, read_grid
+from lab.grid import Grid, read_grid
 from lab.jobs import Folders, Job, Record
-from lab.plan import plan_of
-from lab.queue import Failure, LocalPool, Pool, SubmititPool, run_all
+from lab.plan import Machine, plan_of
+from lab.progress import Progress
+from lab.queue import LocalPool, Pool, SubmititPool, run_all
+from lab.scenes import SceneAt, own_scene
 from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
+RUNS = EXPERIMENTS.parent / "runs"
+USAGE = 2
+"""Exit code of a call that cannot be run as it is."""
+SCALES = ("full", "small", "smoke")
 MEMORY_SHARE = 0.8
 """Default share of the machine's memory for all jobs together."""
 MOST_SENT = 1_000
@@ -35,13 +42,19 @@ class Lab:
     def __init__(self, args: argparse.Namespace):
         self.args = args
         self.scale: str = args.scale
-        name = f"{args.scale}-validation" if args.validation else args.scale
-        self.out: Path = args.out or EXPERIMENTS / "results" / name
-        self.work: Path = args.work or EXPERIMENTS.parent / "runs" / "experiments" / args.scale
+        self.out: Path = args.out or self._default_out()
+        self.work: Path = args.work or RUNS / "experiments" / args.scale
         network = None if args.lpips_weights is None else load_lpips(args.lpips_weights).network
         self.folders = Folders(args.scenes, self.work, args.lpips_weights, network)
         self._file = self.out / "records.json"
         self.records: dict[str, Record] = self._all_records()
+
+    def _default_out(self) -> Path:
+        """Return the folder of the committed results, or one that git ignores for the smoke scale and grids of one's
+        own."""
+        name = f"{self.scale}-validation" if self.args.validation else self.scale
+        is_own = self.is_smoke or getattr(self.args, "own_grids", ())
+        return (RUNS if is_own else EXPERIMENTS) / "results" / name
 
     def grid(self, name: str) -> Grid:
         """Return a grid with the requested scenes."""
@@ -59,20 +72,28 @@ class Lab:
         """Return whether the scale only shows that everything runs: figures need little work and mean nothing."""
         return self.scale == "smoke"
 
-    def run(self, grids: Sequence[Grid]) -> list[Failure]:
-        """Run the unfinished jobs of the grids, unless only tables are requested."""
+    def run(self, grids: Sequence[Grid]) -> list[str]:
+        """Run the unfinished jobs of the grids, unless only tables are requested; return what failed, in words."""
         if self.args.tables_only:
             return []
-        self._check_inputs(grids)
+        self.check_inputs(grids)
         if self.records:
             self._save()
         jobs = lambda records: (job for grid in grids for job in grid.jobs(records))  # noqa: E731
+        progress = Progress(grids, self.records, self.work / "log.txt")
+
+        def keep(job: Job, record: Record) -> None:
+            self._save()
+            progress.done(job, record)
+
         with contextlib.closing(self._pool()) as pool:
+            progress.begin(pool.slots)
             try:
-                return run_all(jobs, self.folders, pool, self.records, self._keep, _tell_failure)
+                failures = run_all(jobs, self.folders, pool, self.records, keep, progress.failed, progress.start)
             except KeyboardInterrupt:
                 pool.abort()
                 raise
+        return [f"{progress.told(failure.job)}: {failure.reason}" for failure in failures]
 
     @property
     def is_partial(self) -> bool:
@@ -110,22 +131,18 @@ class Lab:
         with replacing(self.pages / f"{name}.csv") as temporary:
             temporary.write_text(spreadsheet.rows_text(found), encoding="utf-8")
 
-    def _check_inputs(self, grids: Sequence[Grid]) -> None:
+    def check_inputs(self, grids: Sequence[Grid]) -> None:
         """Raise if a scene is missing, before anything is trained."""
         for path in {cell.scene.path for grid in grids for cell in grid.cells} - {SYNTHETIC}:
+            if not Path(path).is_absolute() and not self.folders.scenes.is_dir():
+                raise ValueError(f"there is no folder --scenes {self.folders.scenes}")
             if not (self.folders.scenes / path).is_dir():
+                if Path(path).is_absolute():
+                    raise ValueError(f"there is no scene folder {path}")
                 raise ValueError(
                     f"there is no scene {self.folders.scenes / path}: --scenes must name the folder of the scenes, as "
                     "grids/scales.toml has them (experiments/download.py fetches those of --scale full)"
                 )
-
-    def _keep(self, job: Job, record: Record) -> None:
-        self._save()
-        print(
-            f"{len(self.records):4d}  {job.key}: {record['num']} splats, {record['mb']:.2f} MB, "
-            f"{record['psnr']:.2f} dB; {record['seconds']:.0f} s, {record['ms_per_step']:.0f} ms a step",
-            flush=True,
-        )
 
     def _save(self) -> None:
         """Merge the records into the results, to which another program may have added some."""
@@ -141,9 +158,16 @@ class Lab:
         own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
         return {**own, **self._kept()}
 
+    def machine(self) -> Machine:
+        """Return what --plan plans for."""
+        return Machine(self.args.jobs or machine.default_jobs(), self._memory(), machine.num_gpus() > 0)
+
+    def _memory(self) -> float:
+        """Return the bytes that jobs of this machine may take together."""
+        return self.args.memory_gb * 1e9 if self.args.memory_gb else MEMORY_SHARE * machine.memory_bytes()
+
     def _pool(self) -> Pool:
-        args, inf = self.args, float("inf")
-        memory = args.memory_gb * 1e9 if args.memory_gb else MEMORY_SHARE * machine.memory_bytes()
+        args, inf, memory = self.args, float("inf"), self._memory()
         if args.cluster:
             parameters = {**CLUSTER_DEFAULTS.get(args.cluster, {}), **dict(map(_parameter, args.cluster_parameter))}
             is_here = args.cluster == "local"
@@ -177,12 +201,12 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
         grids = {name: lab.grid(name) for name in names}
         if args.plan:
-            print(plan_of(list(grids.values()), lab.records))
+            lab.check_inputs(list(grids.values()))
+            print(plan_of(list(grids.values()), lab.records, lab.folders, lab.machine()))
             return None
-        failures = lab.run(list(grids.values()))
+        errors = lab.run(list(grids.values()))
     except (ValueError, OSError, RuntimeError, NameError) as error:  # The last two are submitit's.
-        sys.exit(f"error: {error}")
-    errors = [f"{failure.job.key}: {failure.reason}" for failure in failures]
+        stop(str(error))
     for experiment in experiments:
         own = [grids[name] for name in experiment.grids]
         try:
@@ -196,8 +220,10 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
     return lab
 
 
-def _tell_failure(failure: Failure) -> None:
-    print(f"FAILED {failure.job.key}: {failure.reason}", flush=True)
+def stop(message: str) -> NoReturn:
+    """End the program with one line and the exit code of a call that cannot be run."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(USAGE)
 
 
 @contextlib.contextmanager
@@ -218,7 +244,8 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
-    add("--scale", choices=("full", "small", "smoke"), default="small", help="full is the paper's, for a GPU")
+    add("--scale", type=_scale, default="small", metavar="{full,small,smoke}",
+        help="full is the paper's, for a GPU")  # fmt: skip
     add("--only", nargs="+", metavar="SCENE", help="run these scenes of the scale only")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip
@@ -226,7 +253,8 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--without-held-out", action="store_true", help="leave out the held-out scenes")
     add("--validation", action="store_true",
         help="hold out every eighth training view in place of the test views, to choose options by")  # fmt: skip
-    add("--out", type=Path, help="folder of records, tables and plots; runs finished in it are never run again")
+    add("--out", type=Path, help="folder of records, tables and plots; runs finished in it are never run again; "
+        "default: experiments/results/SCALE, or runs/results/SCALE for --scale smoke and grid files")  # fmt: skip
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")
     add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet); without them LPIPS is left out")
     add("--jobs", type=int, help="number of jobs at a time; default: one a GPU, else one a core")
@@ -236,6 +264,12 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--plan", action="store_true", help="run nothing; print what is left to run and about how long it takes")
     add("--tables-only", action="store_true", help="run nothing; write tables and plots of the finished runs")
     return parser
+
+
+def _scale(name: str) -> str:
+    if name not in SCALES:
+        stop(f"there is no --scale {name}{did_you_mean(name, SCALES) or '; there are ' + ', '.join(SCALES)}")
+    return name
 
 
 def _parameter(text: str) -> tuple[str, Any]:

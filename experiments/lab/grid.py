@@ -1,7 +1,7 @@
 """Grids: methods, scenes and numbers of Gaussians of an experiment, read from files in `grids/`.
 
 A cell is a scene with a number of Gaussians, a seed, and lengths of the stages. Every method of the experiment is one
-run in it. A method has the cell's number of splats, or, `at_equal_bytes`, as many as fit into the final bytes of the
+run in it. A method has the cell's number of Gaussians, or, `at_equal_bytes`, as many as fit into the final bytes of the
 cell's reference, which are known once that is trained.
 """
 
@@ -14,10 +14,15 @@ from typing import Any
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
+from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.training.registry import merged, with_changes
 from lab.jobs import Job, Record
+from lab.scenes import SceneAt, chosen_scenes, read_scenes
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
+SUFFIX = ".toml"
+TABLES = ("quality", "gains", "choices")
+"""Kinds of tables of a grid, the default first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,27 +33,9 @@ class Method:
     system: str
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     floats: int | None = None
-    """Floats of a splat; needed for a given number of bytes."""
+    """Floats of a Gaussian; needed for a given number of bytes."""
     most: int | None = None
     """Largest number of Gaussians of the cells that have this method."""
-
-
-@dataclasses.dataclass(frozen=True)
-class SceneAt:
-    """A scene at a size."""
-
-    label: str
-    """DATASET/NAME, or a name without a data set."""
-    path: str
-    downscale: int
-    held_out: bool = False
-    """Mark of a scene on which no choice may be made."""
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
-    """Options of every system, such as its background."""
-
-    @property
-    def dataset(self) -> str:
-        return self.label.rpartition("/")[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +49,11 @@ class Cell:
     iterations: tuple[int, int]
     budget: float | None = None
     """Bytes that every method fills, in MB (10^6 bytes)."""
+
+    @property
+    def size(self) -> str:
+        """Number of Gaussians, or budget, for tables."""
+        return f"{self.gaussians:,}" if self.budget is None else f"{self.budget:g} MB"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +83,8 @@ class Grid:
     """Methods at the final bytes of the reference."""
     validation: bool = False
     """Whether validation views are held out in place of the test views."""
+    table: str = TABLES[0]
+    """Kind of its tables."""
 
     def runs(self, records: Mapping[str, Record]) -> Iterator[Run]:
         """Yield every run that can be named already, in the order of the cells."""
@@ -106,7 +100,11 @@ class Grid:
 
     def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
         """Return the record of the reference in a cell, or None before it is finished."""
-        return records.get(self._job(self.reference, cell, cell.gaussians).key)
+        return records.get(self.reference_job(cell).key)
+
+    def reference_job(self, cell: Cell) -> Job:
+        """Return the last job of the reference in a cell."""
+        return self._job(self.reference, cell, cell.gaussians)
 
     def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
         """Return the last job of every run."""
@@ -123,27 +121,14 @@ class Grid:
 
 
 def splats_in(mb: float, method: Method) -> int:
-    """Return how many splats of a method fit into so many MB (10^6 bytes).
+    """Return how many Gaussians of a method fit into so many MB (10^6 bytes).
 
     Raises:
-      ValueError: if the floats of its splats are not known.
+      ValueError: if the floats of its Gaussians are not known.
     """
     if method.floats is None:
-        raise ValueError(f"{method.label}: its splats differ in size: a number of bytes does not say how many they are")
+        raise ValueError(f"{method.label}: its Gaussians differ in size, so that a number of bytes does not fix theirs")
     return int(round(1e6 * mb) // (BYTES_PER_FLOAT * method.floats))
-
-
-def own_scene(path: Path, downscale: int) -> SceneAt:
-    """Return a scene of one's own by the path of its folder.
-
-    Raises:
-      ValueError: if there is no such folder, or the downscale is not a whole number of at least 1.
-    """
-    if not path.is_dir():
-        raise ValueError(f"there is no scene folder {path}")
-    if downscale < 1:
-        raise ValueError(f"--downscale must be at least 1; got {downscale}")
-    return SceneAt(path.resolve().name, path.resolve().as_posix(), downscale)
 
 
 def read_grid(
@@ -155,57 +140,112 @@ def read_grid(
     own: Sequence[SceneAt] = (),
     validation: bool = False,
 ) -> Grid:
-    """Read an experiment's grid at a scale from `grids/NAME.toml`.
+    """Read an experiment's grid at a scale from `grids/NAME.toml`, or from a file of one's own.
 
     Args:
+      name: name of a grid, or the path of a file that ends in .toml.
       scenes: labels of the wanted scenes; None for those that the file, or else the scale, names.
       held_out: whether held-out scenes count.
       own: scenes that take the place of all these; empty for none.
       validation: whether validation views are held out in place of the test views.
 
     Raises:
-      ValueError: if the file lacks the scale, or a scene or method is unknown.
+      ValueError: if the file lacks the scale, or a scene, a method or a kind of table is unknown.
     """
-    file, everywhere = _read(name), _read("scales")
+    path, scales = grid_path(name), _read(GRIDS / "scales.toml")
+    file, place = _read(path), path.name
     if scale not in file:
-        raise ValueError(f"grids/{name}.toml has no table [{scale}]")
-    settings = {**everywhere[scale], **file[scale]}
-    methods = _methods({**_read("methods"), **file.get("variants", {})})
+        found = ", ".join(f"[{known}]" for known in scales if known in file) or "none"
+        raise ValueError(f"{place} has no table of --scale {scale}, [{scale}]; it has {found}")
+    settings, known_scenes = _settings(file[scale], scales[scale], path)
+    methods = _methods({**_read(GRIDS / "methods.toml"), **file.get("variants", {})}, place)
 
     def method(label: str) -> Method:
         if label not in methods:
-            raise ValueError(f"grids/{name}.toml: there is no method {label!r}; there are {', '.join(methods)}")
+            hint = did_you_mean(label, methods) or f"; there are {', '.join(methods)}"
+            raise ValueError(f"{place}: there is no method {label!r}{hint}")
         return methods[label]
 
     def methods_in(key: str) -> tuple[Method, ...]:
         """Return the methods of an entry of the scale, or else of the file."""
         return tuple(map(method, file[scale].get(key, file.get(key, []))))
 
+    reference = method(_entry(file, "reference", place))
+    others = dict.fromkeys((*methods_in("methods"), *methods_in("variants")))
+    others.pop(reference, None)
     blocks = [{**settings, **block} for block in settings.get("blocks", [{}])]
-    cells = [cell for block in blocks for cell in _cells(block, own or _scenes(block, scenes, held_out, name))]
+    cells = [
+        cell
+        for block in blocks
+        for cell in _cells(block, own or chosen_scenes(known_scenes, block, scenes, held_out, place), place)
+    ]
     if not cells:
-        raise ValueError(f"grids/{name}.toml: no scene is left")
+        raise ValueError(f"{place}: no scene is left")
     return Grid(
-        name, file["title"], scale, settings["preset"], tuple(dict.fromkeys(cells)), method(file["reference"]),
-        (*methods_in("methods"), *methods_in("variants")), methods_in("at_equal_bytes"),
-        validation,
+        path.stem, _entry(file, "title", place), scale, settings["preset"], tuple(dict.fromkeys(cells)), reference,
+        tuple(others), methods_in("at_equal_bytes"), validation, _table(file, place),
     )  # fmt: skip
 
 
-def _methods(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Method]:
+def grid_path(name: str) -> Path:
+    """Return the file of a grid by its name or path."""
+    return Path(name).expanduser() if name.endswith(SUFFIX) else GRIDS / f"{name}{SUFFIX}"
+
+
+def _entry(file: Mapping[str, Any], key: str, place: str) -> str:
+    if key not in file:
+        raise ValueError(f"{place} has no entry {key!r}")
+    return file[key]
+
+
+def _table(file: Mapping[str, Any], place: str) -> str:
+    """Return the kind of the grid's tables."""
+    table = file.get("table", TABLES[0])
+    if table not in TABLES:
+        raise ValueError(f"{place}: table must be one of {', '.join(TABLES)}; got {table!r}")
+    return table
+
+
+def _settings(
+    own: Mapping[str, Any], scale: Mapping[str, Any], path: Path
+) -> tuple[dict[str, Any], dict[str, SceneAt]]:
+    """Return the settings of a grid at a scale, and its scenes; scenes of its own take the place of the scale's."""
+    if "scenes" not in own:
+        return {**scale, **own}, read_scenes(scale["scenes"], "scales.toml", None)
+    everywhere = {key: value for key, value in scale.items() if key != "only"}
+    return {**everywhere, **own}, read_scenes(own["scenes"], path.name, path.parent)
+
+
+def _methods(table: Mapping[str, Mapping[str, Any]], place: str) -> dict[str, Method]:
     """Return methods by label; one that is `like` another inherits its system and options."""
     methods: dict[str, Method] = {}
     for label, values in table.items():
         own = dict(values)
-        base = methods[own.pop("like")] if "like" in own else None
-        if base is not None:
+        if "like" in own:
+            like = own.pop("like")
+            if like not in methods:
+                hint = did_you_mean(like, methods) or f"; there are {', '.join(methods)}"
+                raise ValueError(f"{place}: {label!r} is like {like!r}, which is no method above it{hint}")
+            base = methods[like]
             own = {"system": base.system, **own, "options": merged(base.options, own.get("options", {}))}
-        methods[label] = Method(label, **own)
+        methods[label] = _method(label, own, place)
     return methods
 
 
-def _cells(block: Mapping, scenes: Sequence[SceneAt]) -> list[Cell]:
+def _method(label: str, values: Mapping[str, Any], place: str) -> Method:
+    known = [field.name for field in dataclasses.fields(Method) if field.name != "label"]
+    for key in values:
+        if key not in known:
+            raise ValueError(f"{place}: method {label!r} has {key!r}, which is none of like, {', '.join(known)}")
+    if "system" not in values:
+        raise ValueError(f"{place}: method {label!r} has neither a system nor a method that it is like")
+    return Method(label, **values)
+
+
+def _cells(block: Mapping, scenes: Sequence[SceneAt], place: str) -> list[Cell]:
     """Return a cell for every number of Gaussians or budget, every seed and every scene of a block."""
+    if "budgets" not in block and "gaussians" not in block:
+        raise ValueError(f"{place}: a scale needs gaussians or budgets")
     first, second = block["iterations"]
     sizes = (
         [(0, budget) for budget in block["budgets"]] if "budgets" in block else [(n, None) for n in block["gaussians"]]
@@ -214,17 +254,8 @@ def _cells(block: Mapping, scenes: Sequence[SceneAt]) -> list[Cell]:
     return [Cell(scene, num, seed, (first, second), budget) for (num, budget), seed, scene in pairs]
 
 
-def _read(name: str) -> dict[str, Any]:
-    return tomllib.loads((GRIDS / f"{name}.toml").read_text(encoding="utf-8"))
-
-
-def _scenes(block: Mapping, wanted: Sequence[str] | None, held_out: bool, name: str) -> list[SceneAt]:
-    """Return the scenes of a block, or the wanted ones, at the block's downscale if it has one."""
-    table = block["scenes"]
-    for label in wanted or ():
-        if label not in table:
-            raise ValueError(f"{name}: there is no scene {label!r} at this scale; there are {', '.join(table)}")
-    labels = block.get("only", table) if wanted is None else wanted
-    found = [SceneAt(label, **table[label]) for label in labels]
-    found = [dataclasses.replace(scene, downscale=block.get("downscale", scene.downscale)) for scene in found]
-    return [scene for scene in found if held_out or not scene.held_out]
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: {error}") from error

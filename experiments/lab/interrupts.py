@@ -1,21 +1,37 @@
-"""Ctrl-C: how a program of experiments ends. Imports nothing but the standard library."""
+"""Ctrl-C and SIGTERM: how a program of experiments ends. Imports nothing but the standard library."""
 
 import contextlib
 import shlex
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-INTERRUPTED = 128 + 2
-"""Exit code after Ctrl-C."""
+INTERRUPTED, TERMINATED = 128 + 2, 128 + 15
+"""Exit codes after Ctrl-C and SIGTERM."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a program as Ctrl-C does."""
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """End the program with one line and exit code 130 if Ctrl-C comes within the block."""
+    """End the program with one line and exit code 130 if Ctrl-C comes within the block, 143 if SIGTERM does."""
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
+        is_terminated = isinstance(interrupt, Terminated)
         command = shlex.join([Path(sys.executable).name, *sys.argv])
-        print(f"\ninterrupted; what is finished is kept; continue with: {command}", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        told = "terminated" if is_terminated else "interrupted"
+        print(f"\n{told}; what is finished is kept; continue with: {command}", file=sys.stderr)
+        sys.exit(TERMINATED if is_terminated else INTERRUPTED)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(*_: Any) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # A second one would break the end.
+    raise Terminated

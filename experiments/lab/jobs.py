@@ -40,7 +40,7 @@ class Job:
     """One stage to train."""
 
     scene: str
-    """Path below the folder of scenes, or "synthetic"."""
+    """Path below the folder of scenes, absolute path, or "synthetic"."""
     downscale: int
     system: a2tg.System
     stage: int
@@ -74,7 +74,13 @@ def _key(job: Job) -> str:
     numbers = [fingerprint(job.system, index) for index in range(job.stage + 1)]
     held_out = ("validation",) if job.validation else ()
     digest = hashlib.sha256(repr((job.scene, job.downscale, numbers, *held_out)).encode()).hexdigest()[:12]
-    return f"{job.scene.replace('/', '-')}-{job.downscale}-{job.system.stages()[job.stage].name}-{digest}"
+    return f"{_readable(job.scene)}-{job.downscale}-{job.system.stages()[job.stage].name}-{digest}"
+
+
+def _readable(scene: str) -> str:
+    """Return a part of a file name: the folder's name of an absolute path, and all of a path below --scenes."""
+    path = Path(scene)
+    return path.name if path.is_absolute() else scene.replace("/", "-")
 
 
 def num_gaussians(system: a2tg.System) -> int:
@@ -87,6 +93,7 @@ def num_gaussians(system: a2tg.System) -> int:
     return max(caps, default=system.initial_gaussians or DEFAULT_GAUSSIANS)
 
 
+@functools.lru_cache(maxsize=10_000)
 def model_bytes(system: a2tg.System) -> float:
     """Return the bytes of the largest model of a system's stages; only shapes are computed, no device is used."""
     num, bases = num_gaussians(system), NUM_BASES[system.initial_sh_degree]
@@ -125,10 +132,11 @@ class Folders:
     def checkpoint(self, job: Job) -> Path:
         return self.work / "checkpoints" / f"{job.key}.npz"
 
-    def load_scene(self, job: Job) -> a2tg.Scene:
+    def load_scene(self, job: Job, room: int | None = None) -> a2tg.Scene:
+        """Return a job's scene; `room` as in `SceneSource.load`."""
         is_folder = job.scene != "synthetic"
         path = str(self.scenes / job.scene) if is_folder else job.scene
-        return SceneSource(path, job.downscale, validation=job.validation).load()
+        return SceneSource(path, job.downscale, validation=job.validation).load(room)
 
 
 def run_job(job: Job, folders: Folders) -> Record:
@@ -209,7 +217,7 @@ def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
 
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:
-    """Return the number of splats by texture size, "2x4" being two rows (v) and four columns (u); empty without."""
+    """Return the number of Gaussians by texture size, "2x4" being two rows (v) and four columns (u); empty without."""
     if model.textures is None or model.appearance.texture_options is None:
         return {}
     pairs, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)

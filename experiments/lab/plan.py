@@ -1,57 +1,170 @@
-"""The runs that are left, and about how long they take."""
+"""The cells of a sweep with what is left, and about how much time, disk and memory that takes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+import a2tg_jax as a2tg
+from a2tg_jax.events import HostEvent
+from a2tg_jax.training.cost import forecast_stages
 from lab.grid import Grid
-from lab.jobs import Job, Record, num_gaussians
+from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians
+from lab.markdown import table
+from lab.queue import estimated_bytes
+from lab.stages import Stage, runs_by_cell, stages_of, told_scene
 
-GPU_SECONDS, GPU_SECONDS_A_SPLAT = 0.002, 2.4e-8
+GPU_SECONDS, GPU_SECONDS_PER_GAUSSIAN = 0.002, 2.4e-8
 """Time of a plain step: 14 ms for 500,000 Gaussians, from the paper's 7.18 minutes for 30,000 iterations."""
 GPU_TEXTURED = 2.0
 """Ratio of a textured step to a plain one: 19.7 minutes, if they are for both stages, leave 25 ms a step."""
+COMPILE_SECONDS, OTHER_SECONDS = 5.0, 4.0
+"""Seconds on one core to compile a program of training, and to load, measure and save a stage."""
+MOST_ROWS = 40
+"""Largest number of cells in the table."""
+FINISHED, GPU, CPU = (
+    "the steps of finished stages of the same size",
+    "the paper's program on its GPU, since none has been timed here",
+    "a very rough figure of CPUs, which may be wrong by a factor of two",
+)
 
 
-def plan_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
-    """Return what is left in a few lines. Runs at equal bytes count with the number of splats of their cell."""
-    open_jobs = {job.key: job for grid in grids for job in _all_jobs(grid, records) if job.key not in records}
-    unknown = sum(
-        len(grid.at_equal_bytes)
-        for grid in grids
-        for cell in grid.cells
-        if grid.reference_record(cell, records) is None
-    )
-    steps = sum(job.iterations for job in open_jobs.values())
-    seconds = sum(job.iterations * seconds_of_step(job, records) for job in open_jobs.values())
-    average = seconds / max(1, len(open_jobs))
-    total = seconds + unknown * 2 * average
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """What the stages are trained on."""
+
+    jobs: int
+    """Number of stages at a time."""
+    memory: float
+    """Bytes that they may take together."""
+    has_gpu: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """Estimate of a stage."""
+
+    shared: float
+    """Seconds of its steps if it has the machine to itself."""
+    own: float
+    """Seconds in which other stages train beside it."""
+    source: str
+    """Origin of the time of its steps."""
+
+
+def plan_of(grids: Sequence[Grid], records: Mapping[str, Record], folders: Folders, machine: Machine) -> str:
+    """Return a table of the cells, and estimates of what is left."""
+    stages = stages_of(grids, records)
+    left = [stage for key, stage in stages.items() if key not in records]
+    if not left:
+        return f"{_cells(grids, records)}\nAll {len(stages)} stages are finished."
+    steps = sum(stage.job.iterations for stage in left)
     return (
-        f"{len(open_jobs)} stages left of those that can be named, {steps:,} iterations: {duration(seconds)} on "
-        f"one machine, one at a time. Runs at equal bytes that follow from them: {unknown}, two stages each at most. "
-        f"In all about {duration(total)}, or that divided by the machines. The time of a step is that of finished runs "
-        "here, or else that of the paper's program and GPU: this one has not been timed on a GPU yet."
+        f"{_cells(grids, records)}\n"
+        f"{len(left)} of {len(stages)} stages are left, {steps:,} iterations; one that several methods share "
+        f"counts once.\n{_time(left, records, folders, machine)}\n{_room(left, folders, machine)}"
     )
+
+
+def _cells(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
+    """Return a row for each cell with the methods that are left."""
+    rows = []
+    for cell, runs in runs_by_cell(grids, records).items():
+        left = [label for label, run in runs.items() if run.job.key not in records]
+        length = "+".join(f"{count:,}" for count in cell.iterations)
+        done = f"{len(runs) - len(left)} of {len(runs)}"
+        rows.append([told_scene(cell.scene), cell.size, str(cell.seed), length, done, _told_left(left, len(runs))])
+    more = f"… and {len(rows) - MOST_ROWS} more cells\n" if len(rows) > MOST_ROWS else ""
+    header = ["scene", "Gaussians or budget", "seed", "iterations", "methods finished", "methods left"]
+    return table(header, rows[:MOST_ROWS]) + more
+
+
+def _told_left(labels: Sequence[str], num: int) -> str:
+    if not labels:
+        return "–"
+    return "all" if len(labels) == num > 1 else "; ".join(labels)
+
+
+def _time(left: Sequence[Stage], records: Mapping[str, Record], folders: Folders, machine: Machine) -> str:
+    forecaster = Forecaster(folders)
+    found = [_estimate(stage.job, records, machine, forecaster) for stage in left]
+    seconds = sum(one.shared for one in found) + sum(one.own for one in found) / machine.jobs
+    sources = " and ".join(dict.fromkeys(one.source for one in found))
+    compiling = "" if machine.has_gpu else ", with compilation"
+    return (
+        f"Time: about {duration(seconds)} on this machine, {machine.jobs} at a time{compiling}, estimated from "
+        f"{sources}. Pages that measure models take some minutes more."
+    )
+
+
+class Forecaster:
+    """Seconds of stages on the CPUs of this machine; each scene is read once, its photographs are not."""
+
+    def __init__(self, folders: Folders):
+        self._folders = folders
+        self._scenes: dict[tuple[str, int], a2tg.Scene] = {}
+        self._chains: dict[str, list[float]] = {}
+
+    def seconds(self, job: Job) -> float:
+        """Return the seconds of a stage's steps."""
+        last = dataclasses.replace(job, stage=len(job.system.stages()) - 1).key
+        if last not in self._chains:
+            self._chains[last] = [stage.seconds for stage in forecast_stages(self._scene(job), job.system)]
+        return self._chains[last][job.stage]
+
+    def _scene(self, job: Job) -> a2tg.Scene:
+        place = job.scene, job.downscale
+        if place not in self._scenes:
+            self._scenes[place] = self._folders.load_scene(job, room=0)
+        return self._scenes[place]
+
+
+def _estimate(job: Job, records: Mapping[str, Record], machine: Machine, forecaster: Forecaster) -> Estimate:
+    """Return the time of a stage."""
+    compiling = 0.0 if machine.has_gpu else COMPILE_SECONDS * num_programs(job) + OTHER_SECONDS
+    pace = finished_pace(job, records)
+    if pace is not None:
+        return Estimate(0.0, job.iterations * pace + compiling, FINISHED)
+    if machine.has_gpu:
+        return Estimate(0.0, job.iterations * gpu_pace(job), GPU)
+    return Estimate(forecaster.seconds(job), compiling, CPU)
+
+
+def num_programs(job: Job) -> int:
+    """Return the number of programs that a stage compiles, about."""
+    stage = job.system.stages()[job.stage]
+    return 1 + sum(one.num_programs(stage.iterations) for one in stage.events if isinstance(one, HostEvent))
+
+
+def _room(left: Sequence[Stage], folders: Folders, machine: Machine) -> str:
+    """Return disk and memory in words."""
+    disk = sum(model_size(stage.job) for stage in left)
+    memory = max(estimated_bytes(stage.job) for stage in left)
+    return (
+        f"Disk: about {_told(disk)} of models in {folders.work}. Memory: at most {_told(memory)} for a stage; "
+        f"{_told(machine.memory)} may be used."
+    )
+
+
+def model_size(job: Job) -> float:
+    """Return the bytes of a stage's model: its budget, or its Gaussians with all floats."""
+    budget = job.system.budget_bytes
+    return model_bytes(job.system) if budget is None else budget
+
+
+def _told(num_bytes: float) -> str:
+    return f"{num_bytes / 1e9:.1f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"
 
 
 def duration(seconds: float) -> str:
     """Return a time in hours or minutes."""
     if seconds >= 3600:
         return f"{seconds / 3600:.1f} hours"
-    return f"{seconds / 60:.0f} minutes" if seconds >= 60 else "less than a minute"
+    return f"{seconds / 60:.0f} minutes" if seconds >= 90 else "a minute"
 
 
-def _all_jobs(grid: Grid, records: Mapping[str, Record]) -> Iterable[Job]:
-    """Return the jobs of a grid and the jobs that they start from."""
-    for job in grid.jobs(records):
-        ahead: Job | None = job
-        while ahead is not None:
-            yield ahead
-            ahead = ahead.start
-
-
-def seconds_of_step(job: Job, records: Mapping[str, Record]) -> float:
-    """Return the time of a job's step, scaled from finished runs of the stage at this size or from the paper's GPU."""
+def finished_pace(job: Job, records: Mapping[str, Record]) -> float | None:
+    """Return the seconds of a step, scaled from finished runs of the stage at this size; None without."""
     num = num_gaussians(job.system)
     stage = job.system.stages()[job.stage].name
     paces = [
@@ -59,6 +172,11 @@ def seconds_of_step(job: Job, records: Mapping[str, Record]) -> float:
         for record in records.values()
         if record["stage"] == stage and record["downscale"] == job.downscale
     ]
-    if np.isfinite(paces).any():
-        return float(np.nanmedian(paces))
-    return (GPU_SECONDS + GPU_SECONDS_A_SPLAT * num) * (GPU_TEXTURED if stage == "textures" else 1)
+    return float(np.nanmedian(paces)) if np.isfinite(paces).any() else None
+
+
+def gpu_pace(job: Job) -> float:
+    """Return the seconds of a step on the paper's GPU."""
+    stage = job.system.stages()[job.stage].name
+    plain = GPU_SECONDS + GPU_SECONDS_PER_GAUSSIAN * num_gaussians(job.system)
+    return plain * (GPU_TEXTURED if stage == "textures" else 1)

@@ -205,6 +205,7 @@ def run_all(
     records: dict[str, Record],
     on_record: Callable[[Job, Record], None],
     on_failure: Callable[[Failure], None],
+    on_start: Callable[[Job], None] = lambda job: None,
 ) -> list[Failure]:
     """Run all wanted jobs that are not finished, and add their records.
 
@@ -215,6 +216,7 @@ def run_all(
       records: records of finished jobs by key, to which those of this call are added.
       on_record: called with each finished job.
       on_failure: called with each failed job.
+      on_start: called with each job when it starts.
 
     Returns:
       The failed jobs. Jobs that need their results are not run.
@@ -233,6 +235,7 @@ def run_all(
             others = [other for other, _ in running.values()]
             is_open = job.key not in running and job.key not in failures
             if is_open and _fits(job, others, pool, deaths):
+                on_start(job)
                 running[job.key] = job, pool.submit(job, folders)
         if not running:
             return list(failures.values())
@@ -265,8 +268,9 @@ def _fits(job: Job, others: list[Job], pool: Pool, deaths: Mapping[str, int]) ->
     """Return whether a job may run beside others; a job that died, or whose neighbour did, runs alone."""
     if not others:
         return True
-    is_room = sum(map(estimated_bytes, [*others, job])) <= pool.memory
-    return len(others) < pool.slots and is_room and not any(deaths.get(one.key) for one in [*others, job])
+    if len(others) >= pool.slots or any(deaths.get(one.key) for one in [*others, job]):
+        return False
+    return sum(map(estimated_bytes, [*others, job])) <= pool.memory
 
 
 def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]:

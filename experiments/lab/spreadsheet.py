@@ -6,9 +6,12 @@ from collections.abc import Iterable
 
 from lab.tables import Result
 
-FIGURES = ("num", "mb", "published_mb", "psnr", "ssim", "lpips", "train_psnr", "fps", "seconds", "ms_per_step")
-"""Figures of a record; those that are missing are empty."""
-HEADER = ("grid", "scene", "method", "gaussians", "budget_mb", "seed", "iterations", *FIGURES, "key")
+DIGITS = {
+    "mb": 6, "published_mb": 6, "psnr": 4, "ssim": 4, "lpips": 4, "train_psnr": 4, "fps": 1, "seconds": 1,
+    "ms_per_step": 2,
+}  # fmt: skip
+"""Figures of a record with their digits; those that are missing are empty."""
+HEADER = ("grid", "scene", "method", "size", "gaussians", "budget_mb", "seed", "iterations", *DIGITS, "key")
 
 
 def rows_text(results: Iterable[tuple[str, Result]]) -> str:
@@ -22,6 +25,10 @@ def rows_text(results: Iterable[tuple[str, Result]]) -> str:
 
 def _row(grid: str, result: Result) -> list[object]:
     cell, job = result.run.cell, result.run.job
-    place = [cell.scene.label, result.label, cell.gaussians or None, cell.budget, cell.seed]
-    figures = [result.record.get(name) for name in FIGURES]
+    place = [cell.scene.label, result.label, cell.size.replace(",", ""), result.record["num"], cell.budget, cell.seed]
+    figures = [_rounded(result.record.get(name), digits) for name, digits in DIGITS.items()]
     return [grid, *place, sum(job.all_iterations), *figures, job.key]
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

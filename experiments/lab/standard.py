@@ -1,14 +1,50 @@
-"""Experiments that are one grid and one table."""
+"""Experiments that are one grid and one table, of the kind that the grid's file names."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 from lab import tables
 from lab.cli import Experiment, Lab
-from lab.grid import Grid
+from lab.figures import figures_table
+from lab.grid import SUFFIX, Grid
+from lab.tables import Result
 
 
-def quality_experiment(name: str, place: str, description: str) -> Experiment:
-    """Return an experiment that writes every method in every column of scenes, then the paper's table of that name.
+def _gains(grid: Grid, results: Sequence[Result]) -> str:
+    gains = tables.variants_of_reference(grid, results)
+    return f"{gains}\n## Figures of every method\n\n{figures_table(results)}"
+
+
+def _choices(grid: Grid, results: Sequence[Result]) -> str:
+    return tables.choices_table(results, grid.reference.label)
+
+
+WRITERS: Mapping[str, Callable[[Grid, Sequence[Result]], str]] = {
+    "quality": tables.quality_tables,
+    "gains": _gains,
+    "choices": _choices,
+}
+"""Functions that write the tables of a grid, by kind."""
+
+
+def table_experiment(name: str, description: str, grid: str | None = None) -> Experiment:
+    """Return an experiment that writes the tables of one grid.
+
+    Args:
+      name: name of the experiment.
+      description: one line for the command line.
+      grid: name or path of the grid; by default the experiment's name.
+    """
+
+    def present(lab: Lab, grids: Sequence[Grid]) -> None:
+        (grid,) = grids
+        lab.write(name, f"# {grid.title}\n\n{_told(lab, grid)}")
+
+    return Experiment(name, (grid or name,), present, description)
+
+
+def paper_experiment(name: str, place: str, description: str) -> Experiment:
+    """Return an experiment that also writes the paper's table of its name.
 
     Args:
       name: name of the experiment, its grid, and the paper's table.
@@ -18,41 +54,27 @@ def quality_experiment(name: str, place: str, description: str) -> Experiment:
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        ours = tables.quality_tables(grid, tables.results_of(grid, lab.records))
         paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS)
-        lab.write(name, f"# {grid.title}\n\n{ours}\n## In the paper\n\n{paper}")
+        lab.write(name, f"# {grid.title}\n\n{_told(lab, grid)}\n## In the paper\n\n{paper}")
 
     return Experiment(name, (name,), present, description)
 
 
-def choices_experiment(name: str, description: str) -> Experiment:
-    """Return an experiment that writes the gain of each variant of a grid over its reference."""
-
-    def present(lab: Lab, grids: Sequence[Grid]) -> None:
-        (grid,) = grids
-        results = tables.results_of(grid, lab.records)
-        lab.write(name, f"# {grid.title}\n\n{tables.choices_table(results, grid.reference.label)}")
-
-    return Experiment(name, (name,), present, description)
+def file_experiment(path: str) -> Experiment:
+    """Return the experiment of a grid file of one's own."""
+    return table_experiment(Path(path).name.removesuffix(SUFFIX), f"The grid {path}.", path)
 
 
-def gains_experiment(name: str, description: str) -> Experiment:
-    """Return an experiment that writes the gains of a grid's reference and its variants, with the spread of seeds."""
-
-    def present(lab: Lab, grids: Sequence[Grid]) -> None:
-        (grid,) = grids
-        results = tables.results_of(grid, lab.records)
-        lab.write(name, f"# {grid.title}\n\n{tables.variants_of_reference(grid, results)}")
-
-    return Experiment(name, (name,), present, description)
+def _told(lab: Lab, grid: Grid) -> str:
+    return WRITERS[grid.table](grid, tables.results_of(grid, lab.records))
 
 
 STANDARD = (
-    gains_experiment("claim", "The paper's claim: A²TG beside plain Gaussians and textures of one size, equal bytes."),
-    choices_experiment("texel_rate", "The texels' learning rate at two densities, without the held-out scene."),
-    choices_experiment("defaults", "Each open choice of the method, one at a time, without the held-out scene."),
-    gains_experiment("where_textures_pay", "The claim over the number of Gaussians, training length and image size."),
-    quality_experiment("fixed_memory", "budget_mb", "Every method in A²TG's final bytes: Table 1 of the paper."),
-    quality_experiment("fixed_number", "gaussians", "Every method with one number of Gaussians: Table 2 of the paper."),
-    choices_experiment("quick_preset", "The preset `quick` with its numbers put back to the paper's, one at a time."),
+    table_experiment("claim", "The paper's claim: A²TG beside plain Gaussians and textures of one size, equal bytes."),
+    table_experiment("texel_rate", "The texels' learning rate at two densities, without the held-out scene."),
+    table_experiment("defaults", "Each open choice of the method, one at a time, without the held-out scene."),
+    table_experiment("where_textures_pay", "The claim over the number of Gaussians, training length and image size."),
+    paper_experiment("fixed_memory", "budget_mb", "Every method in A²TG's final bytes: Table 1 of the paper."),
+    paper_experiment("fixed_number", "gaussians", "Every method with one number of Gaussians: Table 2 of the paper."),
+    table_experiment("quick_preset", "The preset `quick` with its numbers put back to the paper's, one at a time."),
 )

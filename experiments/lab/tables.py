@@ -15,9 +15,11 @@ import numpy as np
 import scipy.stats
 
 from a2tg_jax.results.folder import read_json
-from lab.grid import Cell, Grid, Run, SceneAt
+from lab.grid import Cell, Grid, Run
 from lab.jobs import Record
 from lab.markdown import table as markdown
+from lab.scenes import SceneAt
+from lab.stages import EQUAL_BYTES
 
 T = TypeVar("T")
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
@@ -49,9 +51,6 @@ class Result:
         return float("nan") if value is None else value
 
 
-EQUAL_BYTES = ", equal bytes"
-
-
 def results_of(grid: Grid, records: Mapping[str, Record]) -> list[Result]:
     """Return the finished runs of a grid."""
     return [Result(run, records[run.job.key]) for run in grid.runs(records) if run.job.key in records]
@@ -59,7 +58,7 @@ def results_of(grid: Grid, records: Mapping[str, Record]) -> list[Result]:
 
 def mean(results: Iterable[Result], figure: str) -> float:
     """Return the mean over scenes of each scene's mean; NaN without results."""
-    means = [np.mean([result[figure] for result in own]) for _, own in _grouped(results, _scene)]
+    means = [np.mean([result[figure] for result in own]) for _, own in grouped(results, _scene)]
     return float(np.mean(means)) if means else float("nan")
 
 
@@ -99,7 +98,7 @@ def over_scenes(values: Iterable[float]) -> SceneMean:
 def gains_by_scene(results: Sequence[Result], label: str, other: str, figure: str) -> dict[str, float]:
     """Return a method's figure less another's, averaged over seeds, then over the sizes of each scene."""
     sizes: dict[str, list[float]] = {}
-    for cell, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
+    for cell, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         if gains := _gains(block, label, other, figure):
             sizes.setdefault(cell.scene.label, []).append(float(np.mean(gains)))
     return {scene: float(np.mean(own)) for scene, own in sizes.items()}
@@ -131,15 +130,15 @@ def quality(results: Sequence[Result]) -> str:
 
 def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
     """Return a table for each number of Gaussians or budget: a row a method, quality and MB in each column."""
-    columns = {column: {r.run.cell.scene for r in own} for column, own in _grouped(results, lambda r: r.column)}
+    columns = {column: {r.run.cell.scene for r in own} for column, own in grouped(results, lambda r: r.column)}
     parts = []
-    for (num, budget), block in _grouped(results, lambda result: (result.run.cell.gaussians, result.run.cell.budget)):
+    for (num, budget), block in grouped(results, lambda result: (result.run.cell.gaussians, result.run.cell.budget)):
         rows = []
-        for label, own in _grouped(block, lambda result: result.label):
+        for label, own in grouped(block, lambda result: result.label):
             by_column = {column: [result for result in own if result.column == column] for column in columns}
             shown = [_quality_and_size(found, columns[column]) for column, found in by_column.items()]
-            rows.append([label, _iterations(own), _splats(own), *shown, _mean_of_columns(by_column)])
-        header = ["method", "iterations", "splats", *(f"{column}: PSNR / SSIM / LPIPS · MB" for column in columns)]
+            rows.append([label, iterations(own), num_gaussians(own), *shown, _mean_of_columns(by_column)])
+        header = ["method", "iterations", "Gaussians", *(f"{column}: PSNR / SSIM / LPIPS · MB" for column in columns)]
         size = f"**{num:,} Gaussians** of {grid.reference.label}" if budget is None else f"**{budget:g} MB**"
         parts.append(f"{size}\n\n" + markdown([*header, "mean PSNR"], rows))
     return "\n".join(parts)
@@ -161,18 +160,18 @@ def _mean_of_columns(by_column: Mapping[str, Sequence[Result]]) -> str:
     return number(float(np.mean([mean(found, "psnr") for found in by_column.values()])), 2)
 
 
-def _iterations(results: Sequence[Result]) -> str:
+def iterations(results: Sequence[Result]) -> str:
     """Return the iterations of all stages."""
     return "+".join(f"{count:,}" for count in results[0].run.job.all_iterations)
 
 
-def _splats(results: Sequence[Result]) -> str:
-    """Return the number of splats, or its range."""
+def num_gaussians(results: Sequence[Result]) -> str:
+    """Return the number of Gaussians, or its range."""
     counts = sorted({int(result["num"]) for result in results})
     return f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,}–{counts[-1]:,}"
 
 
-def _grouped(results: Iterable[T], key: Callable[[T], Any]) -> list[tuple[Any, list[T]]]:
+def grouped(results: Iterable[T], key: Callable[[T], Any]) -> list[tuple[Any, list[T]]]:
     """Return groups by key, in the order of first occurrence."""
     groups: dict[Any, list[T]] = {}
     for result in results:
@@ -183,7 +182,7 @@ def _grouped(results: Iterable[T], key: Callable[[T], Any]) -> list[tuple[Any, l
 def variants_of_reference(grid: Grid, results: Sequence[Result]) -> str:
     """Return a table of gains for the reference and for each method whose label begins with the reference's.
 
-    Each has its own bytes; the other methods have as many splats as fit into the bytes of the reference.
+    Each has its own bytes; the other methods have as many Gaussians as fit into the bytes of the reference.
     """
     names = [method.label for method in (grid.reference, *grid.methods)]
     variants = [name for name in names if name.startswith(grid.reference.label)]
@@ -203,7 +202,7 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
     spread = seed_spread(results, reference, others)
     rows: list[list[str]] = []
     every: dict[str, dict[str, list[float]]] = {other: {} for other in others}
-    for place, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
+    for place, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         own = [result for result in block if result.label == reference]
         if not own:
             continue
@@ -237,11 +236,11 @@ def _told_spread(spread: float | None) -> str:
 
 
 def _told_place(cell: Cell, result: Result) -> list[str]:
-    """Return scene, pixels, iterations and Gaussians of a cell."""
+    """Return scene, pixels, iterations and Gaussians of a cell; a budget has those that the run ended with."""
     width, height = result.record["pixels"]
     length = "+".join(f"{count:,}" for count in cell.iterations)
-    density = cell.gaussians / (width * height)
-    return [cell.scene.label, f"{width}×{height}", length, f"{cell.gaussians:,} ({density:.2f} a pixel)"]
+    num = cell.gaussians if cell.budget is None else result.record["num"]
+    return [cell.scene.label, f"{width}×{height}", length, f"{num:,} ({num / (width * height):.2f} a pixel)"]
 
 
 def _seeds(results: Sequence[Result]) -> str:
@@ -258,7 +257,7 @@ def _mean_and_interval(gains: Mapping[str, Sequence[float]]) -> str:
 def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float | None:
     """Return the root mean square difference of two seeds in a gain, in dB; None if no cell has two seeds."""
     spreads = []
-    for _, block in _grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
+    for _, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
         for other in others:
             gains = _gains(block, reference, other, "psnr")
             spreads += [a - b for a, b in itertools.pairwise(gains)]
@@ -324,15 +323,15 @@ def choices_table(results: Sequence[Result], default: str) -> str:
 
     Only cells that both have count.
     """
-    counts = {result.run.cell.gaussians for result in results}
+    sizes = {result.run.cell.size for result in results}
 
     def place(result: Result) -> str:
-        return result.column if len(counts) == 1 else f"{result.column}, {result.run.cell.gaussians:,}"
+        return result.column if len(sizes) == 1 else f"{result.column}, {result.run.cell.size}"
 
     columns = list(dict.fromkeys(map(place, results)))
     base = {result.run.cell: result for result in results if result.label == default}
     rows = []
-    for label, own in _grouped(results, lambda result: result.label):
+    for label, own in grouped(results, lambda result: result.label):
         by_column = {column: [result for result in own if place(result) == column] for column in columns}
         if label == default:
             shown = [quality(found) for found in by_column.values()]
@@ -350,7 +349,7 @@ def _mean_gain(results: Sequence[Result], base: Mapping[Cell, Result]) -> tuple[
     both = [(result, base[result.run.cell]) for result in results if result.run.cell in base]
     if not both:
         return None
-    pairs = [pair for _, pair in _grouped(both, lambda pair: _scene(pair[0]))]
+    pairs = [pair for _, pair in grouped(both, lambda pair: _scene(pair[0]))]
     means = [[np.mean([a[figure] - b[figure] for a, b in own]) for own in pairs] for figure in ("psnr", "lpips")]
     psnr, lpips = (float(np.mean(own)) for own in means)
     return psnr, lpips

@@ -1,0 +1,64 @@
+"""The stages of a sweep with the runs that need them, and how they are told."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+from lab.grid import Cell, Grid, Run
+from lab.jobs import Job, Record, model_bytes
+from lab.scenes import SceneAt
+
+EQUAL_BYTES = ", equal bytes"
+"""End of the label of a method at the bytes of the reference."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A stage to train, and a run that needs it."""
+
+    job: Job
+    run: Run
+
+    def __str__(self) -> str:
+        cell, stage = self.run.cell, self.job.system.stages()[self.job.stage].name
+        size = cell.size if cell.budget is not None else f"{cell.size} Gaussians"
+        if self.run.is_at_equal_bytes:
+            size = f"bytes of {size}"
+        return f"{told_scene(cell.scene)}, {self.run.method.label}, stage {stage}, {size}, seed {cell.seed}"
+
+
+def told_scene(scene: SceneAt) -> str:
+    """Return the label of a scene with its size."""
+    return scene.label if scene.downscale == 1 else f"{scene.label} 1/{scene.downscale}"
+
+
+def stages_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> dict[str, Stage]:
+    """Return the stages of all runs by the key of their job; the bytes of unfinished references are guessed."""
+    found: dict[str, Stage] = {}
+    for grid in grids:
+        for run in grid.runs(guessed(grid, records)):
+            for job in chain(run.job):
+                found.setdefault(job.key, Stage(job, run))
+    return found
+
+
+def chain(job: Job) -> Iterator[Job]:
+    """Yield the jobs before a job, first the first, and the job."""
+    if job.start is not None:
+        yield from chain(job.start)
+    yield job
+
+
+def guessed(grid: Grid, records: Mapping[str, Record]) -> dict[str, Record]:
+    """Return the records, with the largest possible bytes of references that are not finished."""
+    references = map(grid.reference_job, grid.cells if grid.at_equal_bytes else ())
+    return {**{job.key: {"mb": model_bytes(job.system) / 1e6} for job in references}, **records}
+
+
+def runs_by_cell(grids: Sequence[Grid], records: Mapping[str, Record]) -> dict[Cell, dict[str, Run]]:
+    """Return the runs of every cell by label of the method; bytes are guessed as in `stages_of`."""
+    cells: dict[Cell, dict[str, Run]] = {}
+    for grid in grids:
+        for run in grid.runs(guessed(grid, records)):
+            label = run.method.label + (EQUAL_BYTES if run.is_at_equal_bytes else "")
+            cells.setdefault(run.cell, {})[label] = run
+    return cells
