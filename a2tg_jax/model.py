@@ -177,7 +177,8 @@ class Model:
           camera: the view.
           features: [N, D] numbers to show in place of colours (`render_image`), one row for each allocated Gaussian.
           background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
-          settings: static options; `texture` is not used, for the appearance has options of its own.
+          settings: static options; `texture` is not used, for the appearance has options of its own. Under jit they
+            need a capacity: `plan_render(model, cameras)`.
         """
         background = self.background if background is None and features is None else background
         rule = with_features(self.rule, features, self.gaussians)
@@ -189,6 +190,12 @@ class Model:
         """Return the same model in the world that `similarity` leads to, with its cameras (host).
 
         View dependence turns with the world; all other parameters of the appearance stay.
+
+        Lengths of the settings are in units of the world: `near_plane` is 0.2 of the new units too. Scale it along for
+        the same image, which else may lack or show splats close to the camera:
+
+            moved = model.transform(similarity)
+            moved.render(moved.origin.cameras[0], settings=settings.transform(similarity))
         """
         turned = transform_gaussians(dataclasses.replace(self.gaussians, sh=jnp.asarray(self.sh)), similarity)
         model = self.with_sh(np.asarray(turned.sh))

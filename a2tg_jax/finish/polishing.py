@@ -23,7 +23,8 @@ from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import Textures
 
 HIGHEST_DEGREE = 3
@@ -70,7 +71,7 @@ def polish(
     _check(model, views)
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
-    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    settings = plan_render(model, [view.camera for view in views])
     groups = _stacked(views, background)
     changes = _jitted()(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
