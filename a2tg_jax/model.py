@@ -13,7 +13,7 @@ from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
 from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import short_repr
+from a2tg_jax.core.checks import check_kind, short_repr
 from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
@@ -53,6 +53,12 @@ class Model:
     origin: Origin | None = dataclasses.field(default=None, metadata={"static": True})
     """Training cameras and world; None if unknown."""
 
+    def __post_init__(self) -> None:
+        """Refuse other values of this library in place of Gaussians; transformations put values of their own there."""
+        is_ours = type(self.gaussians).__module__.startswith("a2tg_jax.")
+        if is_ours or isinstance(self.gaussians, str):
+            check_kind("gaussians", self.gaussians, Gaussians)
+
     @property
     def rule(self) -> AppearanceRule:
         """Appearance rule for the renderer."""
@@ -89,6 +95,8 @@ class Model:
 
     def with_parameters(self, parameters: Parameters) -> "Model":
         """Return the same model with other floats, of the same shapes."""
+        hint = "say model.parameters._replace(gaussians=gaussians)" if isinstance(parameters, Gaussians) else ""
+        check_kind("parameters", parameters, Parameters, hint)
         return dataclasses.replace(self, gaussians=parameters.gaussians, params=parameters.params)
 
     @property

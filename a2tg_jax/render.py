@@ -162,7 +162,6 @@ def render_appearance(
     check_gaussians(gaussians)
     check_camera(camera)
     check_kind("rule", rule, AppearanceRule)
-    check_kind("settings", settings, RenderSettings)
     background = (0,) * rule.num_colors if background is None else background
     check_background(background, rule.num_colors)
     if num_live is not None:
@@ -366,6 +365,7 @@ def with_capacity(
     Raises:
       ValueError: under jit or vmap without a capacity.
     """
+    check_kind("settings", settings, RenderSettings)
     if settings.capacity is not None:
         return settings
     gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))

@@ -114,3 +114,74 @@ def test_a_renderer_prints_as_one_line():
     assert repr(renderer) == "Renderer(40 Gaussians, no size yet)"
     renderer(CAMERA)
     assert repr(renderer) == "Renderer(40 Gaussians, 16×12)"
+
+
+def scene() -> a2tg.Scene:
+    view = a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3), np.uint8))
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    return a2tg.Scene("toy", (view, view), (view,), points, 0 * points, some_world(), 1.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OneStage(a2tg.A2tg):
+    def stages(self):
+        return super().stages()[0]
+
+
+MODEL, GAUSSIANS = a2tg.Model(some_gaussians()), some_gaussians()
+TEXTURES, LAYOUT = a2tg.allocate_textures(np.ones((7, 2), int))
+KINDS = {
+    "scene must be a Scene; got str: say load_scene('/path')": lambda: a2tg.fit("/path", a2tg.A2tg()),
+    "got a name: say find_system('a2tg')": lambda: a2tg.fit(scene(), "a2tg"),
+    "system must be a System; got the class A2tg: say A2tg()": lambda: a2tg.fit(scene(), a2tg.A2tg),
+    "resume must be a Checkpoint; got str: say load_checkpoint": lambda: a2tg.fit(
+        scene(), a2tg.A2tg(), resume="cp.npz"
+    ),
+    "OneStage.stages must return a tuple of stages; got Stage(": lambda: a2tg.fit(scene(), OneStage()),
+    "views must be views, such as scene.train; got Scene: say evaluate(scene.test": lambda: a2tg.evaluate(
+        scene(), MODEL
+    ),
+    "got Model: say evaluate(scene.test, model)": lambda: a2tg.evaluate(MODEL, scene().test),
+    "gaussians must be Gaussians; got Scene": lambda: a2tg.evaluate(scene().test, scene()),
+    "got Scene: say polish(model, scene.train)": lambda: a2tg.polish(MODEL, scene()),
+    "model must be a Model; got tuple: say polish": lambda: a2tg.polish(scene().train, MODEL),
+    "cameras[0] must be a Camera; got View: use view.camera": lambda: a2tg.smooth_path(scene().train, 5),
+    "cameras must be a list of cameras, such as": lambda: a2tg.smooth_path(scene(), 5),
+    "model must be a Model; got Gaussians: say Model(gaussians)": lambda: a2tg.save_model("g.npz", GAUSSIANS),
+    "model must be a Model; got Gaussians": lambda: a2tg.save_compact("g.a2tgz", GAUSSIANS),
+    "parameters must be Parameters; got Gaussians: say": lambda: MODEL.with_parameters(GAUSSIANS),
+    "model must be a Model; got ArrayImpl": lambda: a2tg.value_and_grad(jnp.sum)(jnp.ones(3)),
+    "settings must be RenderSettings; got dict": lambda: MODEL.render(CAMERA, settings={"tile_size": 8}),
+    "camera.viewmat must be an array; got list": lambda: MODEL.render(
+        a2tg.Camera(np.eye(4).tolist(), np.eye(3).tolist(), 8, 8)
+    ),
+    "camera.width must be a positive number of pixels, a Python int": lambda: MODEL.render(
+        dataclasses.replace(CAMERA, width=jnp.int32(80))
+    ),
+    "gaussians must be Gaussians; got Scen": lambda: a2tg.Model(scene()),
+    "model.params must be () for the appearance Plain": lambda: a2tg.Model(GAUSSIANS, TEXTURES, LAYOUT).render(CAMERA),
+    "x.ply: save_model writes *.npz files; call save_ply instead": lambda: a2tg.save_model("x.ply", MODEL),
+    "save_compact writes *.a2tgz files; call save_model": lambda: a2tg.save_compact("x.npz", MODEL),
+    "save_ply writes *.ply files; call save_compact": lambda: a2tg.save_ply("x.a2tgz", MODEL),
+    "flat.ply: load_model reads *.npz files; call load_ply instead": lambda: a2tg.load_model("flat.ply"),
+    "load_compact reads *.a2tgz files; call load_model": lambda: a2tg.load_compact("m.npz"),
+    "load_ply reads *.ply files; call load_model": lambda: a2tg.load_ply("m.npz"),
+}
+
+
+@pytest.mark.parametrize("message", KINDS)
+def test_a_value_of_the_wrong_kind_is_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        KINDS[message]()
+
+
+def test_transformations_may_put_anything_in_the_place_of_gaussians():
+    axes = a2tg.Model(0, None, None)
+    assert jax.tree.map(lambda x: None, MODEL).gaussians.means is None and axes.gaussians == 0
+
+
+def test_a_ply_file_with_nan_says_how_many_rows_and_which_first(tmp_path):
+    bad = dataclasses.replace(GAUSSIANS, means=GAUSSIANS.means.at[jnp.array([2, 5]), 1].set(jnp.nan))
+    a2tg.save_ply(tmp_path / "bad.ply", bad)
+    with pytest.raises(ValueError, match=r"2 of 7 have NaN or infinite numbers, the first is row 2 \(from 0\)"):
+        a2tg.load_ply(tmp_path / "bad.ply")

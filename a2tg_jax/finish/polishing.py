@@ -19,9 +19,11 @@ from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
+from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, render_traced
 from a2tg_jax.renderer import plan_render
@@ -164,6 +166,8 @@ def with_colors(model: Model, colors: Colors) -> Model:
 
 
 def _check(model: Model, views: Sequence[View]) -> None:
+    check_kind("model", model, Model, "say polish(model, scene.train)")
+    check_are_views(views, "polish(model, scene.train)")
     if not views:
         raise ValueError("views must hold at least one view; got none")
     if not model.appearance.is_linear:

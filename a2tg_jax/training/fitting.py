@@ -1,12 +1,15 @@
 """Training from photographs: the stages of a system, each from the result of the one before."""
 
 import dataclasses
+import os
 import warnings
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, origin_of_scene
+from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
@@ -107,7 +110,7 @@ def fit(
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
       ValueError: if options contradict each other or the checkpoint.
     """
-    system.check()
+    _check_arguments(scene, system, resume)
     if resume is not None:
         check_resume(resume, system, resume.stage)
     session = Session() if session is None else session
@@ -128,6 +131,19 @@ def fit(
         )
         results.append(result)
     return FitResult(system, tuple(results))
+
+
+def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
+    """Raise ValueError unless the arguments are of their classes and the options are valid."""
+    is_path = str, os.PathLike
+    check_kind("scene", scene, Scene, f"say load_scene({shortened(scene)!r})" if isinstance(scene, is_path) else "")
+    if isinstance(system, str):
+        raise ValueError(f"system must be a System; got a name: say find_system({shortened(system)!r}).preset('quick')")
+    example = f"say {system.__name__}() or {system.__name__}.preset('quick')" if isinstance(system, type) else ""
+    check_kind("system", system, System, example)
+    if resume is not None:
+        check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
+    system.check()
 
 
 def fit_stage(
@@ -156,7 +172,7 @@ def fit_stage(
         views. None: that of the checkpoint, or 0.
       watch: called between steps with the stage under way (`training.loop.Watch`).
     """
-    system.check()
+    _check_arguments(scene, system, resume)
     if not 0 <= index < len(system.stages()):
         raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
     if checkpoint_every is not None and checkpoint_every < 1:

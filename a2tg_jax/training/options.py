@@ -190,6 +190,8 @@ class System:
 
     def _check_stages(self) -> None:
         stages = self.stages()
+        if not isinstance(stages, tuple | list) or not all(isinstance(stage, Stage) for stage in stages):
+            raise ValueError(f"{type(self).__name__}.stages must return a tuple of stages; got {shortened(stages)}")
         if not stages:
             raise ValueError(f"{type(self).__name__} has no stages")
         names = [stage.name for stage in stages]
