@@ -161,7 +161,6 @@ def render_appearance(
     """Render a view as `render_image` does, with an appearance rule; of the first `num_live` rows, if given."""
     check_gaussians(gaussians)
     check_camera(camera)
-    check_kind("rule", rule, AppearanceRule)
     background = (0,) * rule.num_colors if background is None else background
     check_background(background, rule.num_colors)
     if num_live is not None:
@@ -193,6 +192,17 @@ def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> 
         found = f"{dtype_of(features)}{[*np.shape(features)]}"
         raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
     return Features(rule, jnp.asarray(features))
+
+
+def check_rule(rule: AppearanceRule) -> None:
+    """Raise ValueError unless a value is a rule, and it and the rules in it are pytrees."""
+    check_kind("rule", rule, AppearanceRule)
+    for leaf in jax.tree.leaves(rule):
+        if isinstance(leaf, AppearanceRule):
+            raise ValueError(
+                f"{type(leaf).__name__} is not a pytree: decorate it with @jax.tree_util.register_dataclass, above "
+                "@dataclasses.dataclass(frozen=True)"
+            )
 
 
 def check_background(background: Any, num_colors: int = 3) -> None:
@@ -335,6 +345,7 @@ def pairs_of_view(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
 ) -> int:
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
+    check_rule(rule)
     try:
         return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
@@ -366,6 +377,7 @@ def with_capacity(
       ValueError: under jit or vmap without a capacity.
     """
     check_kind("settings", settings, RenderSettings)
+    check_rule(rule)
     if settings.capacity is not None:
         return settings
     gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))

@@ -185,3 +185,15 @@ def test_a_ply_file_with_nan_says_how_many_rows_and_which_first(tmp_path):
     a2tg.save_ply(tmp_path / "bad.ply", bad)
     with pytest.raises(ValueError, match=r"2 of 7 have NaN or infinite numbers, the first is row 2 \(from 0\)"):
         a2tg.load_ply(tmp_path / "bad.ply")
+
+
+def test_a_preset_takes_other_values_of_options():
+    system = a2tg.A2tg.preset("quick", stage1_iterations=10, texture={"cap": 8}, rates=a2tg.LearningRates(quats=0.5))
+    plain = a2tg.A2tg.preset("quick")
+    texture = dataclasses.replace(plain.texture, cap=8)
+    rates = a2tg.LearningRates(quats=0.5)
+    assert system == dataclasses.replace(plain, stage1_iterations=10, texture=texture, rates=rates)
+    with pytest.raises(ValueError, match=r"A2tg.iterations is not a field of A2tg; did you mean stage"):
+        a2tg.A2tg.preset("quick", iterations=10)
+    with pytest.raises(ValueError, match=r"A2tg.texture.cep is not a field of TextureConfig; did you mean cap\?"):
+        a2tg.A2tg.preset("quick", texture={"cep": 10})
