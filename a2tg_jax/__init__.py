@@ -111,6 +111,7 @@ if TYPE_CHECKING:
     from a2tg_jax.training import DivergedError as DivergedError
     from a2tg_jax.training import FitResult as FitResult
     from a2tg_jax.training import History as History
+    from a2tg_jax.training import Interrupted as Interrupted
     from a2tg_jax.training import LearningRates as LearningRates
     from a2tg_jax.training import LossConfig as LossConfig
     from a2tg_jax.training import Session as Session
@@ -189,6 +190,7 @@ _NAMES = {
         "DivergedError",
         "FitResult",
         "History",
+        "Interrupted",
         "LearningRates",
         "LossConfig",
         "Session",

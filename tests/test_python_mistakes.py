@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import signal
 import warnings
 
 import jax
@@ -12,6 +13,7 @@ from small_models import some_model
 from small_values import some_gaussians, some_world
 
 import a2tg_jax as a2tg
+from a2tg_jax.host import signals
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 
@@ -197,3 +199,12 @@ def test_a_preset_takes_other_values_of_options():
         a2tg.A2tg.preset("quick", iterations=10)
     with pytest.raises(ValueError, match=r"A2tg.texture.cep is not a field of TextureConfig; did you mean cap\?"):
         a2tg.A2tg.preset("quick", texture={"cep": 10})
+
+
+def test_the_first_ctrl_c_is_noted_and_the_second_interrupts():
+    with pytest.raises(KeyboardInterrupt), signals.ctrl_c_noted() as is_interrupted:
+        assert not is_interrupted()
+        signal.raise_signal(signal.SIGINT)
+        assert is_interrupted()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

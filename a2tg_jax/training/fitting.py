@@ -9,12 +9,13 @@ from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, origin_of_scene
+from a2tg_jax.host import signals
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
-from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, Watch, check_resume, never, unwatched
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, check_resume, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
@@ -88,6 +89,7 @@ def fit(
     resume: Checkpoint | None = None,
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
+    on_log: OnLog | None = None,
     progress: bool = True,
     is_stopped: IsStopped = never,
     session: Session | None = None,
@@ -101,12 +103,15 @@ def fit(
       on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
         iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
+      on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
+        the fields of `History`.
       progress: show a progress bar.
-      is_stopped: asked between steps. If it returns True, `on_checkpoint` is called a last time and KeyboardInterrupt
-        is raised.
+      is_stopped: asked between steps. If it returns True, `on_checkpoint` is called a last time and `Interrupted` is
+        raised. The first Ctrl-C does the same, unless the program handles it.
       session: shapes that trainings of this process share; None: a new one.
 
     Raises:
+      Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to go on from.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
       ValueError: if options contradict each other or the checkpoint.
     """
@@ -116,20 +121,22 @@ def fit(
     session = Session() if session is None else session
     first = 0 if resume is None else resume.stage
     results: list[StageResult] = []
-    for index in range(first, len(system.stages())):
-        result = fit_stage(
-            scene,
-            system,
-            index,
-            results[-1].model if results else None,
-            resume=resume if index == first else None,
-            on_checkpoint=on_checkpoint,
-            checkpoint_every=checkpoint_every,
-            progress=progress,
-            is_stopped=is_stopped,
-            session=session,
-        )
-        results.append(result)
+    with signals.ctrl_c_noted() as is_interrupted:
+        for index in range(first, len(system.stages())):
+            result = fit_stage(
+                scene,
+                system,
+                index,
+                results[-1].model if results else None,
+                resume=resume if index == first else None,
+                on_checkpoint=on_checkpoint,
+                checkpoint_every=checkpoint_every,
+                on_log=on_log,
+                progress=progress,
+                is_stopped=lambda: is_interrupted() or is_stopped(),
+                session=session,
+            )
+            results.append(result)
     return FitResult(system, tuple(results))
 
 
@@ -155,6 +162,7 @@ def fit_stage(
     resume: Checkpoint | None = None,
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
+    on_log: OnLog | None = None,
     progress: bool = True,
     title: str | None = None,
     is_stopped: IsStopped = never,
@@ -182,6 +190,7 @@ def fit_stage(
         start = initial_model(scene, system)
     with system.naming_options():
         run = StageRun(scene, system, index, start, resume, num_restored, session)
+        run.on_log = on_log
         run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
     origin = origin_of_scene(scene, BACKGROUNDS[system.background])
     origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
