@@ -38,7 +38,10 @@ class Parameters(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """Gaussians, their appearance with its parameters, and their origin."""
+    """Gaussians, their appearance with its parameters, and their origin.
+
+    Methods marked "(host)" read numbers of the device, and cannot be called under jit.
+    """
 
     gaussians: Gaussians
     """Allocated rows, of which the first `num_live` exist."""
@@ -237,6 +240,9 @@ class Model:
 
 def _indices(rows: Any, num: int) -> np.ndarray:
     """Return the indices of the rows that a mask, indices or a slice choose of `num`."""
+    if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
+        end = f"{rows + 1}" if rows != -1 else ""
+        raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian say model[{rows}:{end}]")
     chosen = rows if isinstance(rows, slice) else np.asarray(rows)
     if not isinstance(chosen, slice) and (chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu")):
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; got {chosen.dtype} {[*chosen.shape]}")
@@ -253,7 +259,7 @@ def concatenate(models: Sequence[Model]) -> Model:
     up with zeros.
 
     Args:
-      models: at least one, of one appearance.
+      models: at least one, of the same appearance with the same options.
 
     Returns:
       The model of all Gaussians that exist; its origin is that of the first model.
@@ -261,16 +267,20 @@ def concatenate(models: Sequence[Model]) -> Model:
     Raises:
       ValueError: if there are no models, or they differ in their appearance or dtype.
     """
+    if not isinstance(models, Sequence) or not models:
+        raise ValueError("concatenate needs at least one model, in a list")
+    for index, model in enumerate(models):
+        check_kind(f"models[{index}]", model, Model)
     models = [model.live for model in models]
-    if not models:
-        raise ValueError("models must be one model at least; got none")
     first = models[0]
-    for name, found in (
-        ("appearance", [m.appearance for m in models]),
-        ("dtype", [m.gaussians.means.dtype for m in models]),
-    ):
-        if any(other != found[0] for other in found):
-            raise ValueError(f"models must have one {name}; got {', '.join(map(str, found))}")
+    if kinds := [type(m.appearance).__name__ for m in models if m.appearance != first.appearance]:
+        own = type(first.appearance).__name__
+        why = f"{own} and {kinds[0]}" if kinds[0] != own else f"{own} of different options"
+        raise ValueError(f"models must have one appearance; got {why}")
+    if dtypes := [
+        str(m.gaussians.means.dtype) for m in models if m.gaussians.means.dtype != first.gaussians.means.dtype
+    ]:
+        raise ValueError(f"models must have one dtype; got {first.gaussians.means.dtype} and {dtypes[0]}")
     highest = max(model.gaussians.sh.shape[1] for model in models)
     several = [_with_bases(model.gaussians, 0 if first.appearance.has_degrees else highest) for model in models]
     if len({gaussians.sh_degree for gaussians in several}) > 1:

@@ -212,6 +212,8 @@ def check_background(background: Any, num_colors: int = 3) -> None:
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
             "render on black and add (1 - output.alpha[..., None]) * image"
         )
+    if isinstance(background, str):
+        raise ValueError(f"background must be [{num_colors}] floats, such as (1, 1, 1) for white; got {background!r}")
     check_shape("background", background, (num_colors,))
 
 

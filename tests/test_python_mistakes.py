@@ -132,6 +132,7 @@ class OneStage(a2tg.A2tg):
 
 MODEL, GAUSSIANS = a2tg.Model(some_gaussians()), some_gaussians()
 TEXTURES, LAYOUT = a2tg.allocate_textures(np.ones((7, 2), int))
+TEXTURED = a2tg.Model(GAUSSIANS, TEXTURES, LAYOUT, appearance=a2tg.Textured())
 KINDS = {
     "scene must be a Scene; got str: say load_scene('/path')": lambda: a2tg.fit("/path", a2tg.A2tg()),
     "got a name: say find_system('a2tg')": lambda: a2tg.fit(scene(), "a2tg"),
@@ -208,3 +209,24 @@ def test_the_first_ctrl_c_is_noted_and_the_second_interrupts():
         assert is_interrupted()
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+ROWS = {
+    "concatenate needs at least one model": lambda: a2tg.concatenate([]),
+    "models[1] must be a Model; got Gaussians": lambda: a2tg.concatenate([MODEL, GAUSSIANS]),
+    "models must have one appearance; got Plain and Textured": lambda: a2tg.concatenate([MODEL, TEXTURED]),
+    "models must have one appearance; got Plain of different options": lambda: a2tg.concatenate(
+        [MODEL, a2tg.Model(GAUSSIANS, appearance=a2tg.Plain(0.5))]
+    ),
+    "for one Gaussian say model[3:4]": lambda: MODEL[3],
+    "for one Gaussian say model[-1:]": lambda: MODEL[-1],
+    "background must be [3] floats, such as (1, 1, 1) for white; got 'white'": lambda: MODEL.render(
+        CAMERA, background="white"
+    ),
+}
+
+
+@pytest.mark.parametrize("message", ROWS)
+def test_rows_models_and_backgrounds_of_a_wrong_form_are_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        ROWS[message]()

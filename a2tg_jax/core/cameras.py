@@ -69,7 +69,8 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
     for side in ("width", "height"):
         value = getattr(camera, side)
         if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name}.{side} must be a positive number of pixels, a Python int; got {value!r}")
+            kind = "" if isinstance(value, int) else ", a Python int"
+            raise ValueError(f"{name}.{side} must be a positive number of pixels{kind}; got {value!r}")
     _check_rigid(camera.viewmat, f"{name}.viewmat")
 
 
