@@ -253,7 +253,7 @@ def _indices(rows: Any, num: int) -> np.ndarray:
 
 
 def concatenate(models: Sequence[Model]) -> Model:
-    """Return the Gaussians of several models as one model, in their order (host).
+    """Return the Gaussians of several models as one model, in their order.
 
     The models lie in one world: move them first (`Model.transform`). Spherical harmonics of lower degrees are filled
     up with zeros.

@@ -146,7 +146,7 @@ class Renderer:
         return f"Renderer({counted(self._gaussians.num, 'Gaussian')}, {sizes})"
 
     def __call__(self, camera: Camera) -> RenderOutput:
-        """Render the view of a camera (host); never an overflow."""
+        """Render the view of a camera; never an overflow."""
         check_camera(camera)
         size = camera.width, camera.height
         if size not in self.capacities:

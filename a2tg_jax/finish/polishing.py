@@ -57,7 +57,7 @@ class Targets(NamedTuple):
 def polish(
     model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: Any = None
 ) -> Model:
-    """Return the model with colours that lower the squared error over the views (host).
+    """Return the model with colours that lower the squared error over the views.
 
     Args:
       model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
