@@ -119,9 +119,9 @@ def logit(p: Array) -> Array:
 
 
 def check_unit_colors(name: str, colors: ArrayLike) -> None:
-    """Raise ValueError if colours are integers, such as bytes, or outside [0, 1]; NaN passes (host)."""
+    """Raise ValueError if colours are an array of integers, such as bytes, or outside [0, 1]; NaN passes."""
     values = np.asarray(colors)
-    if not np.issubdtype(values.dtype, np.floating):
+    if hasattr(colors, "dtype") and not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"{name} must be floats in [0, 1]; got {values.dtype}: divide bytes by 255")
     if (outside := values[(values < -COLOR_SLACK) | (values > 1 + COLOR_SLACK)]).size:
         raise ValueError(f"{name} must lie in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
@@ -153,8 +153,8 @@ def init_from_points(
       float32 Gaussians, min(num, P) of them.
 
     Raises:
-      ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, or colours are
-        integers or outside [0, 1].
+      ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, or colours are an
+        array of integers or outside [0, 1].
     """
     check_unit_colors("colors", colors)
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
