@@ -186,7 +186,10 @@ def test_transformations_may_put_anything_in_the_place_of_gaussians():
 def test_a_ply_file_with_nan_says_how_many_rows_and_which_first(tmp_path):
     bad = dataclasses.replace(GAUSSIANS, means=GAUSSIANS.means.at[jnp.array([2, 5]), 1].set(jnp.nan))
     a2tg.save_ply(tmp_path / "bad.ply", bad)
-    with pytest.raises(ValueError, match=r"2 of 7 have NaN or infinite numbers, the first is row 2 \(from 0\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"means must be finite; 2 of 7 rows have NaN or infinite numbers, the first is row 2 \(from 0\)",
+    ):
         a2tg.load_ply(tmp_path / "bad.ply")
 
 

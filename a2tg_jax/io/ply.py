@@ -15,7 +15,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -138,14 +137,15 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def _check_rows(gaussians: Gaussians) -> None:
-    """Raise ValueError, naming the number of rows and the first of them, if some are not finite."""
-    leaves = [np.asarray(leaf).reshape(gaussians.num, -1) for leaf in jax.tree.leaves(gaussians)]
-    bad = np.flatnonzero(~np.isfinite(np.concatenate(leaves, axis=1)).all(axis=1))
-    if len(bad):
-        raise ValueError(
-            f"rows must be finite; {len(bad):,} of {gaussians.num:,} have NaN or infinite numbers, the first is row "
-            f"{bad[0]:,} (from 0)"
-        )
+    """Raise ValueError, naming a field, the number of rows and the first of them, if some are not finite."""
+    for field in dataclasses.fields(gaussians):
+        rows = np.asarray(getattr(gaussians, field.name))
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))))
+        if len(bad):
+            raise ValueError(
+                f"gaussians.{field.name} must be finite; {len(bad):,} of {gaussians.num:,} rows have NaN or infinite "
+                f"numbers, the first is row {bad[0]:,} (from 0)"
+            )
 
 
 def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
