@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from a2tg_jax.core.optim import adam_update as adam_update
     from a2tg_jax.core.optim import exponential_decay as exponential_decay
     from a2tg_jax.core.origin import Origin as Origin
+    from a2tg_jax.core.overflow import CapacityWarning as CapacityWarning
     from a2tg_jax.core.paths import path_through as path_through
     from a2tg_jax.core.paths import smooth_path as smooth_path
     from a2tg_jax.core.similarity import Similarity as Similarity
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
     from a2tg_jax.measure.alignment import align_poses as align_poses
     from a2tg_jax.measure.alignment import color_fit as color_fit
     from a2tg_jax.measure.evaluation import evaluate as evaluate
+    from a2tg_jax.measure.metrics import load_lpips as load_lpips
     from a2tg_jax.measure.metrics import lpips as lpips
     from a2tg_jax.measure.metrics import parameter_bytes as parameter_bytes
     from a2tg_jax.measure.metrics import psnr as psnr
@@ -86,10 +88,10 @@ if TYPE_CHECKING:
     from a2tg_jax.model import concatenate as concatenate
     from a2tg_jax.render import RenderOutput as RenderOutput
     from a2tg_jax.render import RenderSettings as RenderSettings
-    from a2tg_jax.render import plan_render as plan_render
     from a2tg_jax.render import render_appearance as render_appearance
     from a2tg_jax.render import render_image as render_image
     from a2tg_jax.renderer import Renderer as Renderer
+    from a2tg_jax.renderer import plan_render as plan_render
     from a2tg_jax.systems.a2tg import A2tg as A2tg
     from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig
     from a2tg_jax.systems.bbsplat import BBSplat as BBSplat
@@ -109,6 +111,7 @@ if TYPE_CHECKING:
     from a2tg_jax.training import DivergedError as DivergedError
     from a2tg_jax.training import FitResult as FitResult
     from a2tg_jax.training import History as History
+    from a2tg_jax.training import Interrupted as Interrupted
     from a2tg_jax.training import LearningRates as LearningRates
     from a2tg_jax.training import LossConfig as LossConfig
     from a2tg_jax.training import Session as Session
@@ -148,6 +151,7 @@ _NAMES = {
     "a2tg_jax.core.gradient_statistics": ("GradientStatistics",),
     "a2tg_jax.core.optim": ("adam_init", "adam_update", "exponential_decay"),
     "a2tg_jax.core.origin": ("Origin",),
+    "a2tg_jax.core.overflow": ("CapacityWarning",),
     "a2tg_jax.core.paths": ("path_through", "smooth_path"),
     "a2tg_jax.core.similarity": ("Similarity",),
     "a2tg_jax.core.transform": ("transform_gaussians",),
@@ -168,10 +172,10 @@ _NAMES = {
     "a2tg_jax.mcmc": ("FillingMcmc", "Mcmc", "Noise", "grow", "perturb", "relocate"),
     "a2tg_jax.measure.alignment": ("align_poses", "color_fit"),
     "a2tg_jax.measure.evaluation": ("evaluate",),
-    "a2tg_jax.measure.metrics": ("lpips", "parameter_bytes", "psnr", "ssim"),
+    "a2tg_jax.measure.metrics": ("load_lpips", "lpips", "parameter_bytes", "psnr", "ssim"),
     "a2tg_jax.model": ("Model", "Parameters", "concatenate"),
-    "a2tg_jax.render": ("RenderOutput", "RenderSettings", "plan_render", "render_appearance", "render_image"),
-    "a2tg_jax.renderer": ("Renderer",),
+    "a2tg_jax.render": ("RenderOutput", "RenderSettings", "render_appearance", "render_image"),
+    "a2tg_jax.renderer": ("Renderer", "plan_render"),
     "a2tg_jax.systems.a2tg": ("A2tg", "TextureConfig"),
     "a2tg_jax.systems.bbsplat": ("BBSplat",),
     "a2tg_jax.systems.bytewise": ("Bytewise",),
@@ -186,6 +190,7 @@ _NAMES = {
         "DivergedError",
         "FitResult",
         "History",
+        "Interrupted",
         "LearningRates",
         "LossConfig",
         "Session",
@@ -210,11 +215,14 @@ _NAMES = {
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 _ROOMS = {module.split(".")[1] for module in _NAMES}
 __all__ = sorted(_MODULE_OF)
+__version__: str
 
 if not TYPE_CHECKING:  # Type checkers see the imports above, and that no other name exists.
 
     def __getattr__(name: str) -> Any:
         """Import a public name, or the room of some, at its first use."""
+        if name == "__version__":
+            return importlib.import_module("importlib.metadata").version("a2tg-jax")
         if name in _ROOMS:
             return importlib.import_module(f"{__name__}.{name}")
         if name not in _MODULE_OF:
@@ -223,4 +231,4 @@ if not TYPE_CHECKING:  # Type checkers see the imports above, and that no other 
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+        return sorted({*__all__, "__version__", *(name for name in globals() if name.startswith("__"))})

@@ -13,7 +13,7 @@ from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
 from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import short_repr
+from a2tg_jax.core.checks import check_kind, short_repr
 from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
@@ -38,7 +38,10 @@ class Parameters(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """Gaussians, their appearance with its parameters, and their origin."""
+    """Gaussians, their appearance with its parameters, and their origin.
+
+    Methods marked "(host)" read numbers of the device, and cannot be called under jit.
+    """
 
     gaussians: Gaussians
     """Allocated rows, of which the first `num_live` exist."""
@@ -52,6 +55,12 @@ class Model:
     """Kind of appearance, with its options."""
     origin: Origin | None = dataclasses.field(default=None, metadata={"static": True})
     """Training cameras and world; None if unknown."""
+
+    def __post_init__(self) -> None:
+        """Refuse other values of this library in place of Gaussians; transformations put values of their own there."""
+        is_ours = type(self.gaussians).__module__.startswith("a2tg_jax.")
+        if is_ours or isinstance(self.gaussians, str):
+            check_kind("gaussians", self.gaussians, Gaussians)
 
     @property
     def rule(self) -> AppearanceRule:
@@ -89,6 +98,8 @@ class Model:
 
     def with_parameters(self, parameters: Parameters) -> "Model":
         """Return the same model with other floats, of the same shapes."""
+        hint = "say model.parameters._replace(gaussians=gaussians)" if isinstance(parameters, Gaussians) else ""
+        check_kind("parameters", parameters, Parameters, hint)
         return dataclasses.replace(self, gaussians=parameters.gaussians, params=parameters.params)
 
     @property
@@ -177,7 +188,8 @@ class Model:
           camera: the view.
           features: [N, D] numbers to show in place of colours (`render_image`), one row for each allocated Gaussian.
           background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
-          settings: static options; `texture` is not used, for the appearance has options of its own.
+          settings: static options; `texture` is not used, for the appearance has options of its own. Under jit they
+            need a capacity: `plan_render(model, cameras)`.
         """
         background = self.background if background is None and features is None else background
         rule = with_features(self.rule, features, self.gaussians)
@@ -189,6 +201,12 @@ class Model:
         """Return the same model in the world that `similarity` leads to, with its cameras (host).
 
         View dependence turns with the world; all other parameters of the appearance stay.
+
+        Lengths of the settings are in units of the world: `near_plane` is 0.2 of the new units too. Scale it along for
+        the same image, which else may lack or show splats close to the camera:
+
+            moved = model.transform(similarity)
+            moved.render(moved.origin.cameras[0], settings=settings.transform(similarity))
         """
         turned = transform_gaussians(dataclasses.replace(self.gaussians, sh=jnp.asarray(self.sh)), similarity)
         model = self.with_sh(np.asarray(turned.sh))
@@ -222,6 +240,9 @@ class Model:
 
 def _indices(rows: Any, num: int) -> np.ndarray:
     """Return the indices of the rows that a mask, indices or a slice choose of `num`."""
+    if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
+        end = f"{rows + 1}" if rows != -1 else ""
+        raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian say model[{rows}:{end}]")
     chosen = rows if isinstance(rows, slice) else np.asarray(rows)
     if not isinstance(chosen, slice) and (chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu")):
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; got {chosen.dtype} {[*chosen.shape]}")
@@ -232,13 +253,13 @@ def _indices(rows: Any, num: int) -> np.ndarray:
 
 
 def concatenate(models: Sequence[Model]) -> Model:
-    """Return the Gaussians of several models as one model, in their order (host).
+    """Return the Gaussians of several models as one model, in their order.
 
     The models lie in one world: move them first (`Model.transform`). Spherical harmonics of lower degrees are filled
     up with zeros.
 
     Args:
-      models: at least one, of one appearance.
+      models: at least one, of the same appearance with the same options.
 
     Returns:
       The model of all Gaussians that exist; its origin is that of the first model.
@@ -246,16 +267,20 @@ def concatenate(models: Sequence[Model]) -> Model:
     Raises:
       ValueError: if there are no models, or they differ in their appearance or dtype.
     """
+    if not isinstance(models, Sequence) or not models:
+        raise ValueError("concatenate needs at least one model, in a list")
+    for index, model in enumerate(models):
+        check_kind(f"models[{index}]", model, Model)
     models = [model.live for model in models]
-    if not models:
-        raise ValueError("models must be one model at least; got none")
     first = models[0]
-    for name, found in (
-        ("appearance", [m.appearance for m in models]),
-        ("dtype", [m.gaussians.means.dtype for m in models]),
-    ):
-        if any(other != found[0] for other in found):
-            raise ValueError(f"models must have one {name}; got {', '.join(map(str, found))}")
+    if kinds := [type(m.appearance).__name__ for m in models if m.appearance != first.appearance]:
+        own = type(first.appearance).__name__
+        why = f"{own} and {kinds[0]}" if kinds[0] != own else f"{own} of different options"
+        raise ValueError(f"models must have one appearance; got {why}")
+    if dtypes := [
+        str(m.gaussians.means.dtype) for m in models if m.gaussians.means.dtype != first.gaussians.means.dtype
+    ]:
+        raise ValueError(f"models must have one dtype; got {first.gaussians.means.dtype} and {dtypes[0]}")
     highest = max(model.gaussians.sh.shape[1] for model in models)
     several = [_with_bases(model.gaussians, 0 if first.appearance.has_degrees else highest) for model in models]
     if len({gaussians.sh_degree for gaussians in several}) > 1:

@@ -6,7 +6,6 @@ the settings, which `plan_render` fills in.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,11 +22,13 @@ from a2tg_jax.appearance import (
     appearance_for,
 )
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
+from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of
 from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
+from a2tg_jax.core.overflow import OverflowWatch
+from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.rasterize.compositor import composite, refusal
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of
 from a2tg_jax.rasterize.kernels.native import composite as native
@@ -52,7 +53,8 @@ class RenderSettings:
     tile_size: int = 8
     """Side of a tile in pixels; it does not change the image."""
     near_plane: float = 0.2
-    """Least depth of visible splats and hits; positive."""
+    """Least depth of visible splats and hits, in units of the world; positive. If you scale the world, scale near_plane
+    by the same factor (`transform`)."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
@@ -60,7 +62,8 @@ class RenderSettings:
 
     A `Model` and a rule have their own options; this field is then not used."""
     capacity: int | None = None
-    """Largest number of (splat, tile) pairs. None: an eager call finds it, jit raises."""
+    """Largest number of (splat, tile) pairs, at least 1, as `plan_render` finds it. None: an eager call finds it, jit
+    raises. If it is too small, the image is only the background and `overflow` is True; an eager call then warns."""
     compositor: Wanted = "auto"
     """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
     and XLA with a warning if the others do not support the appearance rule. These are differentiated once, in reverse
@@ -71,6 +74,14 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if not self.near_plane > 0:
             raise ValueError(f"near_plane must be positive; got {self.near_plane}")
+        if isinstance(self.capacity, np.integer):
+            object.__setattr__(self, "capacity", int(self.capacity))
+        if self.capacity is not None and (type(self.capacity) is not int or self.capacity < 1):
+            raise ValueError(f"capacity must be an int, at least 1, or None; got {self.capacity!r}")
+
+    def transform(self, similarity: Similarity) -> "RenderSettings":
+        """Return settings that show a model in the world of `similarity` as these show it in its own."""
+        return dataclasses.replace(self, near_plane=self.near_plane * similarity.scale)
 
     @staticmethod
     def official() -> "RenderSettings":
@@ -90,7 +101,8 @@ class RenderOutput(NamedTuple):
     normal: Array
     """[H, W, 3] Σ n·α·T, in the world, facing the camera."""
     overflow: Array
-    """Whether the capacity was too small; the image is then only the background and must not be used."""
+    """Whether the capacity was too small; the image is then only the background and must not be used. Eager calls
+    warn of it (`CapacityWarning`), jitted ones cannot."""
     distortion: Array
     """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
 
@@ -153,10 +165,18 @@ def render_appearance(
     check_background(background, rule.num_colors)
     if num_live is not None:
         check_shape("num_live", num_live, ())
-    settings = with_capacity(settings, gaussians, camera, rule, num_live)
+    planned = with_capacity(settings, gaussians, camera, rule, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
-    output, _ = _jitted_render()(gaussians, camera, rule, background, settings, num_live=num_live)
+    output, _ = _jitted_render()(gaussians, camera, rule, background, planned, num_live=num_live)
+    if settings.capacity is not None:
+        kind = settings, camera.width, camera.height, gaussians.num
+        _overflow_watch().observe(output.overflow, settings.capacity, kind)
     return output
+
+
+@functools.cache
+def _overflow_watch() -> OverflowWatch:
+    return OverflowWatch()
 
 
 def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> AppearanceRule:
@@ -174,6 +194,17 @@ def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> 
     return Features(rule, jnp.asarray(features))
 
 
+def check_rule(rule: AppearanceRule) -> None:
+    """Raise ValueError unless a value is a rule, and it and the rules in it are pytrees."""
+    check_kind("rule", rule, AppearanceRule)
+    for leaf in jax.tree.leaves(rule):
+        if isinstance(leaf, AppearanceRule):
+            raise ValueError(
+                f"{type(leaf).__name__} is not a pytree: decorate it with @jax.tree_util.register_dataclass, above "
+                "@dataclasses.dataclass(frozen=True)"
+            )
+
+
 def check_background(background: Any, num_colors: int = 3) -> None:
     """Raise ValueError unless the background is one colour, of `num_colors` numbers."""
     if np.ndim(background) == 3:
@@ -181,6 +212,8 @@ def check_background(background: Any, num_colors: int = 3) -> None:
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
             "render on black and add (1 - output.alpha[..., None]) * image"
         )
+    if isinstance(background, str):
+        raise ValueError(f"background must be [{num_colors}] floats, such as (1, 1, 1) for white; got {background!r}")
     check_shape("background", background, (num_colors,))
 
 
@@ -282,46 +315,6 @@ def _output(
     return RenderOutput(color, alpha, depth, normal, overflow, distortion=alpha * squared - depth * depth)
 
 
-def plan_render(
-    gaussians: Gaussians,
-    cameras: Camera | Sequence[Camera],
-    textures: Textures | None = None,
-    layout: AtlasLayout | None = None,
-    *,
-    rule: AppearanceRule | None = None,
-    head_room: float = HEAD_ROOM,
-    settings: RenderSettings = RenderSettings(),
-) -> RenderSettings:
-    """Return the settings with a capacity that suffices for every camera, with head room (host).
-
-    Args:
-      gaussians: N Gaussians.
-      cameras: one or more.
-      textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
-      rule: appearance rule, instead of textures.
-      head_room: factor, at least 1, on the pairs of the fullest view.
-      settings: static options; their capacity is replaced.
-
-    Raises:
-      ValueError: if there is no camera, if both textures and a rule are given, or under jit and vmap, where shapes
-        are fixed.
-    """
-    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-    if not cameras:
-        raise ValueError("cameras must be one camera at least; got none")
-    if not head_room >= 1:
-        raise ValueError(f"head_room must be at least 1; got {head_room}")
-    check_gaussians(gaussians)
-    if rule is None:
-        rule = rule_of(gaussians, textures, layout, settings)
-    elif textures is not None or layout is not None:
-        raise ValueError("rule already says what the splats show: give it, or textures and layout")
-    for camera in cameras:
-        check_camera(camera)
-    most = max(pairs_of_view(gaussians, camera, rule, settings) for camera in cameras)
-    return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
-
-
 def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
     """Return a capacity with head room for a number of pairs, rounded up so that few shapes occur."""
     return max(1024, -(-int(pairs * head_room) // 1024) * 1024)
@@ -354,6 +347,7 @@ def pairs_of_view(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
 ) -> int:
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
+    check_rule(rule)
     try:
         return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
@@ -384,13 +378,15 @@ def with_capacity(
     Raises:
       ValueError: under jit or vmap without a capacity.
     """
+    check_kind("settings", settings, RenderSettings)
+    check_rule(rule)
     if settings.capacity is not None:
         return settings
     gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
-            "settings = plan_render(gaussians, cameras, textures, layout) outside, then pass settings=settings"
+            "settings = plan_render(model, cameras) outside, then pass settings=settings"
         )
     pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
     return dataclasses.replace(settings, capacity=capacity_for(pairs))

@@ -1,8 +1,8 @@
-"""A renderer for moving cameras: the host allocates room for the tile lists and keeps it while it suffices."""
+"""Room for tile lists: planned for given cameras, or kept and enlarged by a renderer for moving cameras (host)."""
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,10 +10,13 @@ from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
+from a2tg_jax.core.checks import check_kind
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.model import Model
 from a2tg_jax.render import (
+    HEAD_ROOM,
     RenderOutput,
     RenderSettings,
     appearance_of,
@@ -21,7 +24,9 @@ from a2tg_jax.render import (
     check_background,
     pairs_of_view,
     render_traced,
+    rule_of,
 )
+from a2tg_jax.texture import AtlasLayout, Textures
 
 FIRST_ROOM = 1.5
 """Head room over the first views."""
@@ -31,6 +36,53 @@ PLANNED_CAMERAS = 16
 """Number of a model's own cameras for which the first capacity is planned."""
 
 Size = tuple[int, int]
+
+
+def plan_render(
+    gaussians: Model | Gaussians,
+    cameras: Camera | Sequence[Camera],
+    textures: Textures | None = None,
+    layout: AtlasLayout | None = None,
+    *,
+    rule: AppearanceRule | None = None,
+    head_room: float = HEAD_ROOM,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> RenderSettings:
+    """Return the settings with a capacity that suffices for every camera, with head room.
+
+    Args:
+      gaussians: a model, alone; or N Gaussians.
+      cameras: one or more.
+      textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
+      rule: appearance rule of the Gaussians, instead of textures.
+      head_room: factor, at least 1, on the pairs of the fullest view.
+      settings: static options; their capacity is replaced.
+
+    Raises:
+      ValueError: if there is no camera, if textures or a rule are given beside a model or each other, or under jit and
+        vmap, where shapes are fixed.
+    """
+    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    if not cameras:
+        raise ValueError("cameras must be one camera at least; got none")
+    if not head_room >= 1:
+        raise ValueError(f"head_room must be at least 1; got {head_room}")
+    check_kind("settings", settings, RenderSettings)
+    num_live = None
+    if isinstance(gaussians, Model):
+        if not (rule is None and textures is None and layout is None):
+            raise ValueError("a model says itself what its splats show: say plan_render(model, cameras)")
+        model, gaussians = gaussians, gaussians.gaussians
+        rule, num_live = model.rule, model.num_live
+    check_gaussians(gaussians)
+    if rule is None:
+        rule = rule_of(gaussians, textures, layout, settings)
+    elif textures is not None or layout is not None:
+        raise ValueError("rule already says what the splats show: give it, or textures and layout")
+    for camera in cameras:
+        check_camera(camera)
+    most = max(pairs_of_view(gaussians, camera, rule, settings, num_live) for camera in cameras)
+    return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 
 class Renderer:
@@ -70,6 +122,8 @@ class Renderer:
         Raises:
           ValueError: if a rule is given beside a model, or an argument has a wrong shape.
         """
+        check_kind("model", model, (Model, Gaussians))
+        check_kind("settings", settings, RenderSettings)
         if isinstance(model, Model) and rule is not None:
             raise ValueError("rule: a model says itself what its splats show; give Gaussians with a rule")
         if not isinstance(model, Model):
@@ -87,8 +141,12 @@ class Renderer:
         """Capacities for (splat, tile) pairs by image size, (width, height)."""
         self._plan(list(cameras))
 
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{width}×{height}" for width, height in self.capacities) or "no size yet"
+        return f"Renderer({counted(self._gaussians.num, 'Gaussian')}, {sizes})"
+
     def __call__(self, camera: Camera) -> RenderOutput:
-        """Render the view of a camera (host); never an overflow."""
+        """Render the view of a camera; never an overflow."""
         check_camera(camera)
         size = camera.width, camera.height
         if size not in self.capacities:

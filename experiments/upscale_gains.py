@@ -28,7 +28,8 @@ from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.data import view_image
 from a2tg_jax.events import Change, Due, HostEvent, event
 from a2tg_jax.model import Model
-from a2tg_jax.render import plan_render, render_traced
+from a2tg_jax.render import render_traced
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.systems.bytewise import DetailTextureConfig
 from a2tg_jax.systems.stage1 import later_stage
 from a2tg_jax.training import Stage, fit_stage
@@ -159,7 +160,7 @@ def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
     textures, layout = a2tg.allocate_textures(sizes)
     background = jnp.asarray(background_of(scene) or (0.0, 0.0, 0.0))
     own = dataclasses.replace(model, params=textures, layout=layout, appearance=Textured(SIZE))
-    settings = plan_render(own.gaussians, [view.camera for view in scene.train], rule=own.rule)
+    settings = plan_render(own, [view.camera for view in scene.train])
     look = jax.jit(functools.partial(_look, settings=settings))
     sums: Any = None
     for index, view in enumerate(scene.train):

@@ -11,6 +11,7 @@ from a2tg_jax import (
     A2tg,
     Change,
     DivergedError,
+    Interrupted,
     StepEvent,
     event,
     fit,
@@ -120,9 +121,15 @@ def test_a_stop_between_any_two_steps_changes_nothing(scene, tmp_path, calls, st
         kept.append((checkpoint.stage, checkpoint.iteration))
         save_checkpoint(tmp_path / "checkpoint.npz", checkpoint)
 
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, system, on_checkpoint=keep, progress=False, is_stopped=lambda: next(left, None) is None)
+    rows = []
+    with pytest.raises(Interrupted, match=f"of stage {stage + 1}; the model is error.checkpoint.model") as stopped:
+        is_stopped = lambda: next(left, None) is None  # noqa: E731
+        fit(scene, system, on_checkpoint=keep, on_log=rows.append, progress=False, is_stopped=is_stopped)
     assert kept[-1][0] == stage and 0 < kept[-1][1] < 20 and kept[-1][1] % 10
+    saved, history = load_checkpoint(tmp_path / "checkpoint.npz"), stopped.value.checkpoint.history.to_dict()
+    jax.tree.map(np.testing.assert_array_equal, stopped.value.checkpoint.model, saved.model)
+    last = [row for row in rows if row["stage"] == stage + 1]
+    assert {name: [row[name] for row in last] for name in history} == jax.tree.map(list, history)
     resumed = fit(scene, system, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False)
     whole = fit(scene, system, progress=False)
     jax.tree.map(np.testing.assert_array_equal, resumed.model, whole.model)

@@ -85,7 +85,7 @@ def test_a_loop_by_hand_learns_and_upscales():
     gaussians = dataclasses.replace(as_gaussians(scene, "float32"), sh=jnp.zeros((50, 16, 3)))
     textures, layout = a2tg.allocate_textures(np.ones((50, 2), int))
     model = Model(gaussians, textures, layout, appearance=Textured())
-    settings = a2tg.plan_render(gaussians, cameras, rule=model.rule, head_room=4)
+    settings = a2tg.plan_render(model, cameras, head_room=4)
 
     @jax.jit
     def step(model, moments, statistics, camera, target):

@@ -13,7 +13,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.appearance import Billboards, Plain, Textured
 from a2tg_jax.data import View
 from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
-from a2tg_jax.render import plan_render
+from a2tg_jax.renderer import plan_render
 
 
 def some_views(model, camera, seed: int = 0, num: int = 3) -> list[View]:
@@ -55,7 +55,7 @@ def test_many_steps_are_at_the_least_error():
     # Half a grey above zero, no colour is cut off before or after.
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=0.1 * model.gaussians.sh))
     views = some_views(model, camera, num=2)
-    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    settings = plan_render(model, [view.camera for view in views])
     flat, unflatten = jax.flatten_util.ravel_pytree(colors_of(model))
     columns = [
         np.concatenate([np.ravel(draw_change(model, unflatten(unit), view.camera, settings)) for view in views])

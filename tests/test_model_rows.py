@@ -111,13 +111,13 @@ def test_mistakes_are_named():
         _ = model[np.ones(14, bool)]
     with pytest.raises(ValueError, match=r"rows must choose among 12 Gaussians: .*12"):
         _ = model[[0, 12]]
-    with pytest.raises(ValueError, match=r"rows must be a mask \[12\], indices or a slice; got int64 \[\]"):
-        _ = model[3]
+    with pytest.raises(ValueError, match=r"rows must be a mask \[12\], indices or a slice; got int64 \[1, 1\]"):
+        _ = model[[[3]]]
     with pytest.raises(ValueError, match=r"rows must be .*; got float64 \[1\]"):
         _ = model[[0.5]]
-    with pytest.raises(ValueError, match=r"models must be one model at least"):
+    with pytest.raises(ValueError, match="concatenate needs at least one model"):
         concatenate([])
-    with pytest.raises(ValueError, match=r"models must have one appearance; got Plain.*, MovableKernels"):
+    with pytest.raises(ValueError, match="one appearance; got Plain and MovableKernels"):
         concatenate([model, some_model("movable kernels")])
 
 

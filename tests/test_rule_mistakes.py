@@ -134,3 +134,15 @@ def test_what_takes_scalars_only_is_applied_pixel_by_pixel(whole, by_hand):
     found = jax.value_and_grad(total, argnums=(1, 2))(rule, u, v)
     wanted = jax.value_and_grad(total, argnums=(1, 2))(by_hand, u, v)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), found, wanted)
+
+
+def test_a_rule_that_is_no_pytree_is_named():
+    loose = dataclasses.dataclass(frozen=True)(type("Loose", (PlainRule,), {}))
+    with pytest.raises(ValueError, match="Loose is not a pytree: decorate it with @jax"):
+        drawn(loose())
+
+
+def test_a_branch_on_a_number_names_jnp_where():
+    with pytest.raises(jax.errors.TracerBoolConversionError) as caught:
+        drawn(with_shade(lambda u, v: (None, u) if u > 0 else (None, v)))
+    assert "use jnp.where in place of if" in "".join(caught.value.__notes__)

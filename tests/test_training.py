@@ -185,7 +185,7 @@ def test_events_that_the_host_decides_are_those_of_the_step(scene, trained, monk
 
 def test_checkpoint_of_another_configuration_is_refused(scene, trained):
     other = dataclasses.replace(CONFIG, seed=4)
-    with pytest.raises(ValueError, match="another configuration"):
+    with pytest.raises(ValueError, match=rf"another configuration \(seed {CONFIG.seed}, not 4\): resume"):
         fit(scene, other, resume=trained[1][0], progress=False)
 
 
@@ -282,7 +282,7 @@ def test_damaged_scenes_are_refused(scene, change, message):
 
 def test_wrong_arguments_of_fit_are_refused(scene, trained):
     checkpoint = trained[1][-1]
-    with pytest.raises(ValueError, match="another configuration"):
+    with pytest.raises(ValueError, match=r"another configuration \(A2tg, not Gaussians2dMcmc\)"):
         fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint, progress=False)
     with pytest.raises(ValueError, match="checkpoint_every must be at least 1; got 0"):
         fit(scene, CONFIG, checkpoint_every=0, progress=False)

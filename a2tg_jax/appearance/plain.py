@@ -2,8 +2,11 @@
 
 import dataclasses
 
+import jax
+
 from a2tg_jax.appearance.base import Appearance
 from a2tg_jax.appearance.rule import PlainRule
+from a2tg_jax.core.checks import described
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,4 +25,9 @@ class Plain(Appearance):
         return True
 
     def rule(self, params: tuple[()], layout: tuple[()]) -> PlainRule:
+        if jax.tree.leaves((params, layout)):
+            raise ValueError(
+                f"model.params must be () for the appearance Plain; got {described(params)}: give the appearance that "
+                "they belong to, as in Model(gaussians, textures, layout, appearance=Textured())"
+            )
         return PlainRule(max_alpha=self.max_alpha)

@@ -87,6 +87,8 @@ def _traced(static: StaticRule, function: str, functions: dict[str, tuple[Any, .
             f"This happened in {static.name}.{function}, which is called with scalars of {arguments.dtype}: "
             f"K = {arguments.num_numbers} numbers, and C = {arguments.num_values} texture values."
         )
+        if isinstance(error, jax.errors.TracerBoolConversionError):
+            error.add_note("Its numbers have no values yet: use jnp.where in place of if.")
         raise
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, short_repr
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_kind, short_repr
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
@@ -17,6 +17,8 @@ LARGEST_OFFSET = 100.0
 """Largest distance of the principal point from the image's corner, in units of the longer side."""
 MAX_SKEW = 1e-2
 """Largest deviation of a rotation from an orthonormal matrix that still passes as rounding."""
+MAX_DRIFT = 5e-2
+"""Largest deviation of a rendered camera's rotation from an orthonormal matrix, such as gradient steps leave."""
 LARGEST_COORDINATE = LARGEST_NUMBER
 """Largest coordinate of a camera or a point, in any world."""
 
@@ -24,16 +26,25 @@ LARGEST_COORDINATE = LARGEST_NUMBER
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """One view. `viewmat` and `K` are differentiable; the image size is static."""
+    """One view: a pinhole camera in OpenCV's frame, x right, y down, z forward; pixel centres lie at +0.5.
+
+    `viewmat` and `K` are differentiable; the image size is static.
+    """
 
     viewmat: Array
-    """[4, 4] world to camera, a rigid motion."""
+    """[4, 4] world to camera, a rigid motion: x_camera = viewmat[:3, :3] · x_world + viewmat[:3, 3]."""
     K: Array
     """[3, 3] intrinsics in pixels, last row (0, 0, 1)."""
     width: int = dataclasses.field(metadata={"static": True})
     """Image width in pixels."""
     height: int = dataclasses.field(metadata={"static": True})
     """Image height in pixels."""
+
+    def __post_init__(self) -> None:
+        """Convert sides of numpy's integers to Python's."""
+        for side in ("width", "height"):
+            if isinstance(getattr(self, side), np.integer):
+                object.__setattr__(self, side, int(getattr(self, side)))
 
     @property
     def center(self) -> Array:
@@ -45,15 +56,38 @@ class Camera:
 
 
 def check_camera(camera: Camera, name: str = "camera") -> None:
-    """Raise ValueError, naming the field, unless the matrices have their shapes and the image a size."""
-    if not isinstance(camera, Camera):
-        raise ValueError(f"{name} must be a Camera; got {type(camera).__name__}")
-    check_floats(f"{name}.viewmat", camera.viewmat, (4, 4))
-    check_floats(f"{name}.K", camera.K, (3, 3))
+    """Raise ValueError, naming the field, unless the matrices have their shapes and the image a size.
+
+    The pose must be a rigid motion, which is checked outside jit, vmap and grad.
+    """
+    check_kind(name, camera, Camera, "use view.camera" if hasattr(camera, "camera") else "")
+    for field, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
+        value = getattr(camera, field)
+        if isinstance(value, list | tuple):
+            raise ValueError(f"{name}.{field} must be an array; got {type(value).__name__}: use jnp.asarray")
+        check_floats(f"{name}.{field}", value, shape)
     for side in ("width", "height"):
         value = getattr(camera, side)
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name}.{side} must be a positive number of pixels; got {value!r}")
+        if not isinstance(value, int) or value < 1:
+            kind = "" if isinstance(value, int) else ", a Python int"
+            raise ValueError(f"{name}.{side} must be a positive number of pixels{kind}; got {value!r}")
+    _check_rigid(camera.viewmat, f"{name}.viewmat")
+
+
+def _check_rigid(viewmat: Array, name: str) -> None:
+    """Raise ValueError unless a matrix with values is a rigid motion, up to drift; one with NaN passes."""
+    if isinstance(viewmat, jax.core.Tracer):
+        return
+    values = np.asarray(viewmat, np.float64)
+    rotation = values[:3, :3]
+    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    wanted = f"{name} must be a rigid motion, world to camera, OpenCV axes (x right, y down, z forward)"
+    if skew > MAX_DRIFT:
+        raise ValueError(f"{wanted}; its rotation R has entries of R·Rᵀ − I up to {skew:.2g}")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError(f"{wanted}; its rotation mirrors, with a determinant of −1")
+    if np.abs(values[3] - [0, 0, 0, 1]).max() > MAX_DRIFT:
+        raise ValueError(f"{wanted}; its last row must be 0, 0, 0, 1, and is {_numbers(values[3])}")
 
 
 def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, what: str) -> None:

@@ -18,6 +18,25 @@ Wanted = tuple[int | str, ...]
 """Sizes of the axes of an array: numbers, or letters for any size, such as ("N", 16, 3)."""
 
 
+def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str = "") -> None:
+    """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several."""
+    if isinstance(value, kind):
+        return
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    raise ValueError(f"{name} must be {' or '.join(map(_noun, kinds))}; got {_kind_of(value)}{hint and f': {hint}'}")
+
+
+def _noun(kind: type) -> str:
+    """Return the name of a class with its article; a plural, such as Gaussians, has none."""
+    article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOU" else "a "
+    return f"{article}{kind.__name__}"
+
+
+def _kind_of(value: Any) -> str:
+    """Return the class of a value in errors; a class itself by its name."""
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
 def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     """Raise ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
 

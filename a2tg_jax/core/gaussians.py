@@ -20,6 +20,8 @@ from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
 INITIAL_OPACITY = 0.1
+COLOR_SLACK = 1e-3
+"""Rounding by which colours may leave [0, 1]."""
 SH_C0 = 0.28209479177387814
 
 
@@ -116,6 +118,15 @@ def logit(p: Array) -> Array:
     return jnp.log(p) - jnp.log1p(-p)
 
 
+def check_unit_colors(name: str, colors: ArrayLike) -> None:
+    """Raise ValueError if colours are an array of integers, such as bytes, or outside [0, 1]; NaN passes."""
+    values = np.asarray(colors)
+    if hasattr(colors, "dtype") and not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"{name} must be floats in [0, 1]; got {values.dtype}: divide bytes by 255")
+    if (outside := values[(values < -COLOR_SLACK) | (values > 1 + COLOR_SLACK)]).size:
+        raise ValueError(f"{name} must lie in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
+
+
 def init_from_points(
     points: ArrayLike,
     colors: ArrayLike,
@@ -132,7 +143,7 @@ def init_from_points(
 
     Args:
       points: [P, 3] positions, P >= 2.
-      colors: [P, 3] colours in [0, 1].
+      colors: [P, 3] floats, colours in [0, 1].
       num: number of Gaussians, at least 2; fewer than P are drawn without replacement, None takes all points.
       seed: seed of the drawing and the rotations.
       opacity: initial opacity, between 0 and 1.
@@ -142,8 +153,10 @@ def init_from_points(
       float32 Gaussians, min(num, P) of them.
 
     Raises:
-      ValueError: if the shapes disagree, there are fewer than two points, or a number is not finite.
+      ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, or colours are an
+        array of integers or outside [0, 1].
     """
+    check_unit_colors("colors", colors)
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
 from a2tg_jax.core.similarity import camera_centers
 
 SMOOTHING = 0.06
@@ -30,6 +30,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are fewer than two cameras or no frames.
     """
+    _check_cameras("cameras", cameras)
     if len(cameras) < 2 or num_frames < 1:
         raise ValueError(f"a path needs two cameras and a frame; got {len(cameras)} cameras, {num_frames} frames")
     viewmats = np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
@@ -57,6 +58,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are no views or no frames.
     """
+    _check_cameras("views", views)
     if not views or num_frames < 1:
         raise ValueError(f"a path needs a view and a frame; got {len(views)} views, {num_frames} frames")
     first = views[0]
@@ -80,6 +82,15 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
         Camera(jnp.asarray(_viewmat(R, c), dtype), jnp.asarray(K, dtype), *size)
         for R, c, K in zip(turned, places, lenses, strict=True)
     ]
+
+
+def _check_cameras(name: str, cameras: Sequence[Camera]) -> None:
+    """Raise ValueError unless all items of a sequence are cameras."""
+    if not isinstance(cameras, Sequence):
+        found = type(cameras).__name__
+        raise ValueError(f"{name} must be a list of cameras, such as model.origin.cameras; got {found}")
+    for index, camera in enumerate(cameras):
+        check_camera(camera, f"{name}[{index}]")
 
 
 def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:

@@ -138,6 +138,14 @@ class PointCloud:
     """[P, 3] uint8."""
 
 
+def check_are_views(views: Sequence[View], call: str) -> None:
+    """Raise ValueError, which shows the right call, unless the views are a list or a tuple of views."""
+    is_list = isinstance(views, list | tuple)
+    odd = next((item for item in views if not isinstance(item, View)), None) if is_list else views
+    if odd is not None:
+        raise ValueError(f"views must be views, such as scene.train; got {type(odd).__name__}: say {call}")
+
+
 def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
     """Return the cameras and the world of a scene, training views first."""
     views = [*scene.train, *scene.test]

@@ -23,7 +23,8 @@ from a2tg_jax.data import View, counted_pixels, views_by_size
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.renderer import plan_render
 
 
 @event
@@ -87,7 +88,7 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
     total = np.zeros(model.gaussians.num)
     if not len(total):
         return total
-    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    settings = plan_render(model, [view.camera for view in views])
     # Programs are compiled for a capacity: for few of them.
     settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
     dtype = model.gaussians.means.dtype

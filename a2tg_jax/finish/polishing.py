@@ -19,11 +19,14 @@ from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
+from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import Textures
 
 HIGHEST_DEGREE = 3
@@ -54,7 +57,7 @@ class Targets(NamedTuple):
 def polish(
     model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: Any = None
 ) -> Model:
-    """Return the model with colours that lower the squared error over the views (host).
+    """Return the model with colours that lower the squared error over the views.
 
     Args:
       model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
@@ -70,7 +73,7 @@ def polish(
     _check(model, views)
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
-    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    settings = plan_render(model, [view.camera for view in views])
     groups = _stacked(views, background)
     changes = _jitted()(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
@@ -163,6 +166,8 @@ def with_colors(model: Model, colors: Colors) -> Model:
 
 
 def _check(model: Model, views: Sequence[View]) -> None:
+    check_kind("model", model, Model, "say polish(model, scene.train)")
+    check_are_views(views, "polish(model, scene.train)")
     if not views:
         raise ValueError("views must hold at least one view; got none")
     if not model.appearance.is_linear:

@@ -24,7 +24,8 @@ from a2tg_jax.core.jit import Jitted
 from a2tg_jax.data import View
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
 
 LEAST_OPACITY = 1e-4
@@ -218,7 +219,7 @@ def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textu
       background: [3] colour.
     """
     assert model.textures is not None
-    settings = plan_render(model.gaussians, [view.camera for view in views], rule=model.rule)
+    settings = plan_render(model, [view.camera for view in views])
     background = jnp.asarray(background, model.gaussians.means.dtype)
     total: Textures = jax.tree.map(jnp.zeros_like, model.textures[0])
     for index, view in enumerate(views):

@@ -63,6 +63,24 @@ def noted() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
+def ctrl_c_noted() -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C within the block; the second raises KeyboardInterrupt.
+
+    Yield a function that returns whether there was one. Programs that handle Ctrl-C themselves keep their handler.
+    """
+    numbers: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        numbers.append(number)
+        if len(numbers) > 1:
+            raise KeyboardInterrupt
+
+    is_own = signal.getsignal(CTRL_C) is not signal.default_int_handler
+    with contextlib.nullcontext() if is_own else _handled_by(note, (CTRL_C,)):
+        yield lambda: bool(numbers)
+
+
+@contextlib.contextmanager
 def _handled_by(handler: Callable[..., Any], numbers: tuple[int, ...]) -> Iterator[None]:
     """Install a handler within the block. Ignored signals, such as SIGHUP under nohup, stay ignored; other threads
     install none."""

@@ -39,6 +39,7 @@ from a2tg_jax.io.model_file import (
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
 from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
+from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
@@ -111,6 +112,7 @@ def save_compact(path: str | os.PathLike[str], model: Model, *, choices: Compact
       ValueError: if the model shows anything else, has a number that is not finite or too large, or a
         choice cannot be.
     """
+    check_saved(path, model, "save_compact")
     data = encode_model(model, choices)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
@@ -123,6 +125,7 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a compact scene, is damaged, or is of another version.
     """
+    check_suffix(path, "load_compact")
     path = Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such compact scene")

@@ -49,6 +49,29 @@ def config_from_dict(
     return kind(**values, **given)
 
 
+def changed_config(config: ConfigT, changes: Mapping[str, Any], where: str) -> ConfigT:
+    """Return a dataclass with some fields changed, those of nested dataclasses by nested dictionaries.
+
+    Raises:
+      ValueError: naming the field, if it is unknown or of another type.
+    """
+    return config_from_dict(type(config), merged(config_to_dict(config), _plain(changes)), where)
+
+
+def _plain(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return changes with the values in nested dictionaries as JSON has them."""
+    return {name: _plain(value) if isinstance(value, Mapping) else _to_json(value) for name, value in changes.items()}
+
+
+def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested options with some of them changed."""
+    result = dict(values)
+    for name, change in changes.items():
+        is_group = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
+        result[name] = merged(values[name], change) if is_group else change
+    return result
+
+
 def has_default(field: dataclasses.Field[Any]) -> bool:
     """Return whether a field of a dataclass need not be given."""
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING

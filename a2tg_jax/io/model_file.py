@@ -24,6 +24,7 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
@@ -44,9 +45,10 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
       header: JSON-able values to keep along; `read_archive_header` returns them.
 
     Raises:
-      ValueError: if `load_model` would refuse it, as it does numbers that are not finite, or the options of the
-        appearance cannot be written as JSON.
+      ValueError: if the suffix is another format's, if `load_model` would refuse the model, as it does numbers that
+        are not finite, or if the options of the appearance cannot be written as JSON.
     """
+    check_saved(path, model, "save_model")
     check_gaussians(model.gaussians, "model.gaussians")
     model = model.live
     check_model(model)
@@ -74,6 +76,7 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a model, is damaged, is of another version, or shows a class that is not known here.
     """
+    check_suffix(path, "load_model")
     header, arrays = read_archive(path, format=FORMAT)
     try:
         return _model_of(header, arrays, appearances)

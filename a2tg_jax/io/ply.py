@@ -26,6 +26,7 @@ from a2tg_jax.data.ply_header import read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.ply_packed import is_packed, read_packed
+from a2tg_jax.io.suffixes import check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
@@ -65,6 +66,7 @@ def save_ply(
     Raises:
       ValueError: if a field of the Gaussians has another shape than it must have.
     """
+    check_suffix(path, "save_ply")
     if isinstance(gaussians, Model):
         model = gaussians.live
         gaussians = _as_plain(model)
@@ -119,6 +121,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a binary little-endian PLY, is cut off, lacks an attribute, or a number is not finite.
     """
+    check_suffix(path, "load_ply")
     path = Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such PLY file")
@@ -126,10 +129,23 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
         vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
     gaussians = _gaussians_of(vertices, path)
     try:
+        _check_rows(gaussians)
         check_model(Model(gaussians))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return gaussians
+
+
+def _check_rows(gaussians: Gaussians) -> None:
+    """Raise ValueError, naming a field, the number of rows and the first of them, if some are not finite."""
+    for field in dataclasses.fields(gaussians):
+        rows = np.asarray(getattr(gaussians, field.name))
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))))
+        if len(bad):
+            raise ValueError(
+                f"gaussians.{field.name} must be finite; {len(bad):,} of {gaussians.num:,} rows have NaN or infinite "
+                f"numbers, the first is row {bad[0]:,} (from 0)"
+            )
 
 
 def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:

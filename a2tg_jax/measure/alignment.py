@@ -22,7 +22,8 @@ from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import View, view_image
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, plan_render, render_traced
+from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 
 NUM_STEPS = 100
@@ -74,7 +75,7 @@ def align_poses(
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
     cameras = [view.camera for view in views]
-    planned = plan_render(model.gaussians, cameras, rule=model.rule, head_room=HEAD_ROOM, settings=settings)
+    planned = plan_render(model, cameras, head_room=HEAD_ROOM, settings=settings)
     return tuple(_aligned(view, model, background, planned, num_steps) for view in views)
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.display import counted
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View, view_image
+from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.measure.alignment import color_fit
 from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim
 from a2tg_jax.model import Model
@@ -100,7 +101,7 @@ def evaluate(
     num_renders: int = 0,
     fit_colors: bool = False,
 ) -> Evaluation:
-    """Render every view and compares it with its photograph, where its pixels count (host).
+    """Render every view and compare it with its photograph, where its pixels count.
 
     Args:
       views: at least one.
@@ -116,6 +117,7 @@ def evaluate(
       ValueError: if there are no views, or a model is given with textures.
       FileNotFoundError: if `lpips_weights` is not there.
     """
+    check_are_views(views, "evaluate(scene.test, model)")
     if not views:
         raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
     weights = None if lpips_weights is None else load_lpips(lpips_weights)
@@ -150,6 +152,7 @@ def _model_of(
         if textures is not None or layout is not None:
             raise ValueError("textures and layout are part of a model: give the model alone")
         return gaussians
+    check_gaussians(gaussians)
     appearance = appearance_of(gaussians, textures, layout, settings)
     if textures is None:
         return Model(gaussians, appearance=appearance)

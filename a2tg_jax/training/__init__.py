@@ -2,6 +2,7 @@
 
 from a2tg_jax.training.checkpoint import Checkpoint as Checkpoint
 from a2tg_jax.training.checkpoint import History as History
+from a2tg_jax.training.checkpoint import Interrupted as Interrupted
 from a2tg_jax.training.checkpoint import load_checkpoint as load_checkpoint
 from a2tg_jax.training.checkpoint import save_checkpoint as save_checkpoint
 from a2tg_jax.training.divergence import DivergedError as DivergedError

@@ -55,6 +55,10 @@ class History:
             return f"History({rows})"
         return f"History({rows} to iteration {self.iteration[-1]:,} of stage {self.stage[-1]}, {self.psnr[-1]:.2f} dB)"
 
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Return the columns by name, as `pandas.DataFrame` takes them."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
     @property
     def last_seconds(self) -> float:
         return float(self.seconds[-1]) if len(self.seconds) else 0.0
@@ -126,6 +130,20 @@ class Checkpoint:
     def __repr__(self) -> str:
         at = f"stage {self.stage + 1}, iteration {self.iteration:,}"
         return f"Checkpoint({type(self.system).__name__}, {at}, {counted(self.state.model.num, 'Gaussian')})"
+
+
+class Interrupted(KeyboardInterrupt):
+    """Training was stopped between two iterations. It can go on from the checkpoint."""
+
+    def __init__(self, checkpoint: Checkpoint):
+        """Args:
+        checkpoint: the state after the last iteration; `checkpoint.model` is its model.
+        """
+        super().__init__(
+            f"training stopped after iteration {checkpoint.iteration:,} of stage {checkpoint.stage + 1}; the model is "
+            "error.checkpoint.model, and fit(scene, system, resume=error.checkpoint) goes on"
+        )
+        self.checkpoint = checkpoint
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:

@@ -1,17 +1,21 @@
 """Training from photographs: the stages of a system, each from the result of the one before."""
 
 import dataclasses
+import os
 import warnings
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, origin_of_scene
+from a2tg_jax.host import signals
+from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
-from a2tg_jax.training.loop import IsStopped, OnCheckpoint, StageRun, Watch, check_resume, never, unwatched
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, check_resume, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
@@ -85,6 +89,7 @@ def fit(
     resume: Checkpoint | None = None,
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
+    on_log: OnLog | None = None,
     progress: bool = True,
     is_stopped: IsStopped = never,
     session: Session | None = None,
@@ -98,36 +103,54 @@ def fit(
       on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
         iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
+      on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
+        the fields of `History`.
       progress: show a progress bar.
-      is_stopped: asked between steps. If it returns True, `on_checkpoint` is called a last time and KeyboardInterrupt
-        is raised.
+      is_stopped: asked between steps. If it returns True, `on_checkpoint` is called a last time and `Interrupted` is
+        raised. The first Ctrl-C does the same, unless the program handles it.
       session: shapes that trainings of this process share; None: a new one.
 
     Raises:
+      Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to go on from.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
       ValueError: if options contradict each other or the checkpoint.
     """
-    system.check()
+    _check_arguments(scene, system, resume)
     if resume is not None:
         check_resume(resume, system, resume.stage)
     session = Session() if session is None else session
     first = 0 if resume is None else resume.stage
     results: list[StageResult] = []
-    for index in range(first, len(system.stages())):
-        result = fit_stage(
-            scene,
-            system,
-            index,
-            results[-1].model if results else None,
-            resume=resume if index == first else None,
-            on_checkpoint=on_checkpoint,
-            checkpoint_every=checkpoint_every,
-            progress=progress,
-            is_stopped=is_stopped,
-            session=session,
-        )
-        results.append(result)
+    with signals.ctrl_c_noted() as is_interrupted:
+        for index in range(first, len(system.stages())):
+            result = fit_stage(
+                scene,
+                system,
+                index,
+                results[-1].model if results else None,
+                resume=resume if index == first else None,
+                on_checkpoint=on_checkpoint,
+                checkpoint_every=checkpoint_every,
+                on_log=on_log,
+                progress=progress,
+                is_stopped=lambda: is_interrupted() or is_stopped(),
+                session=session,
+            )
+            results.append(result)
     return FitResult(system, tuple(results))
+
+
+def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
+    """Raise ValueError unless the arguments are of their classes and the options are valid."""
+    is_path = str, os.PathLike
+    check_kind("scene", scene, Scene, f"say load_scene({shortened(scene)!r})" if isinstance(scene, is_path) else "")
+    if isinstance(system, str):
+        raise ValueError(f"system must be a System; got a name: say find_system({shortened(system)!r}).preset('quick')")
+    example = f"say {system.__name__}() or {system.__name__}.preset('quick')" if isinstance(system, type) else ""
+    check_kind("system", system, System, example)
+    if resume is not None:
+        check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
+    system.check()
 
 
 def fit_stage(
@@ -139,6 +162,7 @@ def fit_stage(
     resume: Checkpoint | None = None,
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
+    on_log: OnLog | None = None,
     progress: bool = True,
     title: str | None = None,
     is_stopped: IsStopped = never,
@@ -156,7 +180,7 @@ def fit_stage(
         views. None: that of the checkpoint, or 0.
       watch: called between steps with the stage under way (`training.loop.Watch`).
     """
-    system.check()
+    _check_arguments(scene, system, resume)
     if not 0 <= index < len(system.stages()):
         raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
     if checkpoint_every is not None and checkpoint_every < 1:
@@ -166,6 +190,7 @@ def fit_stage(
         start = initial_model(scene, system)
     with system.naming_options():
         run = StageRun(scene, system, index, start, resume, num_restored, session)
+        run.on_log = on_log
         run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
     origin = origin_of_scene(scene, BACKGROUNDS[system.background])
     origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_camera
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
@@ -109,6 +110,7 @@ def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callab
     differentiate = jax.value_and_grad(of_parameters, has_aux=has_aux)
 
     def of_model(model: Model, *args: Any, **kwargs: Any) -> tuple[Any, Parameters]:
+        check_kind("model", model, Model, "jax.value_and_grad differentiates in arrays")
         return differentiate(model.parameters, model, *args, **kwargs)
 
     return of_model

@@ -7,7 +7,7 @@ after it stay idle (`step.TrainState.status`); the loop mends the cause and laun
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -16,10 +16,12 @@ import numpy as np
 
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, HostEvent, StepEvent
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
-from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog
+from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.learning import LearningCheck
@@ -43,12 +45,16 @@ from a2tg_jax.training.step import (
 LAUNCHED = 10
 """Number of steps between two waits for the device; fewer if their photographs take too much memory."""
 LOG_EVERY = 10
+MOST_TOLD = 300
+"""Largest number of characters of the options that differ from a checkpoint's."""
 PLANNED_VIEWS = 64
 GROWTH_ROOM = 1.5
 """Room in the lists of a stage, as a multiple of the pairs of the first image."""
 
 OnCheckpoint = Callable[[Checkpoint], None]
+OnLog = Callable[[Mapping[str, float]], object]
 IsStopped = Callable[[], bool]
+HISTORY_COLUMNS = tuple(History.empty().to_dict())
 
 
 def never() -> bool:
@@ -134,6 +140,8 @@ class StageRun:
         )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}
+        self.on_log: OnLog | None = None
+        """Called with each row of the history."""
         self.started = time.perf_counter()
         self.num_regrown = self.num_refused = self.num_compiled = 0
 
@@ -166,7 +174,7 @@ class StageRun:
         watch: Watch = unwatched,
     ) -> None:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
-        KeyboardInterrupt.
+        `Interrupted`.
         """
         try:
             self._train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
@@ -201,7 +209,7 @@ class StageRun:
                 if on_checkpoint is not None and (is_due or is_asked or iteration == end):
                     on_checkpoint(self.checkpoint)
                 if is_stopped() and iteration < end:
-                    raise KeyboardInterrupt
+                    raise Interrupted(self.checkpoint)
         if self.num_refused:
             advice = "; or ".join(self._told_by_events("refused"))
             warnings.warn(
@@ -303,10 +311,13 @@ class StageRun:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
             model = self.state.model
             num_bytes = model.bytes_of(int(info.num_live))
-            self._logged.add(
+            row = (
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
                 num_bytes / 1e6, self.seconds,
             )  # fmt: skip
+            self._logged.add(*row)
+            if self.on_log is not None:
+                self.on_log(dict(zip(HISTORY_COLUMNS, row, strict=True)))
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:
@@ -361,10 +372,22 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
     if resume.stage != index:
         raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
     if resume.system != system:
-        raise ValueError("the checkpoint was made with another configuration: resume with checkpoint.system")
+        raise ValueError(
+            f"the checkpoint was made with another configuration ({_differing(resume.system, system)}): resume with "
+            "checkpoint.system"
+        )
     found, wanted = resume.state.model.gaussians.sh_degree, system.initial_sh_degree
     if found != wanted:
         raise ValueError(
             f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
             "version, so train anew"
         )
+
+
+def _differing(before: System, now: System) -> str:
+    """Return the options in which two systems differ, in a few words."""
+    if type(before) is not type(now):
+        return f"{type(before).__name__}, not {type(now).__name__}"
+    values, others = flatten_config(before), flatten_config(now)
+    pairs = ((name, value, others[name]) for name, value in values.items() if value != others[name])
+    return shortened(", ".join(f"{name} {value!r}, not {other!r}" for name, value, other in pairs), MOST_TOLD)

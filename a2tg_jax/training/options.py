@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.events import Event, FieldError, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.io.config_json import changed_config, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
 from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
@@ -167,11 +167,17 @@ class System:
         raise NotImplementedError(f"{type(self).__name__} must compose its stages")
 
     @classmethod
-    def preset(cls, name: str) -> Self:
-        """Return the options of a preset: "paper", "quick" or "smoke".
+    def preset(cls, name: str, **options: Any) -> Self:
+        """Return the options of a preset, some of them changed.
+
+            A2tg.preset("quick", stage1_iterations=10, texture={"cap": 8})
+
+        Args:
+          name: "paper", "quick" or "smoke".
+          **options: other values of options; those of a group as a dictionary.
 
         Raises:
-          ValueError: if there is no such preset.
+          ValueError: if there is no such preset, or an option is unknown or of another type.
         """
         presets = cls.presets()
         if name not in presets:
@@ -179,7 +185,7 @@ class System:
                 f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {shortened(name)!r}"
                 f"{did_you_mean(name, presets)}"
             )
-        return presets[name]
+        return changed_config(presets[name], options, cls.__name__) if options else presets[name]
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
@@ -198,6 +204,8 @@ class System:
 
     def _check_stages(self) -> None:
         stages = self.stages()
+        if not isinstance(stages, tuple | list) or not all(isinstance(stage, Stage) for stage in stages):
+            raise ValueError(f"{type(self).__name__}.stages must return a tuple of stages; got {shortened(stages)}")
         if not stages:
             raise ValueError(f"{type(self).__name__} has no stages")
         names = [stage.name for stage in stages]

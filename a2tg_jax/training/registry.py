@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
 SYSTEMS = {
@@ -109,16 +109,7 @@ def with_changes(system: System, changes: Mapping[str, Any], where: str) -> Syst
     Raises:
       ValueError: naming the option, if it is unknown or of another type.
     """
-    return config_from_dict(type(system), merged(config_to_dict(system), changes), where)
-
-
-def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested options with some of them changed."""
-    result = dict(values)
-    for name, change in changes.items():
-        is_group = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
-        result[name] = merged(values[name], change) if is_group else change
-    return result
+    return changed_config(system, changes, where)
 
 
 def differences(system: System) -> dict[str, Any]:

@@ -15,7 +15,8 @@ from typing import Any
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.host.text import did_you_mean
-from a2tg_jax.training.registry import merged, with_changes
+from a2tg_jax.io.config_json import merged
+from a2tg_jax.training.registry import with_changes
 from lab.jobs import Job, Record
 from lab.scenes import SceneAt, chosen_scenes, read_scenes
 

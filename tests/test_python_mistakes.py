@@ -1,0 +1,235 @@
+"""Mistakes of a caller of the library: each is an error or a warning that says what was wanted."""
+
+import dataclasses
+import re
+import signal
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_models import some_model
+from small_values import some_gaussians, some_world
+
+import a2tg_jax as a2tg
+from a2tg_jax.host import signals
+
+CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
+
+
+def crowd() -> a2tg.Model:
+    """Return Gaussians that lie in more tiles than a capacity of 1 has room for."""
+    return a2tg.Model(some_gaussians(40))
+
+
+def with_pose(matrix) -> a2tg.Camera:
+    return dataclasses.replace(CAMERA, viewmat=jnp.asarray(matrix, jnp.float32))
+
+
+def test_an_eager_render_with_too_small_a_capacity_warns_and_a_jitted_one_cannot():
+    model, settings = crowd(), a2tg.RenderSettings(capacity=1)
+    with pytest.warns(a2tg.CapacityWarning, match=re.escape("plan_render(model, cameras)")) as caught:
+        assert model.render(CAMERA, settings=settings).overflow
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert jax.jit(lambda camera: model.render(camera, settings=settings))(CAMERA).overflow
+        assert not model.render(CAMERA, settings=a2tg.plan_render(model, [CAMERA])).overflow
+
+
+@pytest.mark.parametrize("capacity", [0, -3, 1e4, True, "4"])
+def test_a_capacity_is_a_positive_int(capacity):
+    with pytest.raises(ValueError, match="capacity must be an int, at least 1, or None"):
+        a2tg.RenderSettings(capacity=capacity)
+
+
+def test_plan_render_takes_a_model_as_evaluate_and_save_ply_do():
+    model = some_model()
+    planned = a2tg.plan_render(model.gaussians, [CAMERA], rule=model.rule)
+    assert a2tg.plan_render(model, [CAMERA]) == planned
+    with pytest.raises(ValueError, match=re.escape("say plan_render(model, cameras)")):
+        a2tg.plan_render(model, [CAMERA], rule=model.rule)
+
+
+def test_a_moved_model_renders_the_same_with_settings_that_are_scaled_along():
+    near = a2tg.Camera(jnp.eye(4).at[2, 3].set(0.7), CAMERA.K, 16, 12)
+    origin = a2tg.Origin.of_cameras([near])
+    model, world = dataclasses.replace(a2tg.Model(some_gaussians(40)), origin=origin), some_world()
+    world = dataclasses.replace(world, scale=0.2)
+    moved = model.transform(world)
+    assert moved.origin is not None
+    settings = a2tg.RenderSettings()
+    shown = model.render(near, settings=settings).color
+    again = moved.render(moved.origin.cameras[0], settings=settings.transform(world)).color
+    np.testing.assert_allclose(again, shown, atol=2e-5)
+    assert np.abs(moved.render(moved.origin.cameras[0], settings=settings).color - shown).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.diag([1.0, -1, 1, 1]), "mirrors"),
+        (np.diag([2.0, 2, 2, 1]), "R·Rᵀ − I up to 3"),
+        (np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 3, 1]]), "its last row must be 0, 0, 0, 1"),
+    ],
+)
+def test_a_pose_that_is_no_rigid_motion_is_refused_outside_jit(matrix, message):
+    with pytest.raises(ValueError, match=f"camera.viewmat must be a rigid motion, world to camera, OpenCV.*{message}"):
+        crowd().render(with_pose(matrix))
+    settings = a2tg.RenderSettings(capacity=1024)
+    jax.jit(lambda camera: crowd().render(camera, settings=settings))(with_pose(matrix))
+
+
+def test_a_pose_that_drifted_a_little_is_rendered():
+    crowd().render(with_pose(np.diag([1.01, 0.995, 1, 1])))
+
+
+def test_a_camera_says_its_convention_and_prints_numbers():
+    assert "OpenCV" in a2tg.Camera.__doc__ and "+0.5" in a2tg.Camera.__doc__
+    camera = dataclasses.replace(CAMERA, width=np.int64(80))
+    assert "width=80" in repr(camera) and type(camera.width) is int
+
+
+@pytest.mark.parametrize(
+    ("colors", "message"),
+    [
+        (np.full((9, 3), 200, np.uint8), "colors must be floats in [0, 1]; got uint8: divide bytes by 255"),
+        (np.full((9, 3), 200.0), "colors must lie in [0, 1]; got 200: divide bytes by 255"),
+        (np.full((9, 3), -0.5), "colors must lie in [0, 1]; got -0.5"),
+    ],
+)
+def test_colours_of_points_lie_in_the_unit_range(colors, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        a2tg.init_from_points(np.random.default_rng(0).normal(size=(9, 3)), colors)
+
+
+def test_the_public_names_hold_no_helpers():
+    names = dir(a2tg)
+    assert not {"Any", "TYPE_CHECKING", "importlib"} & set(names)
+    assert "__version__" in names and re.match(r"\d+\.\d+", a2tg.__version__)
+    assert a2tg.load_lpips.__module__ == "a2tg_jax.measure.metrics"
+
+
+def test_a_renderer_prints_as_one_line():
+    renderer = a2tg.Renderer(crowd())
+    assert repr(renderer) == "Renderer(40 Gaussians, no size yet)"
+    renderer(CAMERA)
+    assert repr(renderer) == "Renderer(40 Gaussians, 16×12)"
+
+
+def scene() -> a2tg.Scene:
+    view = a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3), np.uint8))
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    return a2tg.Scene("toy", (view, view), (view,), points, 0 * points, some_world(), 1.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OneStage(a2tg.A2tg):
+    def stages(self):
+        return super().stages()[0]
+
+
+MODEL, GAUSSIANS = a2tg.Model(some_gaussians()), some_gaussians()
+TEXTURES, LAYOUT = a2tg.allocate_textures(np.ones((7, 2), int))
+TEXTURED = a2tg.Model(GAUSSIANS, TEXTURES, LAYOUT, appearance=a2tg.Textured())
+KINDS = {
+    "scene must be a Scene; got str: say load_scene('/path')": lambda: a2tg.fit("/path", a2tg.A2tg()),
+    "got a name: say find_system('a2tg')": lambda: a2tg.fit(scene(), "a2tg"),
+    "system must be a System; got the class A2tg: say A2tg()": lambda: a2tg.fit(scene(), a2tg.A2tg),
+    "resume must be a Checkpoint; got str: say load_checkpoint": lambda: a2tg.fit(
+        scene(), a2tg.A2tg(), resume="cp.npz"
+    ),
+    "OneStage.stages must return a tuple of stages; got Stage(": lambda: a2tg.fit(scene(), OneStage()),
+    "views must be views, such as scene.train; got Scene: say evaluate(scene.test": lambda: a2tg.evaluate(
+        scene(), MODEL
+    ),
+    "got Model: say evaluate(scene.test, model)": lambda: a2tg.evaluate(MODEL, scene().test),
+    "gaussians must be Gaussians; got Scene": lambda: a2tg.evaluate(scene().test, scene()),
+    "got Scene: say polish(model, scene.train)": lambda: a2tg.polish(MODEL, scene()),
+    "model must be a Model; got tuple: say polish": lambda: a2tg.polish(scene().train, MODEL),
+    "cameras[0] must be a Camera; got View: use view.camera": lambda: a2tg.smooth_path(scene().train, 5),
+    "cameras must be a list of cameras, such as": lambda: a2tg.smooth_path(scene(), 5),
+    "model must be a Model; got Gaussians: say Model(gaussians)": lambda: a2tg.save_model("g.npz", GAUSSIANS),
+    "model must be a Model; got Gaussians": lambda: a2tg.save_compact("g.a2tgz", GAUSSIANS),
+    "parameters must be Parameters; got Gaussians: say": lambda: MODEL.with_parameters(GAUSSIANS),
+    "model must be a Model; got ArrayImpl": lambda: a2tg.value_and_grad(jnp.sum)(jnp.ones(3)),
+    "settings must be RenderSettings; got dict": lambda: MODEL.render(CAMERA, settings={"tile_size": 8}),
+    "camera.viewmat must be an array; got list": lambda: MODEL.render(
+        a2tg.Camera(np.eye(4).tolist(), np.eye(3).tolist(), 8, 8)
+    ),
+    "camera.width must be a positive number of pixels, a Python int": lambda: MODEL.render(
+        dataclasses.replace(CAMERA, width=jnp.int32(80))
+    ),
+    "gaussians must be Gaussians; got Scen": lambda: a2tg.Model(scene()),
+    "model.params must be () for the appearance Plain": lambda: a2tg.Model(GAUSSIANS, TEXTURES, LAYOUT).render(CAMERA),
+    "x.ply: save_model writes *.npz files; call save_ply instead": lambda: a2tg.save_model("x.ply", MODEL),
+    "save_compact writes *.a2tgz files; call save_model": lambda: a2tg.save_compact("x.npz", MODEL),
+    "save_ply writes *.ply files; call save_compact": lambda: a2tg.save_ply("x.a2tgz", MODEL),
+    "flat.ply: load_model reads *.npz files; call load_ply instead": lambda: a2tg.load_model("flat.ply"),
+    "load_compact reads *.a2tgz files; call load_model": lambda: a2tg.load_compact("m.npz"),
+    "load_ply reads *.ply files; call load_model": lambda: a2tg.load_ply("m.npz"),
+}
+
+
+@pytest.mark.parametrize("message", KINDS)
+def test_a_value_of_the_wrong_kind_is_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        KINDS[message]()
+
+
+def test_transformations_may_put_anything_in_the_place_of_gaussians():
+    axes = a2tg.Model(0, None, None)
+    assert jax.tree.map(lambda x: None, MODEL).gaussians.means is None and axes.gaussians == 0
+
+
+def test_a_ply_file_with_nan_says_how_many_rows_and_which_first(tmp_path):
+    bad = dataclasses.replace(GAUSSIANS, means=GAUSSIANS.means.at[jnp.array([2, 5]), 1].set(jnp.nan))
+    a2tg.save_ply(tmp_path / "bad.ply", bad)
+    with pytest.raises(
+        ValueError,
+        match=r"means must be finite; 2 of 7 rows have NaN or infinite numbers, the first is row 2 \(from 0\)",
+    ):
+        a2tg.load_ply(tmp_path / "bad.ply")
+
+
+def test_a_preset_takes_other_values_of_options():
+    system = a2tg.A2tg.preset("quick", stage1_iterations=10, texture={"cap": 8}, rates=a2tg.LearningRates(quats=0.5))
+    plain = a2tg.A2tg.preset("quick")
+    texture = dataclasses.replace(plain.texture, cap=8)
+    rates = a2tg.LearningRates(quats=0.5)
+    assert system == dataclasses.replace(plain, stage1_iterations=10, texture=texture, rates=rates)
+    with pytest.raises(ValueError, match=r"A2tg.iterations is not a field of A2tg; did you mean stage"):
+        a2tg.A2tg.preset("quick", iterations=10)
+    with pytest.raises(ValueError, match=r"A2tg.texture.cep is not a field of TextureConfig; did you mean cap\?"):
+        a2tg.A2tg.preset("quick", texture={"cep": 10})
+
+
+def test_the_first_ctrl_c_is_noted_and_the_second_interrupts():
+    with pytest.raises(KeyboardInterrupt), signals.ctrl_c_noted() as is_interrupted:
+        assert not is_interrupted()
+        signal.raise_signal(signal.SIGINT)
+        assert is_interrupted()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+ROWS = {
+    "concatenate needs at least one model": lambda: a2tg.concatenate([]),
+    "models[1] must be a Model; got Gaussians": lambda: a2tg.concatenate([MODEL, GAUSSIANS]),
+    "models must have one appearance; got Plain and Textured": lambda: a2tg.concatenate([MODEL, TEXTURED]),
+    "models must have one appearance; got Plain of different options": lambda: a2tg.concatenate(
+        [MODEL, a2tg.Model(GAUSSIANS, appearance=a2tg.Plain(0.5))]
+    ),
+    "for one Gaussian say model[3:4]": lambda: MODEL[3],
+    "for one Gaussian say model[-1:]": lambda: MODEL[-1],
+    "background must be [3] floats, such as (1, 1, 1) for white; got 'white'": lambda: MODEL.render(
+        CAMERA, background="white"
+    ),
+}
+
+
+@pytest.mark.parametrize("message", ROWS)
+def test_rows_models_and_backgrounds_of_a_wrong_form_are_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        ROWS[message]()
