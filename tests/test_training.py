@@ -173,7 +173,7 @@ def test_same_seed_same_result(scene, trained):
 
 
 def test_events_that_the_host_decides_are_those_of_the_step(scene, trained, monkeypatch):
-    """As on GPUs: a program for each pattern of due events, two in the first stage, and the same numbers."""
+    """GPUs have one program for each pattern of due events, two in the first stage. The numbers stay the same."""
     monkeypatch.setattr(loop, "are_events_decided_by_host", lambda: True)
     before = jitted_step().num_compiled()
     result = fit(scene, CONFIG, progress=False)

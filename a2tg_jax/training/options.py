@@ -117,7 +117,7 @@ class System:
 
     @property
     def small_budget(self) -> str:
-        """What a memory budget for fewer than `FEW_GAUSSIANS` has room for; empty for others."""
+        """Number of Gaussians that fit into the memory budget, in words, if it is below `FEW_GAUSSIANS`; else empty."""
         size = bytes_per_gaussian(self.initial_sh_degree)
         if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * size:
             return ""

@@ -65,8 +65,8 @@ class StepSettings:
     """Render settings with a capacity."""
     background: Background
     due: tuple[bool, ...] | None = None
-    """Which events of the stage are due, one program for each pattern; None: the step itself decides. On a GPU a
-    decision inside the step would wait for the host."""
+    """Whether each event of the stage is due; a step is compiled for each pattern. With None the step itself decides,
+    which makes a GPU wait for the host."""
 
 
 class StepInfo(NamedTuple):

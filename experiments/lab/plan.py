@@ -31,7 +31,7 @@ FINISHED, GPU, CPU = (
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """What the stages are trained on."""
+    """Machine that trains the stages."""
 
     jobs: int
     """Number of stages at a time."""
