@@ -23,7 +23,7 @@ from a2tg_jax.appearance import (
 )
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of
-from a2tg_jax.core.display import as_bytes, png, short_tuple_repr
+from a2tg_jax.core.display import as_bytes, enlarged, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
@@ -112,7 +112,7 @@ class RenderOutput(NamedTuple):
     def _repr_png_(self) -> bytes | None:
         """Return the colour as a PNG file for notebooks; None for several views, or under a transformation."""
         pixels = as_bytes(self.color)
-        return None if pixels is None else png(pixels)
+        return None if pixels is None else png(enlarged(pixels))
 
 
 def render_image(

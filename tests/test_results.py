@@ -465,7 +465,7 @@ def test_pictures_are_rounded_clipped_and_brightened():
 def test_side_by_side_puts_images_in_a_row():
     images = [np.full((30, 40, 3), shade, np.uint8) for shade in (50, 150)]
     sheet = np.asarray(side_by_side(images, ["photograph", "render"]))
-    assert sheet.shape[1] == 2 * 40 + 6
+    assert sheet.shape[1] == 2 * 240 + 6, "small images are enlarged"
     assert sheet[-1, 0, 0] == 50 and sheet[-1, -1, 0] == 150
 
 

@@ -12,6 +12,8 @@ from a2tg_jax.core.checks import described
 
 THUMBNAIL = 160
 """Longest side of a thumbnail in pixels."""
+LEAST_WIDTH = 240
+"""Width in pixels up to which small pictures are enlarged."""
 
 
 def counted(num: int, noun: str) -> str:
@@ -42,6 +44,12 @@ def as_bytes(image: Any) -> np.ndarray | None:
         return None
     rounded: np.ndarray = np.rint(255 * np.clip(np.nan_to_num(pixels), 0, 1)).astype(np.uint8)
     return rounded
+
+
+def enlarged(pixels: np.ndarray) -> np.ndarray:
+    """Return a picture [H, W, C] whose pixels are repeated k × k times, the least k that makes it 240 pixels wide."""
+    factor = -(-LEAST_WIDTH // pixels.shape[1])
+    return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def png(pixels: np.ndarray, longest: int | None = None) -> bytes:

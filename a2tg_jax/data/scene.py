@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
-from a2tg_jax.core.display import THUMBNAIL, counted, html_image, png
+from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, png
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.masks import Mask
@@ -74,7 +74,7 @@ class View:
         return f"View({self.name!r}, {width}×{height}{more})"
 
     def _repr_png_(self) -> bytes:
-        return png(self.picture.read(), LONGEST_PREVIEW)
+        return png(enlarged(self.picture.read()), LONGEST_PREVIEW)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
+from a2tg_jax.core.display import enlarged
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.model import Model
@@ -91,7 +92,11 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
-    """Return one sheet of images in a row, each under its caption, which is cut off where the image ends."""
+    """Return one sheet of images in a row, each under its caption, which is cut off where the image ends.
+
+    Small images are enlarged, so that captions fit.
+    """
+    images = [enlarged(image) for image in images]
     height, width = images[0].shape[:2]
     sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
     font = ImageFont.truetype(FONT, size=13)
