@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from a2tg_jax.core.optim import exponential_decay as exponential_decay
     from a2tg_jax.core.origin import Origin as Origin
     from a2tg_jax.core.overflow import CapacityWarning as CapacityWarning
+    from a2tg_jax.core.paths import look_at as look_at
     from a2tg_jax.core.paths import path_through as path_through
     from a2tg_jax.core.paths import smooth_path as smooth_path
     from a2tg_jax.core.similarity import Similarity as Similarity
@@ -152,7 +153,7 @@ _NAMES = {
     "a2tg_jax.core.optim": ("adam_init", "adam_update", "exponential_decay"),
     "a2tg_jax.core.origin": ("Origin",),
     "a2tg_jax.core.overflow": ("CapacityWarning",),
-    "a2tg_jax.core.paths": ("path_through", "smooth_path"),
+    "a2tg_jax.core.paths": ("look_at", "path_through", "smooth_path"),
     "a2tg_jax.core.similarity": ("Similarity",),
     "a2tg_jax.core.transform": ("transform_gaussians",),
     "a2tg_jax.data": ("Mask", "Picture", "Scene", "View", "load_scene", "run_sfm", "synthetic_scene", "view_image"),

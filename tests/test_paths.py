@@ -8,9 +8,32 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.capture import central_camera, turntable, vertical_of
-from a2tg_jax.core.paths import looking, path_through
+from a2tg_jax.core.paths import look_at, looking, path_through
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 60), (60, 80)])
+def test_a_camera_looks_at_its_target_with_a_level_horizon(width, height):
+    """The target lies in the middle, what is above it above, and the image's border at half the angle of view."""
+    position, target = np.asarray([1.0, -3.0, 0.5]), np.asarray([0.2, 0.4, -0.3])
+    camera = look_at(position, target, width=width, height=height, fov=50)
+
+    def seen(point):
+        x, y, z = np.asarray(camera.K, float) @ (np.asarray(camera.viewmat, float) @ [*point, 1])[:3]
+        return x / z, y / z, z
+
+    x, y, depth = seen(target)
+    assert (x, y) == pytest.approx((width / 2, height / 2), abs=1e-4)
+    assert depth == pytest.approx(np.linalg.norm(target - position), rel=1e-6)
+    x, y, _ = seen(target + np.asarray([0, 0, 0.1]))
+    assert x == pytest.approx(width / 2, abs=1e-4) and y < height / 2
+    focal = float(camera.K[0, 0])
+    assert np.degrees(np.arctan(max(width, height) / 2 / focal)) == pytest.approx(25, abs=1e-4)
+    for wrong in ({"target": position}, {"target": position + np.asarray([0, 0, 1])}, {"fov": 180}, {"target": [0, 0]}):
+        arguments = {"position": position, "target": target, "width": 80, "height": 60} | wrong
+        with pytest.raises(ValueError, match=r"target|fov"):
+            look_at(**arguments)
 
 
 def some_views(num: int = 4, size=(64, 48)) -> list[Camera]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
@@ -15,6 +16,44 @@ SMOOTHING = 0.06
 """Standard deviation of the smoothing, as a fraction of the path."""
 TURN_WEIGHT = 0.5
 """Weight of a change of direction relative to a change of position when cameras are ordered."""
+
+
+def look_at(
+    position: ArrayLike,
+    target: ArrayLike,
+    *,
+    width: int,
+    height: int,
+    fov: float = 60.0,
+    up: ArrayLike = (0.0, 0.0, 1.0),
+) -> Camera:
+    """Return a pinhole camera that sees `target` in the middle of its image, with a level horizon (host).
+
+    Args:
+      position: [3] position of the camera in the world.
+      target: [3] point that it looks at, another than its position.
+      width, height: size of the image in pixels.
+      fov: angle of view in degrees along the longer side of the image, between 0 and 180.
+      up: [3] vertical of the world; the cameras of a scene have it near +z.
+
+    Raises:
+      ValueError: if the camera is asked to look nowhere, or along the vertical, or with another angle of view.
+    """
+    vectors = {name: np.asarray(v, np.float64) for name, v in (("position", position), ("target", target), ("up", up))}
+    for name, vector in vectors.items():
+        if vector.shape != (3,) or not np.isfinite(vector).all():
+            raise ValueError(f"{name} must be 3 finite numbers; got {vector}")
+    center, seen, up = vectors.values()
+    forward = seen - center
+    if np.linalg.norm(np.cross(forward, up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(up):
+        raise ValueError(f"target must lie in a direction that is not along up; it lies at {forward} from the camera")
+    if not 0 < fov < 180:
+        raise ValueError(f"fov must lie between 0 and 180 degrees; got {fov}")
+    focal = max(width, height) / (2 * np.tan(np.radians(fov) / 2))
+    K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    camera = Camera(jnp.asarray(looking(center, forward, -up), float), jnp.asarray(K, float), width, height)
+    check_camera(camera)
+    return camera
 
 
 def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
