@@ -334,4 +334,4 @@ def test_the_command_line_tells_budgets(tmp_path, capsys, monkeypatch):
     assert "--memory-budget has room for" in told and "raise --stage1-iterations" in told
     assert not (tmp_path / "run").exists()
     assert cli.main(["train", "synthetic", *flags, "--memory-budget", "lots"]) == 2
-    assert "memory_budget must be a number of MB" in capsys.readouterr().err
+    assert "--memory-budget must be a number of MB" in capsys.readouterr().err
