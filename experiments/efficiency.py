@@ -19,7 +19,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.training import fit_stage
 
 TIMED_ITERATIONS, TIMED_ROUNDS = 150, 3
-SMOKE_ITERATIONS, SMOKE_ROUNDS = 10, 1
+SMOKE_ITERATIONS, SMOKE_ROUNDS = 20, 1
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:

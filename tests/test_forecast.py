@@ -230,7 +230,7 @@ def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):
     [
         (
             "100MB",
-            r"would need about \S+ \S+ of memory \(\S+: program .*: the program itself takes about .* with --max-memory",
+            r"would need about \S+ \S+ of memory \(\S+: program .*: the program itself takes .* with --max-memory",
         ),
         ("lots", r"--max-memory must be a number of MB .* got lots"),
         ("-1GB", r"--max-memory must be a number of MB"),
