@@ -38,6 +38,12 @@ def test_only_several_levels_are_told(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_levels_below_the_current_folder_are_not_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    check_output(Path("runs/demo"))
+    assert capsys.readouterr().err == ""
+
+
 def test_a_budget_for_few_gaussians_is_warned_of(recwarn):
     warn_of_small_budget(a2tg.A2tg(memory_budget="1MB"))
     warn_of_small_budget(a2tg.A2tg())

@@ -7,7 +7,10 @@ from pathlib import Path
 
 
 def check_output(path: Path) -> None:
-    """Raise if a file or folder cannot be made; say on stderr if that makes more than one level of folders.
+    """Raise if a file or folder cannot be made.
+
+    If that makes more than one level of folders outside the current folder, such as at a misspelt drive, it is said on
+    stderr.
 
     Raises:
       ValueError: naming what stands in the way.
@@ -23,5 +26,5 @@ def check_output(path: Path) -> None:
         os.rmdir(tempfile.mkdtemp(dir=existing))
     except OSError as error:
         raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
-    if len(missing) > 1:
+    if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
         print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
