@@ -28,6 +28,7 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
+from a2tg_jax.core.pixel_sizes import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.rasterize.compositor import composite, refusal
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of
@@ -52,7 +53,7 @@ class RenderSettings:
 
     tile_size: int = 8
     """Side of a tile in pixels; it does not change the image."""
-    near_plane: float = 0.2
+    near_plane: float = NEAR_PLANE
     """Least depth of visible splats and hits, in units of the world; positive. If you scale the world, scale near_plane
     by the same factor (`transform`)."""
     sh_degree: int = 3

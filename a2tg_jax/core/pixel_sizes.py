@@ -4,8 +4,8 @@ from typing import Any
 
 FILTER_VARIANCE = 0.5
 """Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
-NEAR = 0.2
-"""Depth from which splats are drawn."""
+NEAR_PLANE = 0.2
+"""Default depth from which splats are drawn."""
 
 
 def pixel_sizes(means: Any, scales: Any, viewmat: Any, K: Any) -> Any:
@@ -18,4 +18,4 @@ def pixel_sizes(means: Any, scales: Any, viewmat: Any, K: Any) -> Any:
     """
     depths = means @ viewmat[2, :3] + viewmat[2, 3]
     focal = (K[0, 0] * K[1, 1]) ** 0.5
-    return (depths > NEAR).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR)
+    return (depths > NEAR_PLANE).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR_PLANE)
