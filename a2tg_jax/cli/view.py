@@ -46,7 +46,6 @@ class View:
     """Open a browser if the machine has a display."""
 
     def run(self) -> None:
-        print(f"loading {self.source}", flush=True)
         routes = routes_of(open_source(self.source, self.model))
         serve(routes, host=self.host, port=self.port, on_start=self._started)
 

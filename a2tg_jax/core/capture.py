@@ -86,7 +86,9 @@ def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     if np.median(-np.sum(offsets * axes, axis=1) / distances) < LEAST_FACING:
         raise ValueError("the cameras do not look at one subject to orbit; choose --path smooth")
-    elevation = np.clip(np.arcsin(offsets @ up / distances).mean(), -LARGEST_ELEVATION, LARGEST_ELEVATION)
+    elevation = np.clip(
+        np.arcsin(np.clip(offsets @ up / distances, -1, 1)).mean(), -LARGEST_ELEVATION, LARGEST_ELEVATION
+    )
     side = _across(offsets[0], up)
     first, place = cameras[0], distances.mean()
     frames = []

@@ -37,7 +37,7 @@ LEAST_WEIGHT = 1e-12
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SplitStatistics:
-    """Statistics of N Gaussians over the steps since the last event."""
+    """Statistics of N Gaussians over the steps since their last split."""
 
     gradients: GradientStatistics
     pixels: Array

@@ -20,6 +20,8 @@ def check_output(path: Path) -> None:
     existing = place.parent if not missing else missing[-1].parent
     if not missing and place.is_dir():
         existing = place
+    if not existing.exists():
+        raise ValueError(f"{path} cannot be made, for there is no {existing}")
     if not existing.is_dir():
         raise ValueError(f"{path} cannot be made, for {existing} is a file")
     try:

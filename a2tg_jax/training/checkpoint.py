@@ -145,6 +145,9 @@ class Interrupted(KeyboardInterrupt):
         )
         self.checkpoint = checkpoint
 
+    def __reduce__(self) -> tuple[type["Interrupted"], tuple[Checkpoint]]:
+        return type(self), (self.checkpoint,)
+
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
     """Write a checkpoint; an older file of that name is replaced once the new one is whole."""
