@@ -1,6 +1,7 @@
 """Warnings of eager renders whose capacity was too small, without a wait for every image."""
 
 import collections
+import threading
 import warnings
 from collections.abc import Hashable
 from typing import Any
@@ -22,6 +23,7 @@ class OverflowWatch:
     def __init__(self) -> None:
         self._known: set[Hashable] = set()
         self._pending: collections.deque[tuple[Any, int]] = collections.deque(maxlen=MOST_PENDING)
+        self._lock = threading.Lock()
 
     def observe(self, overflow: Array, capacity: int, kind: Hashable) -> None:
         """Warn if this render, or one before it that is done by now, has overflowed; do nothing under jit and vmap.
@@ -33,12 +35,13 @@ class OverflowWatch:
         """
         if isinstance(overflow, jax.core.Tracer):
             return
-        self._pending.append((overflow, capacity))
+        with self._lock:
+            self._pending.append((overflow, capacity))
         if kind not in self._known:
             self._known.add(kind)
             overflow.block_until_ready()
-        while self._pending and (self._pending[0][0].is_deleted() or self._pending[0][0].is_ready()):
-            done, had = self._pending.popleft()
+        while (found := self._next_done()) is not None:
+            done, had = found
             if not done.is_deleted() and bool(done):
                 warnings.warn(
                     f"settings.capacity of {had:,} was too small for a render: its image is only the background. Plan "
@@ -46,3 +49,10 @@ class OverflowWatch:
                     CapacityWarning,
                     stacklevel=4,
                 )
+
+    def _next_done(self) -> tuple[Any, int] | None:
+        """Take the oldest render from the watch if it is done; None if it is not, or there is none."""
+        with self._lock:
+            if self._pending and (self._pending[0][0].is_deleted() or self._pending[0][0].is_ready()):
+                return self._pending.popleft()
+        return None
