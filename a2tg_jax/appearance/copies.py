@@ -30,16 +30,25 @@ def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple
       logit_opacities [N] and log_scales [N, 2] of each copy.
     """
     dtype = logit_opacities.dtype
-    # log(1 - o) straight from the logit: 1 - o itself has no digits left when o is close to 1.
-    log_transparency = jax.nn.log_sigmoid(-logit_opacities)
-    opacities = -jnp.expm1(log_transparency / num_shares.astype(dtype))
-    opacities = jnp.clip(opacities, DEAD_OPACITY, LARGEST_OPACITY)
+    opacities = shared_opacities(logit_opacities, num_shares.astype(dtype))
     log_ratio = jax.nn.log_sigmoid(logit_opacities) - jnp.log(stacked_integral(opacities, num_shares))
     is_shared = num_shares > 1
     return (
         jnp.where(is_shared, logit(opacities), logit_opacities),
         jnp.where(is_shared[:, None], log_scales + log_ratio[:, None], log_scales),
     )
+
+
+def shared_opacities(logit_opacities: Array, num_shares: Array) -> Array:
+    """Return 1 - (1 - o)^(1/n) [N], clamped to [0.005, 1 - 2⁻²³]: the opacity of n layers as opaque as one of o.
+
+    Args:
+      logit_opacities: [N] logits of the originals.
+      num_shares: [N] floats n of at least 1.
+    """
+    # log(1 - o) straight from the logit: 1 - o itself has no digits left when o is close to 1.
+    log_transparency = jax.nn.log_sigmoid(-logit_opacities)
+    return jnp.clip(-jnp.expm1(log_transparency / num_shares), DEAD_OPACITY, LARGEST_OPACITY)
 
 
 def stacked_integral(opacities: Array, num_shares: Array) -> Array:

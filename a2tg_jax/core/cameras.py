@@ -148,3 +148,29 @@ def crop_camera(camera: Camera, width: int, height: int) -> Camera:
         .set(jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype))
     )
     return Camera(camera.viewmat, scaled.K + shift, width, height)
+
+
+def intrinsics(width: int, height: int, field_of_view: float) -> np.ndarray:
+    """Return K [3, 3] of square pixels with the principal point in the middle.
+
+    Args:
+      width, height: size of the image in pixels.
+      field_of_view: in radians, across the longer side.
+    """
+    focal = max(width, height) / (2 * np.tan(field_of_view / 2))
+    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+
+
+def looking(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Return the world-to-camera matrix [4, 4] at `center`, with z along `forward` and y closest to `down`."""
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(down, z)
+    x /= np.linalg.norm(x)
+    return viewmat_of_axes(np.stack([x, np.cross(z, x), z]), center)
+
+
+def viewmat_of_axes(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return the world-to-camera matrix [4, 4] of a camera's axes, as rows, and its position."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
+    return viewmat

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.paths import looking
+from a2tg_jax.core.cameras import Camera, looking
 from a2tg_jax.core.similarity import camera_centers
 
 MIN_AXIS_SPREAD = 1e-3

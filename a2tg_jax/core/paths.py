@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
+from a2tg_jax.core.cameras import Camera, check_camera, intrinsics, looking, resize_camera, viewmat_of_axes
 from a2tg_jax.core.similarity import camera_centers
 
 SMOOTHING = 0.06
@@ -49,9 +49,8 @@ def look_at(
         raise ValueError(f"target must lie in a direction that is not along up; it lies at {forward} from the camera")
     if not 0 < fov < 180:
         raise ValueError(f"fov must lie between 0 and 180 degrees; got {fov}")
-    focal = max(width, height) / (2 * np.tan(np.radians(fov) / 2))
-    K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
-    camera = Camera(jnp.asarray(looking(center, forward, -up), float), jnp.asarray(K, float), width, height)
+    viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))
+    camera = Camera(jnp.asarray(viewmat, float), jnp.asarray(K, float), width, height)
     check_camera(camera)
     return camera
 
@@ -118,7 +117,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     lenses = np.stack([np.interp(times, knots, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
     dtype, size = first.viewmat.dtype, (first.width, first.height)
     return [
-        Camera(jnp.asarray(_viewmat(R, c), dtype), jnp.asarray(K, dtype), *size)
+        Camera(jnp.asarray(viewmat_of_axes(R, c), dtype), jnp.asarray(K, dtype), *size)
         for R, c, K in zip(turned, places, lenses, strict=True)
     ]
 
@@ -157,18 +156,3 @@ def _smoothed(knots: np.ndarray, num_frames: int) -> np.ndarray:
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(dense[:, :3], axis=0), axis=1) + 1e-12)])
     wanted = np.linspace(0.0, travelled[-1], num_frames)
     return np.stack([np.interp(wanted, travelled, column) for column in dense.T], axis=1)
-
-
-def looking(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] at `center`, with z along `forward` and y closest to `down`."""
-    z = forward / np.linalg.norm(forward)
-    x = np.cross(down, z)
-    x /= np.linalg.norm(x)
-    return _viewmat(np.stack([x, np.cross(z, x), z]), center)
-
-
-def _viewmat(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] of a camera's axes, as rows, and its position."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
-    return viewmat

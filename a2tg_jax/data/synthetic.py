@@ -6,6 +6,7 @@ Its patterns have details of about 4 to 10 pixels, finer than one or two thousan
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.lighting import light
 from a2tg_jax.data.photo_store import Picture
@@ -14,6 +15,7 @@ from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, near
 
 TARGET = np.array([0.0, 0.1, 0.45])
 """Point that all cameras look at."""
+DOWN = np.array([0.0, 0.0, -1.0])
 DISTANCE = 2.4
 """Distance of the cameras from the target."""
 FIELD_OF_VIEW = np.deg2rad(58.0)
@@ -57,7 +59,7 @@ def synthetic_scene(
     rng = np.random.default_rng(seed)
     surfaces = light(still_life(rng), rng)
     size = round(width / downscale), round(height / downscale)
-    K = intrinsics(*size)
+    K = intrinsics(*size, FIELD_OF_VIEW)
     viewmats = [look_at(center) for center in camera_path(num_views)]
     shots = [
         Shot(f"view_{index:03d}.png", viewmat, K, render(surfaces, viewmat, K, *size))
@@ -99,19 +101,7 @@ def camera_path(num_views: int) -> np.ndarray:
 
 def look_at(center: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a camera at `center` that looks at the target, +z up."""
-    forward = (TARGET - center) / np.linalg.norm(TARGET - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ center
-    return viewmat
-
-
-def intrinsics(width: int, height: int) -> np.ndarray:
-    """Return K [3, 3] of square pixels with the principal point in the middle."""
-    focal = max(width, height) / (2 * np.tan(FIELD_OF_VIEW / 2))
-    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return looking(center, TARGET - center, DOWN)
 
 
 def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:

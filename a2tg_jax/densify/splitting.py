@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.copies import DEAD_OPACITY, LARGEST_OPACITY
+from a2tg_jax.appearance.copies import shared_opacities
 from a2tg_jax.core.gaussians import logit
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
@@ -140,6 +140,5 @@ def logits_of_halves(logit_opacities: Array, pixels: Array) -> Array:
     before = jnp.maximum(pixels * pixels, FILTER_VARIANCE)
     after = jnp.maximum((pixels / SPLIT_SHRINK) ** 2, FILTER_VARIANCE)
     ratio = SPLIT_SHRINK**2 * after / before
-    opacities = -jnp.expm1(jax.nn.log_sigmoid(-logit_opacities) / ratio)
-    shared = logit(jnp.clip(opacities, DEAD_OPACITY, LARGEST_OPACITY))
+    shared = logit(shared_opacities(logit_opacities, ratio))
     return jnp.where((pixels > 0) & (ratio > 1), jnp.minimum(shared, logit_opacities), logit_opacities)

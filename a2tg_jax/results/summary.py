@@ -54,8 +54,8 @@ class ModelResult:
     @property
     def splits(self) -> dict[str, Evaluation]:
         """All evaluations, by their names in metrics.json."""
-        held_out = [] if self.test is None else [(str(self.held_out), self.test)]
-        return {"train": self.train, **dict(held_out), **self.corrected}
+        held_out: dict[str, Evaluation] = {} if self.test is None else {self.held_out: self.test}
+        return {"train": self.train, **held_out, **self.corrected}
 
     @property
     def shown(self) -> Evaluation:

@@ -4,6 +4,7 @@ import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from a2tg_jax.core.display import counted
 from lab.grid import Grid
 from lab.jobs import Job, Record
 from lab.queue import Failure
@@ -22,8 +23,7 @@ class Progress:
     def begin(self, at_a_time: int) -> None:
         """Tell how many stages there are."""
         if self._total:
-            stages = "1 stage" if self._total == 1 else f"{self._total} stages"
-            self._tell(f"{stages} to train, {at_a_time} at a time at most; log: {self._log}")
+            self._tell(f"{counted(self._total, 'stage')} to train, {at_a_time} at a time at most; log: {self._log}")
 
     def start(self, job: Job) -> None:
         """Tell that a stage starts."""
