@@ -19,7 +19,7 @@ from pathlib import Path
 
 from lab import pages
 from lab.cli import Experiment, argument_parser, run_experiments, stop
-from lab.grid import SUFFIX
+from lab.grid import SUFFIX, has_scale
 from lab.interrupts import interruptible
 from lab.standard import STANDARD, file_experiment
 
@@ -56,13 +56,14 @@ def parse_arguments(known: Mapping[str, Experiment], arguments: Sequence[str] | 
 
 
 def chosen(known: Mapping[str, Experiment], args: argparse.Namespace) -> list[Experiment]:
-    """Return the experiments of a call; unknown names end the program."""
+    """Return the experiments of a call, or all that have its scale; unknown names end the program."""
     for name in args.names:
         if name not in known and name not in OTHERS and name not in args.own_grids:
             hint = did_you_mean(name, [*known, *OTHERS]) or "; --help lists all"
             stop(f"there is no experiment {name!r}{hint}")
     if EVERYTHING in args.names:
-        return [*known.values(), *_file_experiments(known, args.own_grids)]
+        whole = [found for found in known.values() if all(has_scale(grid, args.scale) for grid in found.grids)]
+        return [*whole, *_file_experiments(known, args.own_grids)]
     named = [known[name] for name in dict.fromkeys(args.names) if name in known]
     return [*named, *_file_experiments(known, args.own_grids)]
 

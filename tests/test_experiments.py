@@ -3,6 +3,7 @@
 import concurrent.futures
 import csv
 import dataclasses
+import itertools
 import json
 import pathlib
 import re
@@ -22,14 +23,14 @@ import upscale_gains
 from lab import pages, queue, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
-from lab.grid import GRIDS, Cell, Grid, Method, Run, read_grid, splats_in
+from lab.grid import GRIDS, Cell, Grid, Method, Run, has_scale, read_grid, splats_in
 from lab.interrupts import interruptible
 from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
 from lab.plan import Machine, duration, finished_pace, plan_of
 from lab.progress import Progress
 from lab.scenes import SceneAt, own_scene
 from lab.stages import stages_of
-from run import experiments, main, parse_arguments
+from run import chosen, experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
@@ -39,6 +40,8 @@ from a2tg_jax.training.terms import Term
 
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
 SCALES = ("full", "small", "smoke")
+LONG = sorted(name for name in NAMES if has_scale(name, "long"))
+"""Grids of the paper's length on small photographs."""
 
 
 def record(psnr=25.0, mb=1.0, num=1_000, **others):
@@ -50,8 +53,7 @@ def record(psnr=25.0, mb=1.0, num=1_000, **others):
 # Grids
 
 
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "scale"), [*itertools.product(NAMES, SCALES), *((name, "long") for name in LONG)])
 def test_every_grid_names_runs_that_can_be_trained(name, scale):
     grid = read_grid(name, scale)
     first = {job.key: job for job in grid.jobs({})}
@@ -105,6 +107,21 @@ def test_methods_of_a_cell_differ_in_what_their_names_say_only():
 def test_equal_bytes_are_no_more_and_less_by_a_splat_at_most(mb, floats):
     num = splats_in(mb, Method("any", "any", floats=floats))
     assert num * floats * 4 <= mb * 1e6 + 0.5 < (num + 1) * floats * 4 + 1
+
+
+def test_a_method_whose_gaussians_differ_in_size_fills_the_bytes_of_the_reference_as_its_budget():
+    grid = read_grid("fixed_memory", "long", scenes=["fox"])
+    finished = {grid.reference_job(grid.cells[0]).key: record(mb=0.7123)}
+    (run,) = (run for run in grid.runs(finished) if run.method.label == "Bytewise")
+    assert run.is_at_equal_bytes and run.job.system.memory_budget == 0.7123
+    assert run.cell.budget is None, "it stays in the cell of the others"
+
+
+def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
+    known = experiments()
+    names = {found.name for found in chosen(known, parse_arguments(known, ["all", "--scale", "long"]))}
+    assert {"fixed_memory", "ablation"} <= names < set(known)
+    assert len(chosen(known, parse_arguments(known, ["all"]))) == len(known)
 
 
 def test_scenes_are_chosen_and_held_out():

@@ -27,7 +27,7 @@ EXPERIMENTS = Path(__file__).resolve().parents[1]
 RUNS = EXPERIMENTS.parent / "runs"
 USAGE = 2
 """Exit code of a call that cannot be run as it is."""
-SCALES = ("full", "small", "smoke")
+SCALES = ("full", "long", "small", "smoke")
 MEMORY_SHARE = 0.8
 """Default share of the machine's memory for all jobs together."""
 MOST_SENT = 1_000
@@ -244,8 +244,8 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
-    add("--scale", type=_scale, default="small", metavar="{full,small,smoke}",
-        help="full is the paper's, for a GPU")  # fmt: skip
+    add("--scale", type=_scale, default="small", metavar="{full,long,small,smoke}",
+        help="full is the paper's, for a GPU; long has its options and length on small photographs")  # fmt: skip
     add("--only", nargs="+", metavar="SCENE", help="run these scenes of the scale only")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip

@@ -2,7 +2,7 @@
 
 A cell is a scene with a number of Gaussians, a seed, and lengths of the stages. Every method of the experiment is one
 run in it. A method has the cell's number of Gaussians, or, `at_equal_bytes`, as many as fit into the final bytes of the
-cell's reference, which are known once that is trained.
+cell's reference, which are known once that is trained; a method whose Gaussians differ in size has them as its budget.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ class Method:
     system: str
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     floats: int | None = None
-    """Floats of a Gaussian; needed for a given number of bytes."""
+    """Floats of a Gaussian; None if Gaussians differ in size, so that the system must take a memory budget."""
     most: int | None = None
     """Largest number of Gaussians of the cells that have this method."""
 
@@ -96,8 +96,7 @@ class Grid:
                 yield Run(method, cell, False, self._job(method, cell, cell.gaussians))
             reference = self.reference_record(cell, records)
             for method in self.at_equal_bytes if reference else ():
-                num = splats_in(reference["mb"], method)
-                yield Run(method, cell, True, self._job(method, cell, num))
+                yield Run(method, cell, True, self._job_in(method, cell, reference["mb"]))
 
     def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
         """Return the record of the reference in a cell, or None before it is finished."""
@@ -110,6 +109,12 @@ class Grid:
     def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
         """Return the last job of every run."""
         return (run.job for run in self.runs(records))
+
+    def _job_in(self, method: Method, cell: Cell, mb: float) -> Job:
+        """Return the job of a method in so many MB."""
+        if method.floats is None:
+            return self._job(method, dataclasses.replace(cell, budget=mb), 0)
+        return self._job(method, cell, splats_in(mb, method))
 
     def _job(self, method: Method, cell: Cell, num: int) -> Job:
         first, second = cell.iterations
@@ -186,6 +191,11 @@ def read_grid(
         path.stem, _entry(file, "title", place), scale, settings["preset"], tuple(dict.fromkeys(cells)), reference,
         tuple(others), methods_in("at_equal_bytes"), validation, _table(file, place),
     )  # fmt: skip
+
+
+def has_scale(name: str, scale: str) -> bool:
+    """Return whether a grid has a scale."""
+    return scale in _read(grid_path(name))
 
 
 def grid_path(name: str) -> Path:
