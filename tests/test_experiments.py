@@ -592,8 +592,8 @@ def test_gains_have_the_verdict_that_seeds_allow():
 
 def test_quality_is_averaged_over_seeds_and_what_is_missing_is_a_dash():
     text = tables.quality_tables(GRID, [result("own", 20.0), result("own", 22.0, 1), result("other", 30.0, lpips=None)])
-    assert "| own | 30,000 | 1,000 | 21.00 / .800 / .200 · 1.00 | 21.00 |" in text
-    assert "30.00 / .800 / – · 1.00" in text
+    assert "| own | 30,000 | 1,000 | 21.00 / .800 / .200 · 1.00 (+331 %) | 21.00 / .800 / .200 · 1.00 |" in text
+    assert "30.00 / .800 / – · 1.00 (+331 %) |" in text
 
 
 def at(scene, label, psnr, seed=0, **others):
@@ -713,7 +713,7 @@ def test_columns_are_data_sets_and_what_is_missing_in_one_is_told():
         for cell, psnr in zip(cells, (20.0, 22.0, 30.0), strict=True)
     ]
     grid = Grid("x", "X", "small", "quick", tuple(cells), method, (), ())
-    assert "| 21.00 / .800 / .200 · 1.00 | 30.00 / .800 / .200 · 1.00 | 25.50 |" in tables.quality_tables(grid, results)
+    assert "1.00 (+331 %) | 30.00 / .800 / .200 · 1.00 (+331 %) | 25.50 / .800 / .200 · 1.00 |" in tables.quality_tables(grid, results)
     other = dataclasses.replace(results[0], run=dataclasses.replace(results[0].run, method=Method("other", "a2tg")))
     assert "20.00 / .800 / .200 · 1.00 (1 of 2 scenes) | – | – |" in tables.quality_tables(grid, [*results, other])
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.stats
 
+from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.results.folder import read_json
 from lab.grid import Cell, Grid, Run
 from lab.jobs import Record
@@ -25,6 +26,13 @@ T = TypeVar("T")
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
 """The figures that the paper publishes, by table."""
 MISSING = "–"
+DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
+QUALITY = tuple(DIGITS)
+"""Figures of quality in the order of all tables."""
+QUALITY_COLUMNS = (("psnr", "PSNR"), ("ssim", "SSIM"), ("lpips", "LPIPS"), ("mb", "MB"))
+PLAIN_DEGREE = 3
+"""Degree of spherical harmonics of the paper's plain Gaussians."""
+QUALITY_AND_SIZE = "PSNR / SSIM / LPIPS · MB"
 CONFIDENCE = 0.95
 """Level of the intervals over scenes."""
 
@@ -124,12 +132,16 @@ def percent(share: float) -> str:
 
 def quality(results: Sequence[Result]) -> str:
     """Return PSNR / SSIM / LPIPS for a table."""
-    figures = zip(("psnr", "ssim", "lpips"), (2, 3, 3), strict=True)
-    return " / ".join(number(mean(results, name), digits) for name, digits in figures) if results else MISSING
+    return _told_quality(*(mean(results, figure) for figure in QUALITY)) if results else MISSING
+
+
+def _told_quality(*figures: float) -> str:
+    return " / ".join(number(value, DIGITS[name]) for name, value in zip(QUALITY, figures, strict=True))
 
 
 def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
-    """Return a table for each number of Gaussians or budget: a row a method, quality and MB in each column."""
+    """Return a table for each number of Gaussians or budget: a row a method, quality and MB in each column and on
+    average, at equal numbers of Gaussians with the paper's percentages."""
     columns = {column: {r.run.cell.scene for r in own} for column, own in grouped(results, lambda r: r.column)}
     parts = []
     for (num, budget), block in grouped(results, lambda result: (result.run.cell.gaussians, result.run.cell.budget)):
@@ -138,9 +150,14 @@ def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
             by_column = {column: [result for result in own if result.column == column] for column in columns}
             shown = [_quality_and_size(found, columns[column]) for column, found in by_column.items()]
             rows.append([label, iterations(own), num_gaussians(own), *shown, _mean_of_columns(by_column)])
-        header = ["method", "iterations", "Gaussians", *(f"{column}: PSNR / SSIM / LPIPS · MB" for column in columns)]
+        header = ["method", "iterations", "Gaussians", *(f"{column}: {QUALITY_AND_SIZE}" for column in columns)]
         size = f"**{num:,} Gaussians** of {grid.reference.label}" if budget is None else f"**{budget:g} MB**"
-        parts.append(f"{size}\n\n" + markdown([*header, "mean PSNR"], rows))
+        size += (
+            " (+ x %: bytes above those of as many plain Gaussians)"
+            if any(map(_overhead, ([r] for r in block)))
+            else ""
+        )
+        parts.append(f"{size}\n\n" + markdown([*header, f"mean: {QUALITY_AND_SIZE}"], rows))
     return "\n".join(parts)
 
 
@@ -150,14 +167,25 @@ def _quality_and_size(results: Sequence[Result], scenes: set[SceneAt]) -> str:
         return MISSING
     found = {result.run.cell.scene for result in results}
     note = "" if found == scenes else f" ({len(found)} of {len(scenes)} scenes)"
-    return f"{quality(results)} · {number(mean(results, 'mb'), 2)}{note}"
+    return f"{quality(results)} · {number(mean(results, 'mb'), 2)}{_overhead(results)}{note}"
+
+
+def _overhead(results: Sequence[Result]) -> str:
+    """Return the bytes above those of as many plain Gaussians in percent; empty where bytes are given, not numbers."""
+    if any(result.run.is_at_equal_bytes or result.run.cell.budget is not None for result in results):
+        return ""
+    plain = mean(results, "num") * bytes_per_gaussian(PLAIN_DEGREE) / MEGABYTE
+    return f" ({100 * (mean(results, 'mb') / plain - 1):+.0f} %)"
 
 
 def _mean_of_columns(by_column: Mapping[str, Sequence[Result]]) -> str:
-    """Return the mean over all columns, each counted once as in the paper; a dash if one is missing."""
+    """Return the means over all columns, each counted once as in the paper; a dash if one is missing."""
     if not all(by_column.values()):
         return MISSING
-    return number(float(np.mean([mean(found, "psnr") for found in by_column.values()])), 2)
+    *figures, mb = (
+        float(np.mean([mean(found, figure) for found in by_column.values()])) for figure in (*QUALITY, "mb")
+    )
+    return f"{_told_quality(*figures)} · {number(mb, 2)}"
 
 
 def iterations(results: Sequence[Result]) -> str:
@@ -307,15 +335,11 @@ def paper_table(
 
 
 PLACES = {"gaussians": "Gaussians", "budget_mb": "MB"}
-DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 
 
 def _as_printed(key: str, value: float) -> str:
     """Return a figure with the paper's number of digits."""
     return number(value, DIGITS[key]) if key in DIGITS else f"{value:g}"
-
-
-QUALITY_COLUMNS = (("psnr", "PSNR"), ("ssim", "SSIM"), ("lpips", "LPIPS"), ("mb", "MB"))
 
 
 def choices_table(results: Sequence[Result], default: str) -> str:
