@@ -713,9 +713,12 @@ def test_columns_are_data_sets_and_what_is_missing_in_one_is_told():
         for cell, psnr in zip(cells, (20.0, 22.0, 30.0), strict=True)
     ]
     grid = Grid("x", "X", "small", "quick", tuple(cells), method, (), ())
-    assert "1.00 (+331 %) | 30.00 / .800 / .200 · 1.00 (+331 %) | 25.50 / .800 / .200 · 1.00 |" in tables.quality_tables(grid, results)
+    text = tables.quality_tables(grid, results)
+    assert "1.00 (+331 %) | 30.00 / .800 / .200 · 1.00 (+331 %) | 25.50 / .800 / .200 · 1.00 |" in text
     other = dataclasses.replace(results[0], run=dataclasses.replace(results[0].run, method=Method("other", "a2tg")))
-    assert "20.00 / .800 / .200 · 1.00 (1 of 2 scenes) | – | – |" in tables.quality_tables(grid, [*results, other])
+    assert "20.00 / .800 / .200 · 1.00 (+331 %) (1 of 2 scenes) | – | – |" in tables.quality_tables(
+        grid, [*results, other]
+    )
 
 
 def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
