@@ -117,6 +117,15 @@ def test_a_method_whose_gaussians_differ_in_size_fills_the_bytes_of_the_referenc
     assert run.cell.budget is None, "it stays in the cell of the others"
 
 
+def test_a_rehearsal_runs_every_method_once_and_keeps_to_itself():
+    whole, short = read_grid("fixed_memory", "full"), read_grid("fixed_memory", "full", rehearsal=True)
+    (cell,) = short.cells
+    assert cell == dataclasses.replace(whole.cells[0], iterations=(300, 300))
+    assert short.methods == whole.methods and short.at_equal_bytes == whole.at_equal_bytes
+    lab = Lab(argument_parser("").parse_args(["--scale", "full", "--rehearsal", "--tables-only"]))
+    assert lab.out.parts[-3:] == ("runs", "results", "full-rehearsal") and len(lab.grid("claim").cells) == 1
+
+
 def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
     known = experiments()
     names = {found.name for found in chosen(known, parse_arguments(known, ["all", "--scale", "long"]))}

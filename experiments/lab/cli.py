@@ -53,14 +53,17 @@ class Lab:
         """Return the folder of the committed results, or one that git ignores for the smoke scale and grids of one's
         own."""
         name = f"{self.scale}-validation" if self.args.validation else self.scale
-        is_own = self.is_smoke or getattr(self.args, "own_grids", ())
+        name = f"{name}-rehearsal" if self.args.rehearsal else name
+        is_own = self.is_smoke or self.args.rehearsal or getattr(self.args, "own_grids", ())
         return (RUNS if is_own else EXPERIMENTS) / "results" / name
 
     def grid(self, name: str) -> Grid:
         """Return a grid with the requested scenes."""
         held_out = not self.args.without_held_out
-        only, validation = self.args.only, self.args.validation
-        return read_grid(name, self.scale, scenes=only, held_out=held_out, own=self.own_scenes, validation=validation)
+        return read_grid(
+            name, self.scale, scenes=self.args.only, held_out=held_out, own=self.own_scenes,
+            validation=self.args.validation, rehearsal=self.args.rehearsal,
+        )  # fmt: skip
 
     @property
     def own_scenes(self) -> tuple[SceneAt, ...]:
@@ -253,6 +256,8 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--without-held-out", action="store_true", help="leave out the held-out scenes")
     add("--validation", action="store_true",
         help="hold out every eighth training view in place of the test views, to choose options by")  # fmt: skip
+    add("--rehearsal", action="store_true",
+        help="run every method once: the first scene and size of each grid, 1/100 of the iterations")  # fmt: skip
     add("--out", type=Path, help="folder of records, tables and plots; runs finished in it are never run again; "
         "default: experiments/results/SCALE, or runs/results/SCALE for --scale smoke and grid files")  # fmt: skip
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")

@@ -22,6 +22,8 @@ from lab.scenes import SceneAt, chosen_scenes, read_scenes
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"
+REHEARSAL = 100
+"""Factor by which a rehearsal is shorter."""
 TABLES = ("quality", "gains", "choices")
 """Kinds of tables of a grid, the default first."""
 
@@ -145,6 +147,7 @@ def read_grid(
     held_out: bool = True,
     own: Sequence[SceneAt] = (),
     validation: bool = False,
+    rehearsal: bool = False,
 ) -> Grid:
     """Read an experiment's grid at a scale from `grids/NAME.toml`, or from a file of one's own.
 
@@ -154,6 +157,7 @@ def read_grid(
       held_out: whether held-out scenes count.
       own: scenes that take the place of all these; empty for none.
       validation: whether validation views are held out in place of the test views.
+      rehearsal: whether only the first cell is run, at a hundredth of the iterations.
 
     Raises:
       ValueError: if the file lacks the scale, or a scene, a method or a kind of table is unknown.
@@ -187,6 +191,8 @@ def read_grid(
     ]
     if not cells:
         raise ValueError(f"{place}: no scene is left")
+    if rehearsal:
+        cells = [_shortened(cells[0])]
     return Grid(
         path.stem, _entry(file, "title", place), scale, settings["preset"], tuple(dict.fromkeys(cells)), reference,
         tuple(others), methods_in("at_equal_bytes"), validation, _table(file, place),
@@ -263,6 +269,12 @@ def _cells(block: Mapping, scenes: Sequence[SceneAt], place: str) -> list[Cell]:
     )
     pairs = itertools.product(sizes, block["seeds"], scenes)
     return [Cell(scene, num, seed, (first, second), budget) for (num, budget), seed, scene in pairs]
+
+
+def _shortened(cell: Cell) -> Cell:
+    """Return a cell at a hundredth of its iterations."""
+    first, second = cell.iterations
+    return dataclasses.replace(cell, iterations=(max(1, first // REHEARSAL), second // REHEARSAL))
 
 
 def _read(path: Path) -> dict[str, Any]:
