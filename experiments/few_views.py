@@ -1,0 +1,128 @@
+"""Train on few views and score views left out of the training views: does `bytewise` overfit?
+
+    python experiments/few_views.py --scenes SCENES --out OUT
+
+Of scenes with many training views 24 are kept, evenly spaced, and 12 of the others are scored. Scenes with fewer than
+30 are cut into five folds: every fifth view is scored. Test views are not used. The preset is `quick`, the budget 0.6
+MB, the photographs are downscaled by 2.
+
+Each training is kept in OUT/few_views.json as soon as it is measured, so that a second call goes on. The table is
+OUT/few_views.md.
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lab import tables
+from lab.interrupts import interruptible
+
+import a2tg_jax as a2tg
+from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.training import find_system
+from a2tg_jax.training.registry import with_changes
+
+SCENES = ("fox", "snowmiku", "lego", "herz_jesus_p25")
+WHITE_BEHIND = ("lego",)
+BUDGET = 0.6
+NUM_KEPT, NUM_SCORED, NUM_FOLDS = 24, 12, 5
+WITHOUT_DETAILS = {"view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
+REFERENCE = "MCMC, degree 0"
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE: ("gaussians-2d-mcmc", {"sh_degree": 0, "stage2_iterations": 1_000}),
+    "bytewise": ("bytewise", {}),
+    "bytewise without details": ("bytewise", WITHOUT_DETAILS),
+    "the same without pruning": ("bytewise", {**WITHOUT_DETAILS, "prune": {"share": 0.0}}),
+}
+
+
+def captures(folder: Path) -> Iterator[tuple[str, a2tg.Scene]]:
+    """Yield each capture of few views by name, with the scored views in place of test views."""
+    for name in SCENES:
+        scene = a2tg.load_scene(folder / name, downscale=2)
+        num = len(scene.train)
+        if num < 30:
+            for fold in range(NUM_FOLDS):
+                yield f"{name}, fold {fold + 1}", _split(scene, list(range(fold, num, NUM_FOLDS)), None)
+            continue
+        kept = {round(index * (num - 1) / (NUM_KEPT - 1)) for index in range(NUM_KEPT)}
+        others = [index for index in range(num) if index not in kept]
+        yield name, _split(scene, others[:: max(1, len(others) // NUM_SCORED)], sorted(kept))
+
+
+def _split(scene: a2tg.Scene, scored: list[int], kept: list[int] | None) -> a2tg.Scene:
+    """Return the scene with some training views to train on, all but the scored ones if None, and some to score."""
+    kept = [index for index in range(len(scene.train)) if index not in scored] if kept is None else kept
+    train, test = (tuple(scene.train[index] for index in found) for found in (kept, scored))
+    return dataclasses.replace(scene, train=train, test=test)
+
+
+def measured(scene: a2tg.Scene, name: str, label: str) -> dict[str, float]:
+    """Return the figures of one training."""
+    known, options = METHODS[label]
+    own = {"memory_budget": BUDGET, **({"background": "white"} if name in WHITE_BEHIND else {})}
+    system = with_changes(find_system(known).preset("quick"), {**options, **own}, label)
+    start = time.perf_counter()
+    model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
+    psnr, train_psnr = (a2tg.evaluate(views, model).psnr for views in (scene.test, scene.train))
+    return {
+        "psnr": psnr, "train_psnr": train_psnr, "num_gaussians": model.num, "views": len(scene.train),
+        "seconds": time.perf_counter() - start,
+    }  # fmt: skip
+
+
+def table(found: Mapping[str, Mapping[str, float]]) -> str:
+    """Return a row for each capture: PSNR of the reference, and what the others gain, on left-out / training views."""
+    rows = []
+    for name in dict.fromkeys(key.partition(" | ")[0] for key in found):
+        base = found.get(key_of(name, REFERENCE))
+        if base is None:
+            continue
+        gains = [_told(found.get(key_of(name, label)), base) for label in METHODS if label != REFERENCE]
+        rows.append([name, f"{base['views']:g}", f"{base['psnr']:.2f} / {base['train_psnr']:.2f}", *gains])
+    others = [label for label in METHODS if label != REFERENCE]
+    return tables.markdown(["capture", "training views", REFERENCE, *others], rows)
+
+
+def _told(cell: Mapping[str, float] | None, base: Mapping[str, float]) -> str:
+    if cell is None:
+        return tables.MISSING
+    return " / ".join(tables.signed(cell[figure] - base[figure], 2) for figure in ("psnr", "train_psnr"))
+
+
+def key_of(name: str, label: str) -> str:
+    return f"{name} | {label}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, required=True, help=f"folder of {', '.join(SCENES)}")
+    parser.add_argument("--out", type=Path, required=True, help="folder of table and figures")
+    arguments = parser.parse_args()
+    a2tg.configure_cpu()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "few_views.json"
+    found = read_json(path) if path.is_file() else {}
+    for name, scene in captures(arguments.scenes):
+        for label in METHODS:
+            key = key_of(name, label)
+            if key not in found:
+                found[key] = measured(scene, name, label)
+                print(
+                    key,
+                    {figure: round(float(np.float64(value)), 2) for figure, value in found[key].items()},
+                    flush=True,
+                )
+                write_json(path, found)
+                (arguments.out / "few_views.md").write_text(table(found), encoding="utf-8")
+    print(table(found))
+
+
+if __name__ == "__main__":
+    with interruptible():
+        main()
