@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
 
@@ -115,7 +114,7 @@ def main() -> None:
                 found[key] = measured(scene, name, label)
                 print(
                     key,
-                    {figure: round(float(np.float64(value)), 2) for figure, value in found[key].items()},
+                    {figure: round(value, 2) for figure, value in found[key].items()},
                     flush=True,
                 )
                 write_json(path, found)
