@@ -10,7 +10,6 @@ Programs made for 3DGS want a third scale, scale_2, of the axis along the normal
 
 import dataclasses
 import os
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
@@ -18,13 +17,13 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance.copies import LARGEST_OPACITY
-from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.ply_header import read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.io.flat import plain_splats, with_third_axis, without_thinnest_axis
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.suffixes import check_suffix
 from a2tg_jax.io.validate import check_model
@@ -36,11 +35,6 @@ SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
 THIRD_SCALE = "scale_2"
-THICKNESS = 1e-3
-"""Ratio of the third scale of a flat Gaussian in a file to its shorter one."""
-LEAST_OPACITY = 1e-6
-AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
-"""Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
 ENCODING = "binary_little_endian"
 
 
@@ -69,7 +63,7 @@ def save_ply(
     check_suffix(path, "save_ply")
     if isinstance(gaussians, Model):
         model = gaussians.live
-        gaussians = _as_plain(model)
+        gaussians = plain_splats(model)
         transform = model.origin.transform if transform is None and model.origin is not None else transform
     check_gaussians(gaussians)
     if transform is not None:
@@ -79,8 +73,7 @@ def save_ply(
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
     if third_scale:
         names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
-        third = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
-        log_scales = np.concatenate([log_scales, third], axis=1)
+        log_scales = with_third_axis(log_scales)
     columns = [
         np.asarray(gaussians.means),
         np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
@@ -95,16 +88,6 @@ def save_ply(
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
         file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
-
-
-def _as_plain(model: Model) -> Gaussians:
-    """Return the Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
-    shown = model.gaussians, model.params, model.layout
-    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
-    if model.appearance.has_own_opacities:
-        return gaussians
-    opacities = jnp.clip(model.appearance.opacities(*shown), LEAST_OPACITY, LARGEST_OPACITY)
-    return dataclasses.replace(gaussians, logit_opacities=logit(opacities))
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -175,41 +158,11 @@ def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
         sh[:, 1:] = per_channel.transpose(0, 2, 1)
     quats, log_scales = columns(QUATS), columns(SCALES)
     if THIRD_SCALE in names:
-        quats, log_scales = _without_thinnest_axis(quats, columns((*SCALES, THIRD_SCALE)), path)
+        quats, log_scales = without_thinnest_axis(quats, columns((*SCALES, THIRD_SCALE)), path)
     return Gaussians(
         means=jnp.asarray(columns(MEANS)),
         quats=jnp.asarray(quats),
         log_scales=jnp.asarray(log_scales),
         logit_opacities=jnp.asarray(columns(("opacity",))[:, 0]),
         sh=jnp.asarray(sh),
-    )
-
-
-def _without_thinnest_axis(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
-
-    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
-    """
-    thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
-    kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
-    dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
-    num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
-    if num_thick:
-        message = f"{path}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
-        warnings.warn(message, stacklevel=4)
-    return _quaternion_product(quats, AXES_TO_NORMAL[thinnest]), kept
-
-
-def _quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return [N, 4] wxyz: the second rotation, and after it the first."""
-    w, x, y, z = first.T
-    a, b, c, d = second.T
-    return np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=-1,
     )
