@@ -72,6 +72,8 @@ if TYPE_CHECKING:
     from a2tg_jax.io.model_file import save_model as save_model
     from a2tg_jax.io.ply import load_ply as load_ply
     from a2tg_jax.io.ply import save_ply as save_ply
+    from a2tg_jax.io.usd import load_usd as load_usd
+    from a2tg_jax.io.usd import save_usd as save_usd
     from a2tg_jax.mcmc import FillingMcmc as FillingMcmc
     from a2tg_jax.mcmc import Mcmc as Mcmc
     from a2tg_jax.mcmc import Noise as Noise
@@ -173,6 +175,7 @@ _NAMES = {
     "a2tg_jax.io.gltf": ("load_gltf", "save_gltf"),
     "a2tg_jax.io.model_file": ("load_model", "save_model"),
     "a2tg_jax.io.ply": ("load_ply", "save_ply"),
+    "a2tg_jax.io.usd": ("load_usd", "save_usd"),
     "a2tg_jax.mcmc": ("FillingMcmc", "Mcmc", "Noise", "grow", "perturb", "relocate"),
     "a2tg_jax.measure.alignment": ("align_poses", "color_fit"),
     "a2tg_jax.measure.evaluation": ("evaluate",),
