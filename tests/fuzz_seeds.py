@@ -47,8 +47,8 @@ def write_seeds(folder: Path) -> None:
         if name in ("a2tg", "bytewise"):
             save_compact(folder / "compact" / f"{name}.a2tgz", model)
         save_checkpoint(folder / "checkpoints" / f"{name}.npz", some_checkpoint(system()))
-    save_ply(folder / "gaussians" / "gaussians.ply", some_model())
-    save_ply(folder / "gaussians" / "third.ply", some_model(), third_scale=True)
+    save_ply(folder / "gaussians" / "gaussians.ply", some_model(), third_scale=False)
+    save_ply(folder / "gaussians" / "third.ply", some_model())
     _write_lpips(folder / "lpips" / "squeeze.npz")
     _write_run(folder / "run")
     write_runs(folder / "commands")
