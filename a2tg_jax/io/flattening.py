@@ -16,23 +16,24 @@ def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
     return third
 
 
-def flattened(
-    quats: np.ndarray, log_scales: np.ndarray, name: str, *, thickness: float = 2 * THICKNESS
-) -> tuple[np.ndarray, np.ndarray]:
+def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
 
-    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
+    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes. If all
+    have one third scale, the smallest of the file, they are flat Gaussians of a file that rounds scales.
 
     Args:
       quats: [N, 4] wxyz.
       log_scales: [N, 3].
       name: the file, for the warning that some ellipsoids are not flat.
-      thickness: ratio of the thinnest scale to the next up to which an ellipsoid counts as flat.
     """
+    third = log_scales[:, 2]
+    if len(third) and third.min() == third.max() <= log_scales.min():
+        return quats, log_scales[:, :2]
     thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
     kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
     dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
-    num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(thickness))
+    num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
     if num_thick:
         message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
         warnings.warn(message, stacklevel=4)

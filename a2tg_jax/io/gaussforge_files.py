@@ -37,8 +37,6 @@ SUFFIXES = {
     ".ksplat": "ksplat",
 }
 """gaussforge's names of formats, by suffix."""
-ROUNDED_THICKNESS = 0.05
-"""Ratio of scales up to which a splat of a file with rounded scales counts as flat."""
 LEAST_LOG_SCALE = -20.0
 CURVE_BITS = 16
 SOG_HEADER, SOG_FLAT = "meta.json", "2dgs"
@@ -74,7 +72,7 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
         data = file.read()
     is_flat = kind == "sog" and _is_marked_sog(data)
     converted = _converted(data, kind, "ply", path)
-    gaussians = decode_ply(io.BytesIO(converted), path, is_flat=is_flat, thickness=ROUNDED_THICKNESS)
+    gaussians = decode_ply(io.BytesIO(converted), path, is_flat=is_flat)
     return _with_sh_order(gaussians, _order(kind, gaussians.sh_degree)) if kind == "ksplat" else gaussians
 
 
@@ -105,7 +103,7 @@ def _order(kind: str, degree: int) -> np.ndarray:
         channel, coefficient = np.divmod(places, max(each, 1))
         own = np.sqrt(coefficient + 1).astype(int)
         first, width = own**2 - 1, 2 * own + 1
-        return 3 * first + channel * width + coefficient - first
+        places = 3 * first + channel * width + coefficient - first
     return places
 
 
@@ -124,9 +122,10 @@ def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
     except ImportError as error:
         raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
     result = gaussforge.GaussForge().convert(data, before, after)
-    if "data" not in result:
-        raise ValueError(f"{path}: gaussforge says: {shortened(str(result.get('error', 'no data')), 200)}")
-    converted: bytes = result["data"]
+    converted: bytes = result.get("data", b"")
+    if not converted:
+        reason = shortened(str(result.get("error", "no splats in it")), 200)
+        raise ValueError(f"{path}: gaussforge says: {reason}; the file is damaged, or of another format")
     return converted
 
 

@@ -24,7 +24,7 @@ from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.ply_header import header_lines, read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.flattening import THICKNESS, flattened, third_log_scales
+from a2tg_jax.io.flattening import flattened, third_log_scales
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.suffixes import check_suffix
 from a2tg_jax.io.validate import check_model
@@ -136,20 +136,19 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
         return decode_ply(file, path)
 
 
-def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False, thickness: float = 2 * THICKNESS) -> Gaussians:
+def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Gaussians:
     """Read Gaussians from an open PLY file.
 
     Args:
       file: at its beginning.
       path: the name for messages.
       is_flat: whether the splats are known to be flat; if not, the header may say so.
-      thickness: as in `flattened`.
     """
     vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
     quats, log_scales = _columns(vertices, QUATS), _columns(vertices, SCALES)
     if THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path)):
         three = _columns(vertices, (*SCALES, THIRD_SCALE))
-        quats, log_scales = flattened(quats, three, str(path), thickness=thickness)
+        quats, log_scales = flattened(quats, three, str(path))
     gaussians = Gaussians(
         means=jnp.asarray(_columns(vertices, MEANS)),
         quats=jnp.asarray(quats),
