@@ -27,8 +27,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
       log_scales: [N, 3].
       name: the file, for the warning that some ellipsoids are not flat.
     """
-    third = log_scales[:, 2]
-    if len(third) and third.min() == third.max() <= log_scales.min():
+    if _share_a_thin_third(log_scales):
         return quats, log_scales[:, :2]
     thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
     kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
@@ -38,6 +37,14 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
         message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
         warnings.warn(message, stacklevel=4)
     return _quaternion_product(quats, AXES_TO_NORMAL[thinnest]), kept
+
+
+def _share_a_thin_third(log_scales: np.ndarray) -> bool:
+    """Return whether all ellipsoids have one third scale, none has a smaller one, and most are far wider."""
+    if not len(log_scales):
+        return False
+    others, third = log_scales[:, :2], log_scales[:, 2]
+    return bool(third.min() == third.max() <= others.min() and third[0] < np.median(others) + np.log(0.1))
 
 
 def _quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
