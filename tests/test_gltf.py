@@ -113,7 +113,7 @@ def test_what_the_extension_cannot_hold_is_refused_or_left_out(tmp_path):
     appearance = Billboards()
     params, layout = appearance.allocate(jax.random.key(0), gaussians)
     model = Model(gaussians, params, layout, appearance=appearance)
-    with pytest.raises(ValueError, match=r"shows Billboards: a glTF file holds Plain, .*textures=False writes"):
+    with pytest.raises(ValueError, match=r"shows Billboards: a glTF file holds Plain, .*textures=False here"):
         save_gltf(tmp_path / "m.glb", model)
     save_gltf(tmp_path / "m.glb", model, textures=False)
     a2tg.save_ply(tmp_path / "m.ply", model)

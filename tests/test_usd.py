@@ -148,7 +148,7 @@ def test_files_that_are_cut_off(tmp_path, suffix):
 
 def test_without_usd_core_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(ImportError, match=r"pip install 'a2tg-jax\[usd\]'"):
+    with pytest.raises(ValueError, match=r"pip install 'a2tg-jax\[usd\]'"):
         save_usd(tmp_path / "m.usda", plain())
 
 

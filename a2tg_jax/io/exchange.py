@@ -4,9 +4,9 @@ A model's own world has +z up, and lengths in which its cameras are 1 away. A fi
 original one, and the up axis that its format asks for; the model lies where it does in its own.
 """
 
+import dataclasses
 import os
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -17,8 +17,9 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.flat import LEAST_OPACITY, plain_splats, with_third_axis, without_thinnest_axis
+from a2tg_jax.io.flattening import flattened, third_log_scales
 from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of, origin_to_dict
+from a2tg_jax.io.ply import LEAST_OPACITY, plain_gaussians
 from a2tg_jax.model import Model
 
 Up = Literal["x", "y", "z"]
@@ -54,12 +55,13 @@ class Splats(NamedTuple):
 
 def splats_of(model: Model) -> Splats:
     """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter."""
-    gaussians = plain_splats(model)
+    gaussians = plain_gaussians(dataclasses.replace(model, origin=None))
     quats = np.asarray(gaussians.quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
     logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
-    scales = np.exp(with_third_axis(np.asarray(gaussians.log_scales, np.float64)))
+    log_scales = np.asarray(gaussians.log_scales, np.float64)
+    scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
     numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), gaussians.sh)
     return Splats(*(np.asarray(values, np.float32) for values in numbers))
 
@@ -75,7 +77,7 @@ def gaussians_of(splats: Splats, path: str | os.PathLike[str], *, is_flat: bool)
     with np.errstate(invalid="ignore"):
         log_scales = np.log(np.maximum(splats.scales, LEAST_SCALE))
     quats, log_scales = (
-        (splats.quats, log_scales[:, :2]) if is_flat else without_thinnest_axis(splats.quats, log_scales, Path(path))
+        (splats.quats, log_scales[:, :2]) if is_flat else flattened(splats.quats, log_scales, os.fspath(path))
     )
     opacities = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY)
     logits = np.log(opacities) - np.log1p(-opacities)

@@ -89,7 +89,7 @@ def save_gltf(
     if not model.num:
         raise ValueError("model has no Gaussians; a glTF file has at least one")
     if textures:
-        check_kind(model.appearance, "a glTF file", "textures=False writes their plain splats")
+        check_kind(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
     builder = Builder()
     primitive = _primitive(builder, model, texels if textures else None)
     used = [SPLATS, *primitive["extensions"][SPLATS].get("extensions", {})]

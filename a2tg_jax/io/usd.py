@@ -55,8 +55,7 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
       ellipsoids: write a ParticleField3DGaussianSplat with a thin third axis, for programs that draw only these.
 
     Raises:
-      ImportError: if usd-core is missing.
-      ValueError: if the model has a number that is not finite or too large.
+      ValueError: if usd-core is missing, or the model has a number that is not finite or too large.
     """
     check_saved(path, model, "save_usd")
     check_gaussians(model.gaussians, "model.gaussians")
@@ -76,7 +75,7 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
 
 
 def _library() -> Any:
-    """Return the modules of usd-core. ImportError, with what to install, if it is missing or too old."""
+    """Return the modules of usd-core. ValueError, with what to install, if it is missing or too old."""
     try:
         import pxr
         from pxr import Gf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401 - as attributes of the package
@@ -84,7 +83,7 @@ def _library() -> Any:
         if not hasattr(UsdVol, SURFLET):
             raise ImportError("it is older than 26.03")
     except ImportError as error:
-        raise ImportError(f"OpenUSD files need usd-core ({error}): pip install 'a2tg-jax[usd]'") from error
+        raise ValueError(f"OpenUSD files need usd-core ({error}): pip install 'a2tg-jax[usd]'") from error
     return pxr
 
 
@@ -144,8 +143,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ImportError: if usd-core is missing.
-      ValueError: if it is no USD file, is damaged, or holds no splats.
+      ValueError: if usd-core is missing, or it is no USD file, is damaged, or holds no splats.
     """
     check_suffix(path, "load_usd")
     usd, path = _library(), Path(path)
