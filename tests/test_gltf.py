@@ -5,6 +5,8 @@ import dataclasses
 import json
 import struct
 import tracemalloc
+import typing
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -17,7 +19,7 @@ from a2tg_jax.appearance import Billboards, TextureOptions
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io import gltf
+from a2tg_jax.io import gltf, gltf_textures
 from a2tg_jax.io.exchange import matrix_of, placed, upright
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_reader import Document
@@ -281,14 +283,18 @@ def first_primitive(described):
 def with_accessor(name, **changes):
     def change(described):
         index = first_primitive(described)["attributes"].get(name)
-        extended = first_primitive(described)["extensions"][SPLATS]["extensions"][EXTENSION]
-        described["accessors"][extended[name] if index is None else index].update(changes)
+        index = extension_of(described)[name] if index is None else index
+        described["accessors"][index].update(changes)
 
     return change
 
 
+def extension_of(described):
+    return first_primitive(described)["extensions"][SPLATS]["extensions"][EXTENSION]
+
+
 def extended(**changes):
-    return lambda described: first_primitive(described)["extensions"][SPLATS]["extensions"][EXTENSION].update(changes)
+    return lambda described: extension_of(described).update(changes)
 
 
 CHANGES = [
@@ -399,3 +405,20 @@ def test_an_origin_elsewhere_is_taken_along():
     model = dataclasses.replace(model, origin=origin)
     assert placed(model, upright(origin, "y"), "y") is model
     assert placed(model, upright(None, "y"), "y") is not model
+
+
+# The schema of the extension
+
+
+def test_the_schema_knows_what_is_written(saved):
+    """All properties, those of the library's options with its choices and defaults."""
+    schema = json.loads((Path(__file__).parents[1] / "docs/reference/A2TG_splat_textures.schema.json").read_text())
+    hints = typing.get_type_hints(TextureOptions)
+    for name, field in gltf_textures.OPTIONS.items():
+        described = schema["properties"][name]
+        assert described["default"] == getattr(TextureOptions(), field)
+        assert name == "maxAlpha" or tuple(described["enum"]) == typing.get_args(hints[field])
+    written = set(extension_of(saved[0])) | {"texelRanges", "degrees", "baseDegree"}
+    assert written == set(schema["properties"])
+    for name, wanted in schema["dependentRequired"].items():
+        assert {name, *wanted} <= set(schema["properties"])
