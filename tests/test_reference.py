@@ -1,6 +1,7 @@
 """The published formats: readers without this library find in the kept files what it finds, and checksums hold."""
 
-import importlib.util
+import dataclasses
+import importlib
 import json
 import subprocess
 import sys
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference_model
 
+from a2tg_jax import save_model
+from a2tg_jax.appearance import Banded, Textured, TextureOptions
 from a2tg_jax.io.web_scene import encode_web_scene
 
 DATA = Path(__file__).parent / "data"
@@ -17,18 +20,15 @@ READER = Path(__file__).parents[1] / "docs" / "reference" / "read_model.py"
 
 
 @pytest.fixture(scope="module")
-def read_model():
-    """The reference reader, and none of its modules left behind."""
+def reference():
+    """The reference reader and renderer; none of their modules is left behind."""
+    names = {path.stem for path in READER.parent.glob("*.py")}
     sys.path.insert(0, str(READER.parent))
-    before = set(sys.modules)
     try:
-        spec = importlib.util.spec_from_file_location("read_model", READER)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        yield module.read_model
+        yield importlib.import_module("read_model").read_model, importlib.import_module("draw").draw
     finally:
         sys.path.remove(str(READER.parent))
-        for name in {"read_compact", "read_gltf", "read_web", "splats"} - before:
+        for name in names:
             sys.modules.pop(name, None)
 
 
@@ -40,11 +40,27 @@ def test_checksums_hold():
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_the_reference_reader_finds_what_this_library_finds(read_model, name):
+def test_the_reference_reader_finds_what_this_library_finds(reference, name):
+    read_model, _ = reference
     found, wanted = read_model(DATA / name), numbers(load(DATA / name))
     assert set(found) == {*wanted, "header"} and len(found["means"]) == NUM
     for key, values in wanted.items():
         np.testing.assert_allclose(found[key], values, atol=2e-6, rtol=2e-6, err_msg=key)
+
+
+def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path):
+    """By the rules of the page alone."""
+    read_model, draw = reference
+    model, options = reference_model(), {"outside": "identity"}
+    appearance = Banded(Textured(options=TextureOptions(**options)))
+    model = dataclasses.replace(model, appearance=appearance)
+    save_model(tmp_path / "m.npz", model)
+    origin = model.origin
+    image = draw(read_model(tmp_path / "m.npz"), origin.viewmats[0], origin.Ks[0], 64, 48, origin.background, **options)
+    wanted = np.asarray(model.render(origin.cameras[0]).color)
+    assert np.ptp(wanted) > 0.5
+    np.testing.assert_allclose(image, wanted, atol=2e-3)
+    assert np.mean(np.abs(image - wanted)) < 1e-5
 
 
 def test_the_kept_files_hold_the_model():
