@@ -123,8 +123,8 @@ class Document:
             except binascii.Error as error:
                 raise ValueError(f"its embedded buffer is damaged ({error})") from error
         folder = self.path.parent.resolve()
-        file = (folder / urllib.parse.unquote(uri, errors="strict")).resolve()
-        if "://" in uri or "\0" in str(file) or not file.is_relative_to(folder):
+        file = (folder / urllib.parse.unquote(uri, errors="strict")).resolve() if "://" not in uri else None
+        if file is None or not file.is_relative_to(folder):
             raise ValueError(f"its buffer {shortened(uri)} does not lie in the folder of the file")
         if not is_regular(file):
             raise ValueError(f"its buffer {shortened(uri)} is missing")
