@@ -121,3 +121,18 @@ def test_convert_on_the_command_line(tmp_path, capsys):
     assert "is the source" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.xyz")]) == 2
     assert "no format is known" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
+    """There and back by the command, with the bytes of the buffer beside a *.gltf."""
+    model = dataclasses.replace(
+        textured(), origin=Origin.of_cameras([], transform=Similarity(2.0, np.eye(3), np.arange(3.0)))
+    )
+    save_model(tmp_path / "a.npz", model)
+    main(["convert", str(tmp_path / "a.npz"), str(tmp_path / f"b{suffix}")])
+    assert "not kept by this format: last digits\n" in (told := capsys.readouterr().out) and "(0." not in told
+    main(["convert", str(tmp_path / f"b{suffix}"), str(tmp_path / "c.npz")])
+    found = load_model(tmp_path / "c.npz")
+    assert found.origin == model.origin and found.appearance == model.appearance
+    np.testing.assert_array_equal(found.gaussians.means, model.gaussians.means)

@@ -49,10 +49,8 @@ def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
     return FileFormat(name, load_by_gaussforge, save_by_gaussforge, highest_degree=degree, is_exact=False)
 
 
-_GLTF = FileFormat(
-    "glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), keeps_appearance=True, keeps_origin=True
-)
-_USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"), keeps_origin=True)
+_GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), True, True, is_exact=False)
+_USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"), keeps_origin=True, is_exact=False)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
@@ -111,6 +109,12 @@ def save_splats(path: str | os.PathLike[str], model: Model) -> None:
     if found.save is None:
         raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
     found.save(Path(path), model)
+
+
+def file_bytes(path: Path) -> int:
+    """Return the bytes of a file, with those of the buffer beside a *.gltf."""
+    files = [path, path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else [path]
+    return sum(file.stat().st_size for file in files)
 
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:

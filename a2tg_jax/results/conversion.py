@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from a2tg_jax.core.display import counted, in_bytes
-from a2tg_jax.io.formats import format_of, lost_by, save_splats
+from a2tg_jax.io.formats import file_bytes, format_of, lost_by, save_splats
 from a2tg_jax.model import Model
 from a2tg_jax.results.output import check_output
 from a2tg_jax.results.viewing import open_source
@@ -62,7 +62,7 @@ def convert(source: Path, out: Path, name: str | None = None) -> Converted:
         out,
         opened.model,
         opened.num_bytes,
-        out.stat().st_size,
+        file_bytes(out),
         tuple(lost_by(opened.model, out)),
         time.perf_counter() - start,
     )
