@@ -321,6 +321,7 @@ CHANGES = [
     (lambda d: d["buffers"][0].update(uri="../../etc/passwd"), "does not lie in the folder"),
     (lambda d: d["buffers"][0].update(uri="/etc/passwd"), "does not lie in the folder"),
     (lambda d: d["buffers"][0].update(uri="https://a.b/c.bin"), "does not lie in the folder"),
+    (lambda d: d["buffers"][0].update(uri="é" * 200), "too long a name"),
     (lambda d: d["buffers"][0].update(uri="data:;base64,???"), "embedded buffer is damaged"),
     (lambda d: d.update(extensionsRequired=["KHR_gaussian_splatting_compression_spz"]), "needs the extension KHR_g"),
     (lambda d: d["asset"].update(version="1.0"), "glTF of version 1.0"),

@@ -20,6 +20,8 @@ LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
 """Bytes of numbers that a file may hold, as float32, beyond `LARGEST_RATIO` times its own."""
 EMBEDDED = "base64,"
+LONGEST_NAME = 255
+"""Bytes that the name of a buffer may have."""
 
 
 class Document:
@@ -122,6 +124,8 @@ class Document:
                 return base64.b64decode(text, validate=True) if mark else urllib.parse.unquote_to_bytes(head[5:])
             except binascii.Error as error:
                 raise ValueError(f"its embedded buffer is damaged ({error})") from error
+        if len(uri.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
+            raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
         folder = self.path.parent.resolve()
         file = (folder / urllib.parse.unquote(uri, errors="strict")).resolve() if "://" not in uri else None
         if file is None or not file.is_relative_to(folder):
