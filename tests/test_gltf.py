@@ -165,6 +165,18 @@ def test_attributes_are_those_of_the_specification(tmp_path):
     assert len(primitive["attributes"]) == 5 + index
 
 
+def test_coefficients_go_up_to_the_highest_degree_of_a_splat(tmp_path):
+    model = MODELS["banded and textured"]()
+    low = model[model.bands[1].degrees < 2]
+    save_gltf(tmp_path / "m.glb", low)
+    described, _ = parts_of(tmp_path / "m.glb")
+    names = described["meshes"][0]["primitives"][0]["attributes"]
+    assert f"{SPLATS}:SH_DEGREE_1_COEF_2" in names and f"{SPLATS}:SH_DEGREE_2_COEF_0" not in names
+    found = load_gltf(tmp_path / "m.glb")
+    assert_shows_the_same(found, low)
+    assert found.num_bytes == low.num_bytes
+
+
 def test_the_node_stands_upright_in_the_lengths_of_the_original_world(tmp_path):
     model = dataclasses.replace(plain(), origin=dataclasses.replace(plain().origin, transform=some_world()))
     save_gltf(tmp_path / "m.glb", model)
@@ -250,6 +262,20 @@ def test_several_meshes_make_one_model(tmp_path):
     found = load_gltf(path)
     assert found.num == 2 * model.num and found.origin == model.origin
     np.testing.assert_array_equal(found.gaussians.means[model.num :], model.gaussians.means)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_kept"), [({}, True), ({"uv": "align-corners"}, False), ({"maxAlpha": 0.5}, False)]
+)
+def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_kept):
+    """Options of training come back unless a program has changed how textures are shown."""
+    described = json.loads(json.dumps(saved[0]))
+    extended(**changes)(described)
+    write_parts(tmp_path / "m.glb", described, saved[1])
+    appearance = load_gltf(tmp_path / "m.glb").appearance
+    assert (appearance == textured().appearance) is is_kept
+    options = appearance.texture_options
+    assert (options.uv, options.max_alpha) == (changes.get("uv", "texel-centre"), changes.get("maxAlpha", 0.95))
 
 
 def test_other_kernels_and_colours_are_told(tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.flattening import flattened, third_log_scales
@@ -54,7 +55,10 @@ class Splats(NamedTuple):
 
 
 def splats_of(model: Model) -> Splats:
-    """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter."""
+    """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
+
+    If splats have degrees of their own, coefficients go up to the highest of these.
+    """
     gaussians = plain_gaussians(dataclasses.replace(model, origin=None))
     quats = np.asarray(gaussians.quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
@@ -62,7 +66,8 @@ def splats_of(model: Model) -> Splats:
     logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
     log_scales = np.asarray(gaussians.log_scales, np.float64)
     scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
-    numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), gaussians.sh)
+    sh = gaussians.sh if model.bands is None else gaussians.sh[:, : NUM_BASES[model.bands[1].degrees.max(initial=0)]]
+    numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
     return Splats(*(np.asarray(values, np.float32) for values in numbers))
 
 
