@@ -114,7 +114,7 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     """Return in words what a file of some suffix does not keep of a model."""
     into, lost = format_of(path), list[str]()
     if model.textures is not None and not into.keeps_appearance:
-        lost.append("textures")
+        lost.append("textures (--bake turns them into plain splats)")
     elif type(model.appearance.base).__name__ != "Plain" and not into.keeps_appearance:
         lost.append(f"what {type(model.appearance.base).__name__} shows beside Gaussians")
     degree = model.gaussians.sh_degree if model.bands is None else 3
