@@ -13,6 +13,7 @@ from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gaussforge_files import load_by_gaussforge, save_by_gaussforge
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply, save_ply
+from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
 from a2tg_jax.model import Model
 
 Reader = Callable[[Path], Model | Gaussians]
@@ -51,6 +52,7 @@ def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
 
 _GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), keeps_appearance=True)
 _USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"))
+_CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
@@ -65,6 +67,9 @@ FORMATS = {
     ".usda": _USD,
     ".usdc": _USD,
     ".usdz": _USD,
+    ".pt": _CHECKPOINT,
+    ".pth": _CHECKPOINT,
+    ".ckpt": _CHECKPOINT,
 }
 """Formats by suffix. Of two that fit a name the first counts."""
 
