@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel
-from a2tg_jax.results.conversion import convert
+from a2tg_jax.results.conversion import BakeOptions, convert
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,8 +18,11 @@ class Convert:
     *.usdc and *.usdz. Gaussians of 3DGS are flattened along their thinnest axis. Files of other programs hold the
     original world.
 
+    Other programs know no textures. --bake turns a textured splat into plain ones, as many as its texels or fewer, and
+    trains them on pictures of the model. The photographs are not needed.
+
     Examples:
-      a2tg convert runs/fox fox.sog
+      a2tg convert runs/fox fox.sog --bake
       a2tg convert scene.spz scene.npz
     """
 
@@ -30,5 +33,13 @@ class Convert:
     model: LastModel = None
     """Name of a run's model, as a2tg info prints it."""
 
+    bake: bool = False
+    """Turn textured splats into plain ones."""
+    bake_growth: float = BakeOptions.growth
+    """Largest ratio of bytes of the numbers after --bake to those before."""
+    bake_iterations: int = BakeOptions.iterations
+    """Iterations of training in --bake; each draws one view. 0 leaves training out."""
+
     def run(self) -> None:
-        print(convert(self.source, self.out, self.model).text)
+        baking = BakeOptions(self.bake_growth, self.bake_iterations) if self.bake else None
+        print(convert(self.source, self.out, self.model, baking=baking).text)

@@ -1,38 +1,42 @@
 """Plain Gaussians in place of textured ones, for programs that know no textures.
 
-Textures shrink where that changes pictures least, until a given number of splats suffices for a splat per texel. Each
-textured Gaussian then becomes a grid of smaller ones in its plane: texel j of an axis takes the Gaussian with the mass,
-mean and variance of w_j(u)·exp(−u²/2), w_j being the texel's bilinear kernel. These kernels add up to 1, so that the
-smaller Gaussians add up to about the large one. Their opacities and colours are fitted to its alpha and colour in its
-own plane, for alphas of splats that overlap multiply instead.
+Textures shrink where that changes pictures least, until a splat per texel makes few enough splats. Each textured
+Gaussian then becomes a grid of smaller ones in its plane: texel j of an axis takes the Gaussian with the mass, mean and
+variance of w_j(u)·exp(−u²/2), w_j being the texel's bilinear kernel. The kernels add up to 1, so that the smaller
+Gaussians add up to about the large one. Their opacities are such that their optical depths −log(1 − alpha) add up to
+that of the textured splat at each of their centres. Splats smaller than a pixel are still drawn a pixel wide. Training
+on pictures of the textured model, without photographs, therefore follows (`distilling`).
 """
 
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from a2tg_jax.appearance import Plain
 from a2tg_jax.appearance.textured import texel_coordinates
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
-from a2tg_jax.core.jit import Jitted
-from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.finish.shrinking import can_shrink, halved, taken, texel_weights_of
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.finish.distilling import distill, pictures
+from a2tg_jax.finish.shrinking import can_shrink, texel_weights_of
+from a2tg_jax.finish.texel_choice import Tables, fewest_texels
 from a2tg_jax.io.ply import plain_gaussians
 from a2tg_jax.model import Model
 
 MOST_GROWTH = 2.0
 """Largest ratio of the bytes after baking to those before."""
-REACH, SAMPLES = 3.6, 24
-"""Half the side of the square that is fitted, in standard deviations, and samples along it."""
-FIT_STEPS, FIT_RATE = 120, 0.05
-LEAST_ALPHA, MOST_ALPHA = 1e-4, 0.99
+ITERATIONS = 500
+MOST_VIEWS = 12
+"""Largest number of views, evenly chosen, by which it is judged where texels and spherical harmonics matter."""
+LEAST_ALPHA, MOST_ALPHA = 1 / 255, 0.99
+"""Alphas of splats: fainter ones are left out, others are at most so opaque."""
+SAME_PSNR = 38.0
+"""PSNR in dB beside the whole model above which higher degrees of spherical harmonics are left out."""
 
 
 class Kernels(NamedTuple):
@@ -40,16 +44,25 @@ class Kernels(NamedTuple):
 
     means: np.ndarray
     scales: np.ndarray
-    peaks: np.ndarray
 
 
-def bake(model: Model, cameras: Sequence[Camera], *, growth: float = MOST_GROWTH) -> Model:
+def bake(
+    model: Model,
+    cameras: Sequence[Camera],
+    *,
+    growth: float = MOST_GROWTH,
+    iterations: int = ITERATIONS,
+    progress: bool = False,
+) -> Model:
     """Return a plain model that looks like a textured one (host).
 
     Args:
-      model: of `Textured` with signed RGB, or of `Banded` around it. Of other appearances the Gaussians are taken.
-      cameras: views by which it is judged where texels matter.
+      model: of any appearance. `Textured` with signed RGB, and `Banded` around it, becomes a splat per texel or fewer;
+        of others the Gaussians are taken.
+      cameras: views that the new model is trained on.
       growth: largest ratio of the bytes of all floats to those of the model.
+      iterations: of training on pictures of the model; 0: none.
+      progress: show a progress bar.
 
     Raises:
       ValueError: if there are no cameras, or the growth is less than 1.
@@ -57,147 +70,108 @@ def bake(model: Model, cameras: Sequence[Camera], *, growth: float = MOST_GROWTH
     if not cameras or not growth >= 1:
         raise ValueError(f"baking needs cameras and a growth of at least 1; got {len(cameras)} and {growth}")
     model = model.live
+    baked = split_splats(model, cameras[:: -(-len(cameras) // MOST_VIEWS)], growth)
+    return distill(baked, model, cameras, iterations=iterations, progress=progress) if iterations else baked
+
+
+def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Model:
+    """Return a plain model with a splat per texel or fewer, without training. Arguments as in `bake`."""
     if not can_shrink(model):
-        return dataclasses.replace(
-            _as_plain(plain_gaussians(dataclasses.replace(model, origin=None))), origin=model.origin
-        )
-    num_floats = floats_per_gaussian(3 if model.bands is not None else model.gaussians.sh_degree)
-    most = max(int(growth * model.num_bytes / (4 * num_floats)), model.num)
-    model = _with_few_texels(model, cameras, most)
-    return dataclasses.replace(_as_plain(_split(model)), origin=model.origin)
-
-
-def _as_plain(gaussians: Gaussians) -> Model:
-    return Model(gaussians, appearance=Plain())
-
-
-def _with_few_texels(model: Model, cameras: Sequence[Camera], most: int) -> Model:
-    """Return the model with smaller textures, so that a splat per texel makes at most so many splats."""
-    while True:
-        weights = texel_weights_of(model, cameras, model.background)
-        step = halved(model, weights)
-        before, after = _splats(model), np.maximum(step.layout.sizes.prod(axis=1), 1)
-        is_single = before == 1
-        too_many = int(before.sum()) - most
-        saved = before - after
-        order = np.argsort(np.where(saved > 0, step.cost / np.maximum(saved, 1), np.inf), kind="stable")
-        reached = np.cumsum(saved[order])
-        count = 0 if too_many <= 0 else int(np.searchsorted(reached, too_many)) + 1
-        chosen = is_single & (model.textures[1].sizes.prod(axis=1) == 1)  # type: ignore[index]
-        chosen[order[:count]] |= saved[order[:count]] > 0
-        if not chosen.any():
-            return model
-        model = taken(model, step, chosen)
-
-
-def _splats(model: Model) -> np.ndarray:
-    """Return the number of splats [N] that each Gaussian will become."""
+        return as_plain(plain_gaussians(dataclasses.replace(model, origin=None)), model)
+    degree = least_degree(model, cameras)
+    most = int(growth * model.num_bytes / (4 * floats_per_gaussian(degree)))
     assert model.textures is not None
-    num: np.ndarray = np.maximum(model.textures[1].sizes.prod(axis=1), 1)
-    return num
+    weights = texel_weights_of(model, cameras, model.background)
+    tables = fewest_texels(*model.textures, weights, max(most, model.num))
+    whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
+    return as_plain(_split(whole, tables, model.appearance.texture_options.uv), model)  # type: ignore[union-attr]
+
+
+def as_plain(gaussians: Gaussians, model: Model) -> Model:
+    """Return a plain model of Gaussians with the origin of another."""
+    return Model(gaussians, appearance=Plain(), origin=model.origin)
+
+
+def least_degree(model: Model, cameras: Sequence[Camera]) -> int:
+    """Return the lowest degree of spherical harmonics with which pictures stay about the same (host)."""
+    highest = model.gaussians.sh_degree if model.bands is None else 3
+    if highest == 0:
+        return 0
+    wanted = pictures(model, cameras)
+    for degree in range(highest):
+        sh = np.array(model.sh)
+        sh[:, NUM_BASES[degree] :] = 0
+        found = pictures(model.with_sh(sh), cameras)
+        if np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)]) < 10 ** (-SAME_PSNR / 10):
+            return degree
+    return highest
 
 
 @functools.cache
 def kernels(num: int, convention: str) -> Kernels:
     """Return the Gaussians along an axis for `num` texels."""
     u = np.linspace(-6, 6, 4801)
-    place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), convention), np.float64)
-    weights = np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None])) * np.exp(-0.5 * u * u)
+    weights = _weights(u, num, convention) * np.exp(-0.5 * u * u)
     masses = weights.sum(axis=1)
     means = weights @ u / masses
-    scales = np.sqrt(weights @ (u * u) / masses - means**2)
-    return Kernels(means, scales, masses * (u[1] - u[0]) / (np.sqrt(2 * np.pi) * scales))
+    return Kernels(means, np.sqrt(weights @ (u * u) / masses - means**2))
 
 
-def _split(model: Model) -> Gaussians:
-    """Return the Gaussians of all splats: those without a texture as they are, the others in a grid."""
-    assert model.textures is not None and model.appearance.texture_options is not None
-    textures, layout = model.textures
-    whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
-    convention = model.appearance.texture_options.uv
-    pieces = []
-    for index, (tv, tu) in enumerate(layout.resolutions):
-        ids = np.flatnonzero(np.asarray(layout.bucket) == index)
-        if not len(ids):
-            continue
-        own = whole[ids]
-        if tv * tu <= 1:
-            pieces.append(own)
-            continue
-        texels = jnp.asarray(textures.buckets[index])[np.asarray(layout.row)[ids]]
-        pieces.append(_grid(own, texels, kernels(tv, convention), kernels(tu, convention), convention))
+def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
+    """Return the bilinear weights [num, Q] of texels at points of an axis."""
+    place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), convention), np.float64)
+    found: np.ndarray = np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
+    return found
+
+
+def _split(gaussians: Gaussians, tables: Tables, convention: str) -> Gaussians:
+    """Return the Gaussians of all splats."""
+    pieces = [
+        _grid(gaussians[ids], texels, kernels(texels.shape[1], convention), kernels(texels.shape[2], convention))
+        for ids, texels in (_looked_up(*table, convention) for table in tables)
+    ]
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
-    return joined
+    is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
+    return joined[is_seen if is_seen.any() else slice(None)]
 
 
-def _grid(parents: Gaussians, texels: Array, v: Kernels, u: Kernels, convention: str) -> Gaussians:
-    """Return n·Tv·Tu Gaussians in place of n with textures [n, Tv, Tu, 4]."""
+def _looked_up(ids: np.ndarray, texels: np.ndarray, convention: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return textures [n, Tv, Tu, 4] at the centres of their splats in place of the texels."""
+    v, u = (_weights(kernels(size, convention).means, size, convention) for size in texels.shape[1:3])
+    found: np.ndarray = np.einsum("ntsc,tv,su->nvuc", texels, v, u)
+    return ids, found
+
+
+def _grid(parents: Gaussians, texels: np.ndarray, v: Kernels, u: Kernels) -> Gaussians:
+    """Return n·Tv·Tu Gaussians in place of n that show textures [n, Tv, Tu, 4] at their centres."""
     tv, tu = texels.shape[1:3]
-    places = jnp.asarray(np.stack(np.broadcast_arrays(u.means[None, :], v.means[:, None]), -1).reshape(-1, 2))
-    scales = jnp.asarray(np.stack(np.broadcast_arrays(u.scales[None, :], v.scales[:, None]), -1).reshape(-1, 2))
-    peaks = jnp.asarray((v.peaks[:, None] * u.peaks[None, :]).reshape(-1))
-    alphas, colors = _jitted()(parents.opacities, texels, places, scales, peaks, convention)
-    axes = rotation_matrices(parents.quats)[:, :, :2] * parents.scales[:, None, :]
-    means = parents.means[:, None] + jnp.einsum("nxk,pk->npx", axes, places)
-    several = functools.partial(jnp.repeat, repeats=tv * tu, axis=0)
-    sh = several(parents.sh).at[:, 0].add(colors.reshape(-1, 3) / SH_C0)
+    places, scales = (
+        np.stack(np.broadcast_arrays(own_u[None, :], own_v[:, None]), -1).reshape(-1, 2)
+        for own_u, own_v in zip(u, v, strict=True)
+    )
+    opacities = np.asarray(parents.opacities, np.float64)[:, None, None]
+    shown = opacities * texels[..., 3] * np.exp(-0.5 * (v.means[:, None] ** 2 + u.means[None, :] ** 2))
+    depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
+    own = np.einsum("vw,nwx,xu->nvu", _unmixed(v), depths, _unmixed(u).T)
+    alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)
+    axes = np.asarray(rotation_matrices(parents.quats))[:, :, :2] * np.asarray(parents.scales)[:, None, :]
+    means = np.asarray(parents.means)[:, None] + np.einsum("nxk,pk->npx", axes, places)
+    several = functools.partial(np.repeat, repeats=tv * tu, axis=0)
+    sh = several(np.asarray(parents.sh))
+    sh[:, 0] += texels[..., :3].reshape(-1, 3) / SH_C0
+    log_scales = np.asarray(parents.log_scales)[:, None] + np.log(scales)
     dtype = parents.means.dtype
     return Gaussians(
-        means=means.reshape(-1, 3).astype(dtype),
-        quats=several(parents.quats),
-        log_scales=(parents.log_scales[:, None] + jnp.log(scales)).reshape(-1, 2).astype(dtype),
-        logit_opacities=logit(alphas.reshape(-1)).astype(dtype),
-        sh=sh.astype(dtype),
+        means=jnp.asarray(means.reshape(-1, 3), dtype),
+        quats=jnp.asarray(several(np.asarray(parents.quats))),
+        log_scales=jnp.asarray(log_scales.reshape(-1, 2), dtype),
+        logit_opacities=jnp.asarray(logit(jnp.asarray(alphas)), dtype),
+        sh=jnp.asarray(sh, dtype),
     )
 
 
-@functools.cache
-def _jitted() -> Jitted[..., tuple[Array, Array]]:
-    return Jitted(_fitted, static_argnums=(5,))
-
-
-def _fitted(
-    opacities: Array, texels: Array, places: Array, scales: Array, peaks: Array, convention: str
-) -> tuple[Array, Array]:
-    """Return opacities [n, P] and colours [n, P, 3] of splats whose picture in the plane is that of textures."""
-    num, tv, tu, _ = texels.shape
-    line = jnp.linspace(-REACH, REACH, SAMPLES)
-    u, v = (axis.reshape(-1) for axis in jnp.meshgrid(line, line))
-    wanted_alpha, wanted_color = _shown(opacities, texels, u, v, convention)
-    falloff = jnp.exp(-0.5 * (((u - places[:, :1]) / scales[:, :1]) ** 2 + ((v - places[:, 1:]) / scales[:, 1:]) ** 2))
-
-    def picture(raw: tuple[Array, Array]) -> tuple[Array, Array]:
-        alphas, colors = jax.nn.sigmoid(raw[0])[:, :, None] * falloff, raw[1]
-        depths = -jnp.log1p(-jnp.minimum(alphas, MOST_ALPHA))
-        total = jnp.sum(depths, axis=1)
-        mean = jnp.einsum("npq,npc->nqc", depths, colors) / jnp.maximum(total, 1e-6)[..., None]
-        alpha = 1 - jnp.exp(-total)
-        return alpha, alpha[..., None] * mean
-
-    def loss(raw: tuple[Array, Array]) -> Array:
-        alpha, color = picture(raw)
-        return jnp.sum((alpha - wanted_alpha) ** 2) + jnp.sum((color - wanted_color) ** 2)
-
-    flat = texels.reshape(num, tv * tu, 4)
-    start = logit(jnp.clip(opacities[:, None] * flat[..., 3] * peaks, LEAST_ALPHA, MOST_ALPHA)), flat[..., :3]
-
-    def step(carry: Any, _: None) -> tuple[Any, None]:
-        raw, state = carry
-        updated = adam_update(raw, jax.grad(loss)(raw), state, (FIT_RATE, 0.2 * FIT_RATE), eps=1e-12)
-        return (updated.params, updated.state), None
-
-    ((alphas, colors), _), _ = jax.lax.scan(step, (start, adam_init(start)), None, length=FIT_STEPS)
-    return jnp.clip(jax.nn.sigmoid(alphas), LEAST_ALPHA, MOST_ALPHA), colors
-
-
-def _shown(opacities: Array, texels: Array, u: Array, v: Array, convention: str) -> tuple[Array, Array]:
-    """Return alpha [n, Q] and premultiplied residual [n, Q, 3] of textured splats at points of their plane."""
-    weights = [
-        jnp.maximum(
-            0.0, 1 - jnp.abs(texel_coordinates(x, jnp.asarray(float(size)), convention) - jnp.arange(size)[:, None])
-        )
-        for x, size in ((v, texels.shape[1]), (u, texels.shape[2]))
-    ]
-    looked_up = jnp.einsum("ntsc,tq,sq->nqc", texels, *weights)
-    alpha = opacities[:, None] * jnp.exp(-0.5 * (u * u + v * v)) * looked_up[..., 3]
-    return alpha, alpha[..., None] * looked_up[..., :3]
+def _unmixed(axis: Kernels) -> np.ndarray:
+    """Return the inverse of the matrix of each Gaussian of an axis at the centre of each."""
+    apart = (axis.means[:, None] - axis.means[None, :]) / axis.scales[None, :]
+    inverse: np.ndarray = np.linalg.inv(np.exp(-0.5 * apart**2))
+    return inverse

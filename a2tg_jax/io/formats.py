@@ -13,6 +13,7 @@ from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gaussforge_files import load_by_gaussforge, save_by_gaussforge
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply, save_ply
+from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
 from a2tg_jax.model import Model
 
 Reader = Callable[[Path], Model | Gaussians]
@@ -51,6 +52,7 @@ def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
 
 _GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), True, True, is_exact=False)
 _USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"), keeps_origin=True, is_exact=False)
+_CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
@@ -66,6 +68,9 @@ FORMATS = {
     ".usdc": _USD,
     ".usdz": _USD,
     ".usd": _USD,
+    ".pt": _CHECKPOINT,
+    ".pth": _CHECKPOINT,
+    ".ckpt": _CHECKPOINT,
 }
 """Formats by suffix. Of two that fit a name the first counts."""
 
@@ -121,7 +126,7 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     """Return in words what a file of some suffix does not keep of a model."""
     into, lost = format_of(path), list[str]()
     if model.textures is not None and not into.keeps_appearance:
-        lost.append("textures")
+        lost.append("textures (--bake turns them into plain splats)")
     elif type(model.appearance.base).__name__ != "Plain" and not into.keeps_appearance:
         lost.append(f"what {type(model.appearance.base).__name__} shows beside Gaussians")
     degree = model.gaussians.sh_degree if model.bands is None else 3
