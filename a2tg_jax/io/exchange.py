@@ -23,9 +23,8 @@ from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of, ori
 from a2tg_jax.io.ply import LEAST_OPACITY, plain_gaussians
 from a2tg_jax.model import Model
 
-Up = Literal["x", "y", "z"]
+Up = Literal["y", "z"]
 UPRIGHT: Mapping[Up, np.ndarray] = {
-    "x": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "z": np.eye(3),
 }

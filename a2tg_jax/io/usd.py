@@ -24,6 +24,7 @@ from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regul
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.exchange import (
     Splats,
+    Up,
     gaussians_of,
     matrix_of,
     origin_from_json,
@@ -162,7 +163,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
 
 def _loaded(usd: Any, path: Path) -> Model:
     stage = usd.Usd.Stage.Open(str(path))
-    up = str(usd.UsdGeom.GetStageUpAxis(stage)).lower()
+    up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
     unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
     models: list[Model] = []
     first: Origin | None = None
@@ -171,7 +172,7 @@ def _loaded(usd: Any, path: Path) -> Model:
         first = first or model.origin
         matrix = np.array(field.ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())).T
         matrix[:3] *= unit
-        models.append(placed(model, similarity_of(matrix, "the transform of its splats"), up, first))  # type: ignore[arg-type]
+        models.append(placed(model, similarity_of(matrix, "the transform of its splats"), up, first))
         if len(models) > MOST_FIELDS:
             raise ValueError(f"holds more than {MOST_FIELDS} particle fields")
     if not models:
