@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, Plain
+from a2tg_jax.appearance import Plain
 from a2tg_jax.core.gaussians import SH_C0, check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
@@ -32,9 +32,9 @@ from a2tg_jax.io.exchange import (
 )
 from a2tg_jax.io.gltf_nodes import mesh_nodes
 from a2tg_jax.io.gltf_reader import Document
-from a2tg_jax.io.gltf_textures import EXTENSION, OPTIONS, Shown, TexelKind, add_textures, shown_of
+from a2tg_jax.io.gltf_textures import EXTENSION, Shown, TexelKind, add_textures, kept_appearance, shown_of
 from a2tg_jax.io.gltf_writer import Builder
-from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict
+from a2tg_jax.io.model_file import appearance_to_dict
 from a2tg_jax.io.rows import Rows, check_kind, model_of, rows_of
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
@@ -198,13 +198,13 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     extended = described.get("extensions", {}).get(EXTENSION)
     if extended is None:
         gaussians = gaussians_of(splats, document.path, is_flat=False)
-        appearance = _kept_appearance(kept, Plain(), is_told=False)
+        appearance = kept_appearance(kept, Plain(), is_told=False)
         model = Model(gaussians, appearance=appearance, origin=origin)
         check_model(model)
         return model
     shown = shown_of(document, extended, len(splats.means), degree)
     rows = _rows(splats, shown, document.path)
-    appearance = _kept_appearance(kept, shown.appearance, is_told=True)
+    appearance = kept_appearance(kept, shown.appearance, is_told=True)
     return model_of(rows, shown.base_degree, appearance, origin)
 
 
@@ -242,26 +242,6 @@ def _rows(splats: Splats, shown: Shown, path: Path) -> Rows:
         np.asarray(gaussians.means), np.asarray(gaussians.quats), np.asarray(gaussians.log_scales),
         np.asarray(gaussians.logit_opacities), degrees, tuple(bands), shown.sizes, shown.texels,
     )  # fmt: skip
-
-
-def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_told: bool) -> Appearance:
-    """Return the appearance that a model had, with options of its training, if it shows the same.
-
-    Args:
-      kept: what the extras keep.
-      shown: what the file says without these.
-      is_told: the file says more than that there are no textures.
-    """
-    if "appearance" not in kept:
-        return shown
-    appearance = appearance_from_dict(kept["appearance"], ())
-    is_same = type(appearance) is type(shown) and type(appearance.base) is type(shown.base) and appearance.is_portable
-    if is_same and is_told:
-        own, told = appearance.texture_options, shown.texture_options
-        is_same = appearance.max_alpha == shown.max_alpha and all(
-            getattr(own, field, None) == getattr(told, field, None) for field in OPTIONS.values()
-        )
-    return appearance if is_same else shown
 
 
 def _warn_of_others(path: Path, described: Mapping[str, Any]) -> None:

@@ -15,6 +15,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_reader import Document
 from a2tg_jax.io.gltf_writer import Builder
+from a2tg_jax.io.model_file import appearance_from_dict
 from a2tg_jax.io.quantise import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.rows import Rows
 from a2tg_jax.texture import MAX_SIDE
@@ -121,3 +122,23 @@ def _integers(document: Document, index: Any, kind: str, name: str, num: int, mo
     if len(values) != num or not ((values >= 0) & (values <= most) & (values % 1 == 0)).all():
         raise ValueError(f"{EXTENSION}.{name} must be {num} times whole numbers in 0..{most}")
     return values.astype(np.int64)
+
+
+def kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_told: bool) -> Appearance:
+    """Return the appearance that a model had, with options of its training, if it shows the same.
+
+    Args:
+      kept: what the extras keep.
+      shown: what the file says without these.
+      is_told: the file says more than that there are no textures.
+    """
+    if "appearance" not in kept:
+        return shown
+    appearance = appearance_from_dict(kept["appearance"], ())
+    is_same = type(appearance) is type(shown) and type(appearance.base) is type(shown.base) and appearance.is_portable
+    if is_same and is_told:
+        own, told = appearance.texture_options, shown.texture_options
+        is_same = appearance.max_alpha == shown.max_alpha and all(
+            getattr(own, field, None) == getattr(told, field, None) for field in OPTIONS.values()
+        )
+    return appearance if is_same else shown
