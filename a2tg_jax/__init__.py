@@ -66,10 +66,16 @@ if TYPE_CHECKING:
     from a2tg_jax.io.compact import CompactChoices as CompactChoices
     from a2tg_jax.io.compact import load_compact as load_compact
     from a2tg_jax.io.compact import save_compact as save_compact
+    from a2tg_jax.io.formats import load_splats as load_splats
+    from a2tg_jax.io.formats import save_splats as save_splats
+    from a2tg_jax.io.gltf import load_gltf as load_gltf
+    from a2tg_jax.io.gltf import save_gltf as save_gltf
     from a2tg_jax.io.model_file import load_model as load_model
     from a2tg_jax.io.model_file import save_model as save_model
     from a2tg_jax.io.ply import load_ply as load_ply
     from a2tg_jax.io.ply import save_ply as save_ply
+    from a2tg_jax.io.usd import load_usd as load_usd
+    from a2tg_jax.io.usd import save_usd as save_usd
     from a2tg_jax.mcmc import FillingMcmc as FillingMcmc
     from a2tg_jax.mcmc import Mcmc as Mcmc
     from a2tg_jax.mcmc import Noise as Noise
@@ -168,8 +174,11 @@ _NAMES = {
     "a2tg_jax.host.cores": ("set_num_threads",),
     "a2tg_jax.host.startup": ("configure_cpu",),
     "a2tg_jax.io.compact": ("CompactChoices", "load_compact", "save_compact"),
+    "a2tg_jax.io.formats": ("load_splats", "save_splats"),
+    "a2tg_jax.io.gltf": ("load_gltf", "save_gltf"),
     "a2tg_jax.io.model_file": ("load_model", "save_model"),
     "a2tg_jax.io.ply": ("load_ply", "save_ply"),
+    "a2tg_jax.io.usd": ("load_usd", "save_usd"),
     "a2tg_jax.mcmc": ("FillingMcmc", "Mcmc", "Noise", "grow", "perturb", "relocate"),
     "a2tg_jax.measure.alignment": ("align_poses", "color_fit"),
     "a2tg_jax.measure.evaluation": ("evaluate",),

@@ -131,6 +131,21 @@ def of_compact(data, rng):
     return head.pack(magic, version, len(coded), len(text), zlib.crc32(rest)) + rest
 
 
+def of_glb(data, rng):
+    """A change of the JSON of a *.glb, or of its binary chunk, under right lengths."""
+    head, chunk = struct.Struct("<4sII"), struct.Struct("<II")
+    magic, version, _ = head.unpack_from(data)
+    length, kind = chunk.unpack_from(data, head.size)
+    start = head.size + chunk.size
+    text, binary = data[start : start + length], data[start + length + chunk.size :]
+    if rng.random() < 0.8:
+        text = of_json(text, rng)
+    else:
+        binary = of_bytes(binary, rng)
+    body = chunk.pack(len(text), kind) + text + chunk.pack(len(binary), 0x004E4942) + binary
+    return head.pack(magic, version, head.size + len(body)) + body
+
+
 def of_png(data, rng):
     """A change of a chunk of a PNG, under a right checksum."""
     chunks, at = [], 8

@@ -49,6 +49,8 @@ READERS = (
     Reader("compact", ("a2tg.a2tgz", "bytewise.a2tgz"), (mutate.of_compact, mutate.of_bytes), "compact"),
     Reader("checkpoints", ("a2tg.npz", "bytewise.npz", "gaussians-2d.npz"), ARCHIVE, "checkpoint"),
     Reader("gaussians", ("gaussians.ply", "third.ply"), BINARY, "gaussians"),
+    Reader("gltf", ("a2tg.glb", "bytewise.glb"), (mutate.of_glb, mutate.of_glb, mutate.of_bytes), "gltf"),
+    Reader("gltf", ("a2tg.gltf",), JSON, "gltf"),
     Reader("lpips", ("squeeze.npz",), ARCHIVE, "lpips"),
     Reader("run", ("metrics.json",), JSON, "info"),
     Reader("run", ("history/a.csv",), TEXT, "history"),
@@ -173,6 +175,12 @@ def _gaussians(folder: Path, file: Path):
     return _check_model(Model(load_ply(file)))
 
 
+def _gltf(folder: Path, file: Path):
+    from a2tg_jax import load_gltf
+
+    return _check_model(load_gltf(file))
+
+
 def _lpips(folder: Path, file: Path) -> None:
     import numpy as np
 
@@ -223,6 +231,6 @@ def _run(folder: Path, file: Path) -> None:
 
 TARGETS = {
     "scene": _scene, "points": _points, "picture": _picture, "model": _model, "compact": _compact,
-    "checkpoint": _checkpoint, "gaussians": _gaussians, "lpips": _lpips, "info": _info, "history": _history,
-    "record": _record, "marker": _marker, "run": _run,
+    "checkpoint": _checkpoint, "gaussians": _gaussians, "gltf": _gltf, "lpips": _lpips, "info": _info,
+    "history": _history, "record": _record, "marker": _marker, "run": _run,
 }  # fmt: skip

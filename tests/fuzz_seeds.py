@@ -14,7 +14,7 @@ from test_data_colmap import write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
 
 import a2tg_jax as a2tg
-from a2tg_jax import save_compact, save_model, save_ply
+from a2tg_jax import save_compact, save_gltf, save_model, save_ply
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.folder import write_json as write_run_json
@@ -39,16 +39,18 @@ def write_seeds(folder: Path) -> None:
     """A folder for each name of `READERS`."""
     _write_scenes(folder)
     _write_pictures(folder / "pictures")
-    for name in ("models", "compact", "checkpoints", "gaussians", "lpips"):
+    for name in ("models", "compact", "checkpoints", "gaussians", "gltf", "lpips"):
         (folder / name).mkdir()
     for name, system in SYSTEMS.items():
         model = some_model(system())
         save_model(folder / "models" / f"{name}.npz", model)
         if name in ("a2tg", "bytewise"):
             save_compact(folder / "compact" / f"{name}.a2tgz", model)
+            save_gltf(folder / "gltf" / f"{name}.glb", model)
+            save_gltf(folder / "gltf" / f"{name}.gltf", model)
         save_checkpoint(folder / "checkpoints" / f"{name}.npz", some_checkpoint(system()))
-    save_ply(folder / "gaussians" / "gaussians.ply", some_model())
-    save_ply(folder / "gaussians" / "third.ply", some_model(), third_scale=True)
+    save_ply(folder / "gaussians" / "gaussians.ply", some_model(), third_scale=False)
+    save_ply(folder / "gaussians" / "third.ply", some_model())
     _write_lpips(folder / "lpips" / "squeeze.npz")
     _write_run(folder / "run")
     write_runs(folder / "commands")

@@ -20,7 +20,7 @@ from a2tg_jax.core.transform import sh_rotation, transform_gaussians
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.model_file import save_model
-from a2tg_jax.io.ply import ATTRIBUTES, load_ply, save_ply
+from a2tg_jax.io.ply import ATTRIBUTES, encode_ply, load_ply, save_ply
 from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
 from a2tg_jax.texture import textures_from_arrays
@@ -44,7 +44,7 @@ def test_ply_round_trip(tmp_path):
 
 def test_ply_attributes_in_the_order_of_2dgs(tmp_path):
     gaussians = some_gaussians()
-    save_ply(tmp_path / "g.ply", gaussians)
+    save_ply(tmp_path / "g.ply", gaussians, third_scale=False)
     header, data = (tmp_path / "g.ply").read_bytes().split(b"end_header\n", 1)
     names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property float ")]
     rows = np.frombuffer(data, "<f4").reshape(7, 61)
@@ -92,7 +92,7 @@ def test_flat_ellipsoids_show_the_same_whichever_axis_is_thin(tmp_path):
     )
     camera = dataclasses.replace(camera, K=camera.K.at[:2, 2].set(jnp.array([16.0, 12])))
     gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + 1)
-    save_ply(tmp_path / "flat.ply", gaussians, third_scale=True)
+    save_ply(tmp_path / "flat.ply", gaussians)
     header, data = (tmp_path / "flat.ply").read_bytes().split(b"end_header\n", 1)
     names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property float ")]
     rows = np.frombuffer(data, "<f4").reshape(30, 62).copy()
@@ -111,9 +111,21 @@ def test_flat_ellipsoids_show_the_same_whichever_axis_is_thin(tmp_path):
     assert expected.alpha.mean() > 0.2
 
 
-def test_third_scale_round_trip(tmp_path):
-    save_ply(tmp_path / "g.ply", some_gaussians(), third_scale=True)
+@pytest.mark.parametrize("third_scale", [False, True])
+def test_flat_gaussians_come_back_exactly_with_and_without_a_third_scale(tmp_path, third_scale):
+    save_ply(tmp_path / "g.ply", some_gaussians(), third_scale=third_scale)
+    assert b"comment SplatRenderMode: 2dgs\n" in (tmp_path / "g.ply").read_bytes()
     assert_same(load_ply(tmp_path / "g.ply"), some_gaussians())
+
+
+def test_the_third_scale_of_splats_marked_as_flat_says_nothing(tmp_path):
+    """Programs that round scales may leave another axis thinner."""
+    gaussians, path = some_gaussians(), tmp_path / "g.ply"
+    path.write_bytes(encode_ply(gaussians, np.asarray(gaussians.log_scales.max(1, keepdims=True)) + 1))
+    assert_same(load_ply(path), gaussians)
+    path.write_bytes(path.read_bytes().replace(b"2dgs", b"mip "))
+    with pytest.warns(UserWarning, match="3D Gaussians"):
+        assert not np.array_equal(load_ply(path).quats, gaussians.quats)
 
 
 def test_ply_of_a_model_is_in_its_original_world(tmp_path):

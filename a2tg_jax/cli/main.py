@@ -1,4 +1,5 @@
-"""The command line `a2tg`: demo, train, eval, finish, render, view, export, compress, info, sfm, doctor."""
+"""The command line `a2tg`: demo, train, eval, finish, render, view, export, convert, compress, info, sfm,
+doctor."""
 
 import dataclasses
 import functools
@@ -14,6 +15,7 @@ from typing import Annotated, Any, TextIO
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import defaulting_to, parse, with_flags
+from a2tg_jax.cli.convert import Convert
 from a2tg_jax.cli.doctor import Doctor
 from a2tg_jax.cli.finish import Finish
 from a2tg_jax.cli.render import Render
@@ -49,6 +51,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
   a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
+  a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others
   a2tg compress runs/scene             write a small file of the trained model
   a2tg info runs/scene                 print what a run folder holds
   a2tg doctor                          print what this machine computes with, and test it
@@ -117,10 +120,10 @@ class Info:
         print(describe_run(open_run(self.folder)))
 
 
-Command = Demo | Train | Eval | Finish | Render | View | Export | Compress | Info | Sfm
+Command = Demo | Train | Eval | Finish | Render | View | Export | Convert | Compress | Info | Sfm
 COMMANDS: dict[str, type] = {
     "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "view": View, "export": Export,
-    "compress": Compress, "info": Info, "sfm": Sfm, "doctor": Doctor,
+    "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm, "doctor": Doctor,
 }  # fmt: skip
 
 

@@ -49,7 +49,9 @@ class VertexHeader:
 
     def check_room(self, file: BinaryIO, num_bytes: int) -> None:
         """Raise ValueError if the rest of a file is too short for this number of bytes per vertex."""
-        left = os.fstat(file.fileno()).st_size - file.tell()
+        start = file.tell()
+        left = file.seek(0, os.SEEK_END) - start
+        file.seek(start)
         if self.count * num_bytes > left:
             raise ValueError(
                 f"{self.path}: is cut off; {self.count} vertices of {num_bytes} bytes were announced, and {left} bytes "

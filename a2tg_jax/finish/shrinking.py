@@ -211,19 +211,24 @@ def _filled(
 
 
 def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textures:
+    """Return h of every texel in some views, whose photographs are not used. Arguments as in `texel_weights_of`."""
+    return texel_weights_of(model, [view.camera for view in views], background)
+
+
+def texel_weights_of(model: Model, cameras: Sequence[Camera], background: Any) -> Textures:
     """h of every texel, in the layout of the model (host).
 
     Args:
       model: with textures.
-      views: cameras; their photographs are not used.
+      cameras: views in which texels are visible.
       background: [3] colour.
     """
     assert model.textures is not None
-    settings = plan_render(model, [view.camera for view in views])
+    settings = plan_render(model, cameras)
     background = jnp.asarray(background, model.gaussians.means.dtype)
     total: Textures = jax.tree.map(jnp.zeros_like, model.textures[0])
-    for index, view in enumerate(views):
-        total = jax.tree.map(jnp.add, total, _jitted()(model, view.camera, background, jax.random.key(index), settings))
+    for index, camera in enumerate(cameras):
+        total = jax.tree.map(jnp.add, total, _jitted()(model, camera, background, jax.random.key(index), settings))
     return total
 
 

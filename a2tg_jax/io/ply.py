@@ -1,16 +1,15 @@
-"""PLY files of Gaussians with the attribute names of 2DGS.
+"""PLY files of Gaussians with the attribute names of 2DGS, and a third scale for programs made for 3DGS.
 
-x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 rot_0..3, little-endian float32: opacities as logits,
-scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all of red,
-then green, then blue. What splats show besides has no place in this format: textures, movable kernels and billboards,
-and with them the colours and opacities that they carry, are lost; `save_model` keeps all.
-
-Programs made for 3DGS want a third scale, scale_2, of the axis along the normal.
+x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32: opacities as
+logits, scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all
+of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The comment
+"SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format: textures,
+movable kernels and billboards, and with them the colours and opacities that they carry, are lost; `save_model` keeps
+all.
 """
 
 import dataclasses
 import os
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
@@ -22,9 +21,10 @@ from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
-from a2tg_jax.data.ply_header import read_vertex_header
+from a2tg_jax.data.ply_header import header_lines, read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.io.flattening import flattened, third_log_scales
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.suffixes import check_suffix
 from a2tg_jax.io.validate import check_model
@@ -36,12 +36,10 @@ SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
 THIRD_SCALE = "scale_2"
-THICKNESS = 1e-3
-"""Ratio of the third scale of a flat Gaussian in a file to its shorter one."""
 LEAST_OPACITY = 1e-6
-AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
-"""Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
 ENCODING = "binary_little_endian"
+FLAT_MARK = "SplatRenderMode: 2dgs"
+"""Comment in the header by which programs tell flat splats from ellipsoids."""
 
 
 def save_ply(
@@ -49,9 +47,9 @@ def save_ply(
     gaussians: Gaussians | Model,
     transform: Similarity | None = None,
     *,
-    third_scale: bool = False,
+    third_scale: bool = True,
 ) -> None:
-    """Write Gaussians as 2DGS does, normals along the splats' own.
+    """Write Gaussians with the attributes of 2DGS, normals along the splats' own, and a third scale.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
@@ -61,25 +59,36 @@ def save_ply(
       transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
         model back to the original world of its origin, if it has one.
-      third_scale: write scale_2, too, a thousandth of the shorter scale, for viewers of 3DGS files.
+      third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS want. False leaves it out,
+        as 2DGS does.
 
     Raises:
       ValueError: if a field of the Gaussians has another shape than it must have.
     """
     check_suffix(path, "save_ply")
+    gaussians = plain_gaussians(gaussians, transform)
+    third = third_log_scales(np.asarray(gaussians.log_scales)) if third_scale else None
+    with replacing(path) as temporary:
+        temporary.write_bytes(encode_ply(gaussians, third))
+
+
+def plain_gaussians(gaussians: Gaussians | Model, transform: Similarity | None = None) -> Gaussians:
+    """Return the Gaussians of a model without what they show, in the original world. Arguments as in `save_ply`."""
     if isinstance(gaussians, Model):
         model = gaussians.live
         gaussians = _as_plain(model)
         transform = model.origin.transform if transform is None and model.origin is not None else transform
     check_gaussians(gaussians)
-    if transform is not None:
-        gaussians = transform_gaussians(gaussians, transform.inverse())
+    return gaussians if transform is None else transform_gaussians(gaussians, transform.inverse())
+
+
+def encode_ply(gaussians: Gaussians, third: np.ndarray | None) -> bytes:
+    """Return a PLY file of Gaussians, with the logarithms [N, 1] of third scales, or without a third scale."""
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, 3 * (sh.shape[1] - 1))
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
-    if third_scale:
+    if third is not None:
         names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
-        third = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
         log_scales = np.concatenate([log_scales, third], axis=1)
     columns = [
         np.asarray(gaussians.means),
@@ -91,10 +100,8 @@ def save_ply(
         np.asarray(gaussians.quats),
     ]
     properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat {ENCODING} 1.0\nelement vertex {gaussians.num}\n{properties}end_header\n"
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+    start = f"ply\nformat {ENCODING} 1.0\ncomment {FLAT_MARK}\nelement vertex {gaussians.num}\n"
+    return f"{start}{properties}end_header\n".encode("ascii") + np.concatenate(columns, 1).astype("<f4").tobytes()
 
 
 def _as_plain(model: Model) -> Gaussians:
@@ -110,9 +117,9 @@ def _as_plain(model: Model) -> Gaussians:
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
-    They have the SH degree of the file; further attributes are left aside. A 3DGS file (scale_2) holds
-    ellipsoids: the thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more
-    than a thousandth of the others.
+    They have the SH degree of the file; further attributes are left aside. The third scale (scale_2) of a file that
+    says that its splats are flat is dropped. Any other holds ellipsoids: the thinnest axis of each becomes the normal
+    and its scale is dropped, with a warning if that is more than a thousandth of the others.
 
     Returns:
       float32 Gaussians in the world of the file.
@@ -126,14 +133,42 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such PLY file")
     with open_regular(path) as file:
-        vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
-    gaussians = _gaussians_of(vertices, path)
+        return decode_ply(file, path)
+
+
+def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Gaussians:
+    """Read Gaussians from an open PLY file.
+
+    Args:
+      file: at its beginning.
+      path: the name for messages.
+      is_flat: whether the splats are known to be flat; if not, the header may say so.
+    """
+    vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
+    quats, log_scales = _columns(vertices, QUATS), _columns(vertices, SCALES)
+    if THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path)):
+        three = _columns(vertices, (*SCALES, THIRD_SCALE))
+        quats, log_scales = flattened(quats, three, str(path))
+    gaussians = Gaussians(
+        means=jnp.asarray(_columns(vertices, MEANS)),
+        quats=jnp.asarray(quats),
+        log_scales=jnp.asarray(log_scales),
+        logit_opacities=jnp.asarray(_columns(vertices, ("opacity",))[:, 0]),
+        sh=jnp.asarray(_sh_of(vertices, path)),
+    )
     try:
         _check_rows(gaussians)
         check_model(Model(gaussians))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return gaussians
+
+
+def _is_marked(file: BinaryIO, path: Path) -> bool:
+    """Return whether the header of a PLY says that the splats are flat."""
+    file.seek(0)
+    lines = [" ".join(words[1:]).lower() for words in header_lines(file, path) if words[:1] == ["comment"]]
+    return FLAT_MARK.lower() in lines
 
 
 def _check_rows(gaussians: Gaussians) -> None:
@@ -157,59 +192,20 @@ def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
     return header.read_binary(file)
 
 
-def _gaussians_of(vertices: np.ndarray, path: Path) -> Gaussians:
-    """Return the Gaussians of a structured array of vertices."""
-    names = vertices.dtype.names or ()
-    rest = [name for name in SH_REST if name in names]
+def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
+    """Return the spherical harmonics [N, K, 3] of a structured array of vertices."""
+    rest = [name for name in SH_REST if name in (vertices.dtype.names or ())]
     if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
-
-    def columns(wanted: Iterable[str]) -> np.ndarray:
-        with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
-            return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
-
     sh = np.zeros((len(vertices), 1 + len(rest) // 3, 3), np.float32)
-    sh[:, 0] = columns(SH_DEGREE0)
+    sh[:, 0] = _columns(vertices, SH_DEGREE0)
     if rest:
-        per_channel = columns(rest).reshape(len(vertices), 3, len(rest) // 3)
+        per_channel = _columns(vertices, rest).reshape(len(vertices), 3, len(rest) // 3)
         sh[:, 1:] = per_channel.transpose(0, 2, 1)
-    quats, log_scales = columns(QUATS), columns(SCALES)
-    if THIRD_SCALE in names:
-        quats, log_scales = _without_thinnest_axis(quats, columns((*SCALES, THIRD_SCALE)), path)
-    return Gaussians(
-        means=jnp.asarray(columns(MEANS)),
-        quats=jnp.asarray(quats),
-        log_scales=jnp.asarray(log_scales),
-        logit_opacities=jnp.asarray(columns(("opacity",))[:, 0]),
-        sh=jnp.asarray(sh),
-    )
+    return sh
 
 
-def _without_thinnest_axis(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
-
-    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
-    """
-    thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
-    kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
-    dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
-    num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
-    if num_thick:
-        message = f"{path}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
-        warnings.warn(message, stacklevel=4)
-    return _quaternion_product(quats, AXES_TO_NORMAL[thinnest]), kept
-
-
-def _quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return [N, 4] wxyz: the second rotation, and after it the first."""
-    w, x, y, z = first.T
-    a, b, c, d = second.T
-    return np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=-1,
-    )
+def _columns(vertices: np.ndarray, wanted: Iterable[str]) -> np.ndarray:
+    """Return attributes of vertices as columns, float32."""
+    with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
+        return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)

@@ -44,12 +44,13 @@ class Rows:
     """Texels [T, 4], one texture after the other, each row by row."""
 
 
-def check_kind(appearance: Appearance) -> None:
-    """Raise ValueError unless a compact file can hold what splats show."""
+def check_kind(
+    appearance: Appearance, file: str = "a compact file", instead: str = "save_model keeps any model"
+) -> None:
+    """Raise ValueError, saying what to do instead, unless a file can hold what splats show."""
     if not appearance.is_portable:
         raise ValueError(
-            f"model shows {type(appearance.base).__name__}: a compact file holds Plain, Textured and Banded of "
-            "these; save_model keeps any model"
+            f"model shows {type(appearance.base).__name__}: {file} holds Plain, Textured and Banded of these; {instead}"
         )
 
 

@@ -9,7 +9,10 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 
-FORMATS = {".npz": "model", ".a2tgz": "compact", ".ply": "ply"}
+FORMATS = {
+    ".npz": "model", ".a2tgz": "compact", ".ply": "ply", ".glb": "gltf", ".gltf": "gltf",
+    ".usdz": "usd", ".usdc": "usd", ".usda": "usd", ".usd": "usd",
+}  # fmt: skip
 """Formats by suffix; `save_` and `load_` stand before the names of their functions."""
 
 

@@ -17,6 +17,6 @@ def export_ply(source: Source, out: Path) -> str:
     if out.is_dir() or out.suffix.lower() != SUFFIX:
         raise ValueError(f"--ply must be the path of a file that ends in {SUFFIX}; got {out}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_ply(out, source.model, third_scale=True)
+    save_ply(out, source.model)
     left_out = "" if source.model.textures is None else ", without their textures, which PLY cannot hold"
     return f"file: {out}: {source.model.num:,} Gaussians{left_out}"

@@ -73,7 +73,7 @@ def evaluate_run(
     for name, model in models.items():
         write_corrections(run, name, model)
     main = models[result.main]
-    save_ply(run.own(run.point_cloud), main, third_scale=True)
+    save_ply(run.own(run.point_cloud), main)
     _write_viewer(run, main, f"{scene.name} · {result.main}")
     histories = {name: read_history(run.history(name)) for name in models}
     starts = {name: plan.first_iteration(name) for name in models}

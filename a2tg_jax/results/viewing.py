@@ -7,7 +7,7 @@ import json
 import shlex
 import threading
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,8 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.compact import load_compact
+from a2tg_jax.io.formats import FORMATS, load_splats
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
@@ -31,9 +30,7 @@ from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, vie
 from a2tg_jax.web.server import Route
 
 QUALITY = 90
-LOADERS: Mapping[str, Callable[[Path], Model]] = {".npz": load_model, ".a2tgz": load_compact}
-"""Readers of models, by the suffix of the file."""
-SHOWN = "a run folder, or a file *.npz, *.a2tgz or *.ply"
+SHOWN = f"a run folder, or a file *{', *'.join(FORMATS)}"
 MOST_LISTED = 5
 """Largest number of run folders that a message lists."""
 
@@ -50,6 +47,8 @@ class Source:
     """Render settings."""
     load_scene: Callable[[], Scene | None] = lambda: None
     """Loader of the photographs; None without photographs."""
+    num_bytes: int = 0
+    """Bytes of the file that it was read from."""
 
     @functools.cached_property
     def near_plane(self) -> float:
@@ -68,7 +67,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
     """Open a run folder or a file for viewing.
 
     Args:
-      path: a run folder; or a model, *.npz or *.a2tgz; or Gaussians, *.ply.
+      path: a run folder, or a file of any format that `load_splats` reads.
       name: which model of a run, by the name that `a2tg info` tells; None is the last of its main system.
 
     Raises:
@@ -81,12 +80,9 @@ def open_source(path: Path, name: str | None = None) -> Source:
         raise FileNotFoundError(f"{path}: no such file or folder")
     if name is not None:
         raise ValueError(f"--model needs a run folder; {path} is not a folder")
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        return _source_of_ply(path)
-    if suffix not in LOADERS:
+    if not path.name.lower().endswith(tuple(FORMATS)):
         raise ValueError(f"{path}: is not a scene to show; give {SHOWN}")
-    return Source(LOADERS[suffix](path), path.stem)
+    return _source_of_file(path)
 
 
 def _run_at(folder: Path) -> RunFolder:
@@ -117,17 +113,18 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
             return None  # The photographs are gone; the model shows itself.
 
     title = f"{record.scene.name} · {planned.name}"
-    return Source(load_model(path), title, settings=settings_of(planned.system), load_scene=load_scene)
+    model, settings = load_model(path), settings_of(planned.system)
+    return Source(model, title, settings=settings, load_scene=load_scene, num_bytes=path.stat().st_size)
 
 
-def _source_of_ply(path: Path) -> Source:
+def _source_of_file(path: Path) -> Source:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        gaussians = load_ply(path)
+        model = load_splats(path)
     notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
     for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=3)
-    return Source(Model(gaussians), path.stem, ". ".join(notes))
+    return Source(model, path.stem, ". ".join(notes), num_bytes=path.stat().st_size)
 
 
 # Photographs

@@ -30,6 +30,7 @@ function only<T>(found: readonly T[], what: string): T {
 export function onefile(): Plugin {
   return {
     name: "onefile",
+    apply: (config, { command }) => command === "build" && config.build?.ssr === undefined,
     enforce: "post",
     generateBundle(_, bundle) {
       const files = Object.values(bundle);

@@ -1,0 +1,52 @@
+"""Training of a plain model on pictures of another model, in place of photographs."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.data.world import scene_scale
+from a2tg_jax.model import Model
+from a2tg_jax.renderer import Renderer
+from a2tg_jax.systems.gaussians_2d import Gaussians2d
+from a2tg_jax.training import fit_stage
+
+
+def distill(
+    model: Model, wanted: Model, cameras: Sequence[Camera], *, iterations: int, progress: bool = False
+) -> Model:
+    """Return a plain model after training on pictures of another one; the number of Gaussians stays.
+
+    Args:
+      model: of `Plain`, in the world of the other.
+      wanted: any model.
+      cameras: views to draw, at least one.
+      iterations: each draws one view.
+      progress: show a progress bar.
+    """
+    highest = model.gaussians.sh_degree
+    system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest)
+    start = dataclasses.replace(model, origin=None)
+    trained = fit_stage(drawn_scene(wanted, cameras), system, 1, start, progress=progress, title="bake").model
+    return dataclasses.replace(trained, origin=wanted.origin)
+
+
+def pictures(model: Model, cameras: Sequence[Camera]) -> list[np.ndarray]:
+    """Return the pictures [H, W, 3] of a model, clipped to [0, 1] (host)."""
+    renderer = Renderer(model, cameras=cameras, has_geometry=False)
+    return [np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras]
+
+
+def drawn_scene(model: Model, cameras: Sequence[Camera]) -> Scene:
+    """Return a scene whose photographs are pictures of a model (host)."""
+    drawn = (np.rint(255 * image).astype(np.uint8) for image in pictures(model, cameras))
+    views = tuple(
+        View(str(index), camera, image) for index, (camera, image) in enumerate(zip(cameras, drawn, strict=True))
+    )
+    points = np.asarray(model.gaussians.means, np.float32)
+    world = Similarity(1.0, np.eye(3), np.zeros(3)) if model.origin is None else model.origin.transform
+    scale = scene_scale(camera_centers(np.array([camera.viewmat for camera in cameras], np.float64)))
+    return Scene("drawn", views, (), points, np.zeros_like(points), world, scale)

@@ -1,0 +1,177 @@
+"""Models as files of other programs hold them: activated numbers of ellipsoids, and a world that stands upright.
+
+A model's own world has +z up, and lengths in which its cameras are 1 away. A file's world has the lengths of the
+original one, and the up axis that its format asks for; the model lies where it does in its own.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.appearance.copies import LARGEST_OPACITY
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.similarity import Similarity, check_similarity
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.flattening import flattened, third_log_scales
+from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of, origin_to_dict
+from a2tg_jax.io.ply import LEAST_OPACITY, plain_gaussians
+from a2tg_jax.model import Model
+
+Up = Literal["y", "z"]
+UPRIGHT: Mapping[Up, np.ndarray] = {
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "z": np.eye(3),
+}
+"""Rotation from a world of +z up to one of another axis."""
+LEAST_SCALE = 1e-30
+SAME_PLACE = 1e-5
+"""Largest difference of the numbers of two similarities that are taken for one."""
+SAME_SCALE = 1e-3
+"""Largest difference of the scales of the axes of a transform, relative to the largest."""
+ORIGIN_KINDS = {"sizes": np.int64, "is_test": bool}
+Result = TypeVar("Result")
+
+
+class Splats(NamedTuple):
+    """N ellipsoids as a renderer wants them; float32 on the host."""
+
+    means: np.ndarray
+    """[N, 3]."""
+    quats: np.ndarray
+    """Unit quaternions [N, 4], wxyz."""
+    scales: np.ndarray
+    """Standard deviations [N, 3]."""
+    opacities: np.ndarray
+    """[N] in [0, 1]."""
+    sh: np.ndarray
+    """[N, K, 3] coefficients, as in `Gaussians`."""
+
+
+def splats_of(model: Model) -> Splats:
+    """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
+
+    If splats have degrees of their own, coefficients go up to the highest of these.
+    """
+    gaussians = plain_gaussians(dataclasses.replace(model, origin=None))
+    quats = np.asarray(gaussians.quats, np.float64)
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
+    logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
+    log_scales = np.asarray(gaussians.log_scales, np.float64)
+    scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
+    sh = gaussians.sh if model.bands is None else gaussians.sh[:, : NUM_BASES[model.bands[1].degrees.max(initial=0)]]
+    numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
+    return Splats(*(np.asarray(values, np.float32) for values in numbers))
+
+
+def gaussians_of(splats: Splats, path: str | os.PathLike[str], *, is_flat: bool) -> Gaussians:
+    """Return the Gaussians of splats.
+
+    Args:
+      splats: the splats.
+      path: their file, for the warning if some are not flat.
+      is_flat: the third axis is the normal; else the thinnest is.
+    """
+    with np.errstate(invalid="ignore"):
+        log_scales = np.log(np.maximum(splats.scales, LEAST_SCALE))
+    quats, log_scales = (
+        (splats.quats, log_scales[:, :2]) if is_flat else flattened(splats.quats, log_scales, os.fspath(path))
+    )
+    opacities = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY)
+    logits = np.log(opacities) - np.log1p(-opacities)
+    numbers = (splats.means, quats, log_scales, logits, splats.sh)
+    return Gaussians(*(jnp.asarray(values, jnp.float32) for values in numbers))
+
+
+# Worlds
+
+
+def upright(origin: Origin | None, up: Up) -> Similarity:
+    """Return the similarity from a model's world to that of a file with this axis up."""
+    scale = 1.0 if origin is None else 1.0 / float(origin.transform.scale)
+    return Similarity(scale, UPRIGHT[up], np.zeros(3))
+
+
+def matrix_of(similarity: Similarity) -> np.ndarray:
+    """Return a similarity as a matrix [4, 4] for columns."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = similarity.scale * similarity.rotation
+    matrix[:3, 3] = similarity.translation
+    return matrix
+
+
+def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
+    """Return the similarity that a matrix [4, 4] for columns is.
+
+    Raises:
+      ValueError: naming it `what`, if it mirrors, shears, or scales axes differently.
+    """
+    scales = np.linalg.norm(matrix[:3, :3], axis=0)
+    largest = float(scales.max())
+    if not np.isfinite(matrix).all() or not 0 < largest < np.inf:
+        raise ValueError(f"{what} must be finite, and must not scale by 0")
+    if np.ptp(scales) > SAME_SCALE * largest or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError(f"{what} scales its axes differently; apply it to the splats in another program first")
+    rotation = matrix[:3, :3] / largest
+    u, _, v = np.linalg.svd(rotation)
+    check_similarity(Similarity(largest, rotation, matrix[:3, 3]), what)
+    return Similarity(largest, u @ v, matrix[:3, 3])
+
+
+def placed(model: Model, world: Similarity, up: Up, origin: Origin | None = None) -> Model:
+    """Return a model of a file in its own world, which has +z up (host).
+
+    A model stays as it is where its file places it as it was written. Else it moves, and its origin along.
+
+    Args:
+      model: the model as the file holds it.
+      world: the similarity from there to the world of the file.
+      up: the axis that is up there.
+      origin: where another part of the same file was trained; None takes the model's own.
+    """
+    move = world.then(upright(origin or model.origin, up).inverse())
+    if np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
+        return model
+    check_similarity(move, "its transform")
+    return model.transform(move)
+
+
+# Origins as text
+
+
+def origin_to_json(origin: Origin) -> dict[str, Any]:
+    """Return an origin as lists of numbers and texts, without the corrections."""
+    return origin_to_dict(origin) | {name: array.tolist() for name, array in origin_arrays(origin).items()}
+
+
+def origin_from_json(data: Mapping[str, Any]) -> Origin:
+    """Return the origin that `origin_to_json` was given. ValueError: it is damaged."""
+    shapes = {"viewmats": (-1, 4, 4), "Ks": (-1, 3, 3), "sizes": (-1, 2)}
+    arrays = {}
+    for name in ("viewmats", "Ks", "sizes", "is_test", "scale", "rotation", "translation"):
+        kind = ORIGIN_KINDS.get(name, np.float64)
+        array = np.asarray(data[name])
+        if array.dtype.kind not in "biuf" or (array.size and np.dtype(kind).kind == "b" != array.dtype.kind):
+            raise ValueError(f"origin/{name} must be numbers; got {shortened(data[name])}")
+        arrays[name] = array.astype(kind).reshape(shapes.get(name, array.shape))
+    return origin_of(data, arrays)
+
+
+# Errors
+
+
+def reading(path: str | os.PathLike[str], read: Callable[[], Result]) -> Result:
+    """Return what `read` returns. Errors in what a file says become one ValueError that names it."""
+    where = os.fspath(path)
+    try:
+        return read()
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{where}: is damaged or of another version ({shortened(repr(error))})") from error
+    except ValueError as error:
+        raise ValueError(f"{where}: {shortened(str(error).removeprefix(f'{where}: '), LONGEST_REASON)}") from error

@@ -1,0 +1,139 @@
+"""Formats of files of splats: by suffix how each is read and written, and what it keeps."""
+
+import dataclasses
+import importlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.compact import load_compact, save_compact
+from a2tg_jax.io.gaussforge_files import load_by_gaussforge, save_by_gaussforge
+from a2tg_jax.io.model_file import load_model, save_model
+from a2tg_jax.io.ply import load_ply, save_ply
+from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
+from a2tg_jax.model import Model
+
+Reader = Callable[[Path], Model | Gaussians]
+Writer = Callable[[Path, Model], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class FileFormat:
+    """Format of files, and what it keeps of a model beside its Gaussians."""
+
+    name: str
+    load: Reader | None
+    save: Writer | None
+    keeps_appearance: bool = False
+    """Whether textures, and whatever else splats show, are kept."""
+    keeps_origin: bool = False
+    """Whether cameras, background and the normalised world are kept; other formats hold the original world."""
+    highest_degree: int = 3
+    """Highest degree of spherical harmonics."""
+    is_exact: bool = True
+    """Whether numbers come back unrounded."""
+
+
+def _later(module: str, function: str) -> Callable[..., Any]:
+    """Return a function that imports a function of a module of this room when it is called."""
+
+    def call(*arguments: object) -> Any:
+        return getattr(importlib.import_module(f"a2tg_jax.io.{module}"), function)(*arguments)
+
+    return call
+
+
+def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
+    return FileFormat(name, load_by_gaussforge, save_by_gaussforge, highest_degree=degree, is_exact=False)
+
+
+_GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), True, True, is_exact=False)
+_USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"), keeps_origin=True, is_exact=False)
+_CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
+FORMATS = {
+    ".npz": FileFormat("model", load_model, save_model, True, True),
+    ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
+    ".compressed.ply": FileFormat("compressed PLY", load_ply, save_by_gaussforge, is_exact=False),
+    ".ply": FileFormat("PLY", load_ply, save_ply),
+    ".spz": _by_gaussforge("SPZ"),
+    ".sog": _by_gaussforge("SOG"),
+    ".splat": _by_gaussforge(".splat", degree=0),
+    ".ksplat": _by_gaussforge(".ksplat"),
+    ".glb": _GLTF,
+    ".gltf": _GLTF,
+    ".usda": _USD,
+    ".usdc": _USD,
+    ".usdz": _USD,
+    ".usd": _USD,
+    ".pt": _CHECKPOINT,
+    ".pth": _CHECKPOINT,
+    ".ckpt": _CHECKPOINT,
+}
+"""Formats by suffix. Of two that fit a name the first counts."""
+
+
+def format_of(path: str | os.PathLike[str]) -> FileFormat:
+    """Return the format of a file by its suffix.
+
+    Raises:
+      ValueError: if the suffix is unknown.
+    """
+    name = Path(path).name.lower()
+    for suffix, found in FORMATS.items():
+        if name.endswith(suffix):
+            return found
+    raise ValueError(f"{shortened(os.fspath(path))}: no format is known by this suffix; known are {', '.join(FORMATS)}")
+
+
+def load_splats(path: str | os.PathLike[str]) -> Model:
+    """Read a model from a file of any format that is known by its suffix, such as *.npz, *.ply, *.spz or *.sog.
+
+    Ellipsoids of files of 3DGS become flat, with a warning if that changes them.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
+    """
+    found = format_of(path)
+    if found.load is None:
+        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be written, but not read")
+    loaded = found.load(Path(path))
+    return Model(loaded) if isinstance(loaded, Gaussians) else loaded
+
+
+def save_splats(path: str | os.PathLike[str], model: Model) -> None:
+    """Write a model in the format of the suffix. Formats of other programs hold its Gaussians in the original world.
+
+    Raises:
+      ValueError: if the suffix is unknown, an optional library is missing, or the format cannot hold the model.
+    """
+    found = format_of(path)
+    if found.save is None:
+        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
+    found.save(Path(path), model)
+
+
+def file_bytes(path: Path) -> int:
+    """Return the bytes of a file, with those of the buffer beside a *.gltf."""
+    files = [path, path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else [path]
+    return sum(file.stat().st_size for file in files)
+
+
+def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
+    """Return in words what a file of some suffix does not keep of a model."""
+    into, lost = format_of(path), list[str]()
+    if model.textures is not None and not into.keeps_appearance:
+        lost.append("textures (--bake turns them into plain splats)")
+    elif type(model.appearance.base).__name__ != "Plain" and not into.keeps_appearance:
+        lost.append(f"what {type(model.appearance.base).__name__} shows beside Gaussians")
+    degree = model.gaussians.sh_degree if model.bands is None else 3
+    if degree > into.highest_degree:
+        lost.append(f"spherical harmonics above degree {into.highest_degree}")
+    if model.origin is not None and not into.keeps_origin:
+        lost.append("cameras and background")
+    if not into.is_exact:
+        lost.append("last digits")
+    return lost

@@ -1,0 +1,155 @@
+"""Files of other programs' splats by the library gaussforge: SPZ, SOG, compressed PLY, .splat and .ksplat.
+
+They pass through a PLY file in memory. Rows are written in the order of a Z curve, and all with one third scale, the
+smallest: formats that round scales by a table then spend one entry on it. What a format can say of flat splats is added
+to its file.
+
+gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than it reads them, and those of
+.ksplat in another order than GaussianSplats3D. Here they have the order that SuperSplat and GaussianSplats3D read.
+"""
+
+import dataclasses
+import importlib
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.flattening import third_log_scales
+from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, plain_gaussians
+from a2tg_jax.io.quantise import morton
+from a2tg_jax.model import Model
+
+SUFFIXES = {
+    ".compressed.ply": "compressed.ply",
+    ".spz": "spz",
+    ".sog": "sog",
+    ".splat": "splat",
+    ".ksplat": "ksplat",
+}
+"""gaussforge's names of formats, by suffix."""
+LEAST_LOG_SCALE = -20.0
+CURVE_BITS = 16
+SOG_HEADER, SOG_FLAT = "meta.json", "2dgs"
+MOST_HEADER_BYTES = 1 << 24
+
+
+def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
+    """Write the Gaussians of a model, in its original world, in the format of the suffix.
+
+    Raises:
+      ValueError: if gaussforge is not installed or cannot write them.
+    """
+    kind, gaussians = _kind(path), _along_curve(plain_gaussians(model))
+    third = third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
+    source = _with_sh_order(gaussians, np.argsort(_order(kind, gaussians.sh_degree)))
+    ply = encode_ply(source, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
+    data = _marked(_converted(ply, "ply", kind, Path(path)), kind)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
+    """Read Gaussians from a file, in its world. Ellipsoids are flattened as `load_ply` does, with a warning.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
+    """
+    kind, path = _kind(path), Path(path)
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such file")
+    with open_regular(path) as file:
+        data = file.read()
+    is_flat = kind == "sog" and _is_marked_sog(data)
+    converted = _converted(data, kind, "ply", path)
+    gaussians = decode_ply(io.BytesIO(converted), path, is_flat=is_flat)
+    return _with_sh_order(gaussians, _order(kind, gaussians.sh_degree)) if kind == "ksplat" else gaussians
+
+
+def _kind(path: str | os.PathLike[str]) -> str:
+    """Return gaussforge's name of the format of a file."""
+    name = Path(path).name.lower()
+    for suffix, kind in SUFFIXES.items():
+        if name.endswith(suffix):
+            return kind
+    raise ValueError(f"{shortened(os.fspath(path))}: must end in one of {', '.join(SUFFIXES)}")
+
+
+def _along_curve(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians in the order of a Z curve through their means."""
+    means = np.asarray(gaussians.means, np.float64)
+    low, high = (end(axis=0, initial=0.0) for end in (means.min, means.max))
+    codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
+    return gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
+
+
+def _order(kind: str, degree: int) -> np.ndarray:
+    """Return for each coefficient above degree 0, channel by channel, its place in gaussforge's order of a file."""
+    each = (degree + 1) ** 2 - 1
+    places = np.arange(3 * each)
+    if kind == "compressed.ply":
+        return places % 3 * each + places // 3
+    if kind == "ksplat":  # Degree by degree, and within each channel by channel.
+        channel, coefficient = np.divmod(places, max(each, 1))
+        own = np.sqrt(coefficient + 1).astype(int)
+        first, width = own**2 - 1, 2 * own + 1
+        places = 3 * first + channel * width + coefficient - first
+    return places
+
+
+def _with_sh_order(gaussians: Gaussians, order: np.ndarray) -> Gaussians:
+    """Return Gaussians whose coefficients above degree 0, channel by channel, are taken in an order."""
+    sh = np.asarray(gaussians.sh)
+    rest = sh[:, 1:].transpose(0, 2, 1)
+    taken = rest.reshape(len(sh), -1)[:, order].reshape(rest.shape).transpose(0, 2, 1)
+    return dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], taken], axis=1)))
+
+
+def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
+    """Return the bytes of one format as another's."""
+    try:
+        gaussforge: Any = importlib.import_module("gaussforge")
+    except ImportError as error:
+        raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
+    result = gaussforge.GaussForge().convert(data, before, after)
+    converted: bytes = result.get("data", b"")
+    if not converted:
+        reason = shortened(str(result.get("error", "no splats in it")), 200)
+        raise ValueError(f"{path}: gaussforge says: {reason}; the file is damaged, or of another format")
+    return converted
+
+
+def _marked(data: bytes, kind: str) -> bytes:
+    """Return a file that says that its splats are flat, if its format can."""
+    if kind == "compressed.ply":
+        return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n".encode(), 1)
+    if kind != "sog":
+        return data
+    marked = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(marked, "w") as new:
+        for entry in old.infolist():
+            content = old.read(entry)
+            if entry.filename == SOG_HEADER:
+                content = json.dumps({**json.loads(content), "model": SOG_FLAT}, separators=(",", ":")).encode()
+            new.writestr(zipfile.ZipInfo(entry.filename), content)
+    return marked.getvalue()
+
+
+def _is_marked_sog(data: bytes) -> bool:
+    """Return whether a SOG file says that its splats are flat; False if it is none."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(SOG_HEADER) as file:
+            header = json.loads(file.read(MOST_HEADER_BYTES))
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, RuntimeError):
+        return False
+    return isinstance(header, dict) and header.get("model") == SOG_FLAT

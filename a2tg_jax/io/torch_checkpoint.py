@@ -1,0 +1,225 @@
+"""Gaussians from checkpoints of PyTorch (*.pt, *.ckpt, *.pth), without PyTorch and without running what they pickle.
+
+Since PyTorch 1.6 a checkpoint is a zip: a pickle that refers to storages, and one entry of plain numbers for each. The
+pickle may name the functions that make tensors, ordered dictionaries and NumPy scalars, and nothing else.
+
+Read are the checkpoints of gsplat ({"splats": …}), of Nerfstudio's splatfacto ("…gauss_params.means", …), and of the
+programs of 3DGS and 2DGS ((parameters, iteration)).
+"""
+
+import collections
+import io
+import math
+import os
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.flattening import flattened
+from a2tg_jax.io.validate import check_model
+from a2tg_jax.model import Model
+
+STORAGES = {
+    "DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "LongStorage": "<i8", "IntStorage": "<i4",
+    "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
+}  # fmt: skip
+MOST_PICKLE_BYTES = 1 << 24
+MOST_ENTRIES = 10_000
+GSPLAT = ("means", "quats", "scales", "opacities", "sh0", "shN")
+NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
+TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacities": 6}
+"""Places of the parameters in the tuple that 3DGS and 2DGS save."""
+TUPLE_LENGTH = 12
+
+
+def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
+    """Read Gaussians from a checkpoint of gsplat, Nerfstudio, 3DGS or 2DGS. Ellipsoids become flat, with a warning.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not such a checkpoint, is damaged, pickles anything else than tensors, or a number is not
+        finite.
+    """
+    path = Path(path)
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such checkpoint")
+    with open_regular(path) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                arrays = _unpickled(archive)
+        except _Refused as error:
+            raise ValueError(f"{path}: {error}") from None
+        except Exception as error:  # A damaged pickle may raise anything.
+            reason = shortened(str(error) or type(error).__name__, 200)
+            raise ValueError(f"{path}: is no checkpoint of PyTorch 1.6 or newer, or is damaged ({reason})") from error
+    try:
+        gaussians = _gaussians_of(_fields_of(arrays), path)
+        check_model(Model(gaussians))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return gaussians
+
+
+class _Refused(Exception):
+    """A pickle names something else than tensors."""
+
+
+class _Storage(NamedTuple):
+    """A storage of a checkpoint, not yet read."""
+
+    dtype: str
+    key: str
+    num: int
+
+
+class _Ignored:
+    """A value of no use here, such as a NumPy scalar."""
+
+    def __init__(self, *arguments: Any):
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+class _Tensor(NamedTuple):
+    """A view into a storage."""
+
+    storage: _Storage
+    offset: int
+    size: tuple[int, ...]
+    stride: tuple[int, ...]
+
+
+def _rebuild_tensor(storage: _Storage, offset: int, size: Any, stride: Any, *rest: Any) -> _Tensor:
+    return _Tensor(storage, offset, tuple(size), tuple(stride))
+
+
+def _rebuild_parameter(data: Any, *rest: Any) -> Any:
+    return data
+
+
+KNOWN = {
+    ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
+    ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
+    ("torch.nn.parameter", "Parameter"): _rebuild_parameter,
+    ("collections", "OrderedDict"): collections.OrderedDict,
+    ("numpy.core.multiarray", "scalar"): _Ignored,
+    ("numpy._core.multiarray", "scalar"): _Ignored,
+    ("numpy", "dtype"): _Ignored,
+    ("_codecs", "encode"): _Ignored,
+    ("torch", "device"): _Ignored,
+}
+"""What a pickle may name, and what is called in its place."""
+
+
+class _Unpickler(pickle.Unpickler):
+    """Unpickler that calls nothing but `KNOWN`."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module == "torch" and name in STORAGES:
+            return STORAGES[name]
+        if (module, name) not in KNOWN:
+            raise _Refused(
+                f"pickles {shortened(f'{module}.{name}')}, which could run any code; save a dictionary of tensors "
+                "alone, or export a PLY"
+            )
+        return KNOWN[module, name]
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        kind, dtype, key, _, num = pid
+        if kind != "storage" or not isinstance(dtype, str) or not isinstance(num, int):
+            raise _Refused("refers to something else than a storage")
+        return _Storage(dtype, str(key), num)
+
+
+def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
+    """Return the arrays of a checkpoint's Gaussians by gsplat's names."""
+    names = archive.namelist()
+    pickled = next((name for name in names if name.count("/") == 1 and name.endswith("/data.pkl")), None)
+    if pickled is None or len(names) > MOST_ENTRIES:
+        raise _Refused("is not a checkpoint of PyTorch: it has no data.pkl")
+    folder = pickled.removesuffix("data.pkl")
+    if folder + "byteorder" in names and archive.read(folder + "byteorder") != b"little":
+        raise _Refused("is a checkpoint of a big-endian machine")
+    if archive.getinfo(pickled).file_size > MOST_PICKLE_BYTES:
+        raise _Refused(f"has a pickle of more than {MOST_PICKLE_BYTES:,} bytes")
+    value = _Unpickler(io.BytesIO(archive.read(pickled))).load()
+    return {name: _array(tensor, archive, folder) for name, tensor in _tensors_of(value).items()}
+
+
+def _tensors_of(value: Any) -> dict[str, _Tensor]:
+    """Return the tensors of Gaussians in a checkpoint by gsplat's names."""
+    if isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[0], tuple | list):
+        parts = value[0]
+        found = {name: parts[place] for name, place in TUPLE_2DGS.items()} if len(parts) >= TUPLE_LENGTH - 1 else {}
+    else:
+        flat = _flat(value)
+        wanted = GSPLAT if any(name.endswith("sh0") for name in flat) else NERFSTUDIO
+        pairs = zip(GSPLAT, wanted, strict=True)
+        found = {name: flat[key] for name, own in pairs for key in flat if key.rpartition(".")[2] == own}
+    tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, _Tensor)}
+    missing = [name for name in GSPLAT[:-1] if name not in tensors]
+    if missing:
+        raise _Refused(f"holds no Gaussians as gsplat, Nerfstudio, 3DGS or 2DGS save them: no {', '.join(missing)}")
+    return tensors
+
+
+def _flat(value: Any, prefix: str = "", depth: int = 0) -> dict[str, Any]:
+    """Return the leaves of nested dictionaries by dotted names."""
+    if not isinstance(value, Mapping) or depth > 4:
+        return {prefix: value}
+    return {name: leaf for key, own in value.items() for name, leaf in _flat(own, f"{prefix}.{key}", depth + 1).items()}
+
+
+def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray:
+    """Return the numbers of a tensor, which must lie within its storage."""
+    storage, size = tensor.storage, tensor.size
+    num = math.prod(list(size))
+    dtype, entry = np.dtype(storage.dtype), archive.getinfo(f"{folder}data/{storage.key}")
+    steps = [stride * (side - 1) for side, stride in zip(size, tensor.stride, strict=True)]
+    numbers = (tensor.offset, *size, *tensor.stride)
+    if any(type(number) is not int or number < 0 for number in numbers) or entry.compress_type != zipfile.ZIP_STORED:
+        raise _Refused("has a tensor of negative sizes, or compressed storages")
+    if entry.file_size != storage.num * dtype.itemsize or len(size) > 4:
+        raise _Refused("has a storage of another size than its tensor says")
+    if num > storage.num or (num and tensor.offset + sum(steps) >= storage.num):
+        raise _Refused("has a tensor that reaches beyond its storage")
+    flat = np.frombuffer(archive.read(entry), dtype)
+    strides = [stride * dtype.itemsize for stride in tensor.stride]
+    return np.array(np.lib.stride_tricks.as_strided(flat[tensor.offset :], size, strides), np.float32)
+
+
+def _fields_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return means, quats, scales, opacities and SH [N, K, 3]. Raises ValueError if the shapes disagree."""
+    num = len(arrays["means"])
+    first = arrays["sh0"].reshape(num, 1, 3)
+    rest = arrays.get("shN")
+    rest = np.zeros((num, 0, 3), np.float32) if rest is None else rest.reshape(num, -1, 3)
+    shapes = {"means": (num, 3), "quats": (num, 4), "scales": (num, arrays["scales"].shape[-1]), "opacities": (num,)}
+    fields = {name: arrays[name].reshape(shape) for name, shape in shapes.items()}
+    sh = np.concatenate([first, rest], axis=1)
+    if sh.shape[1] not in (1, 4, 9, 16) or fields["scales"].shape[1] not in (2, 3):
+        raise ValueError(f"has {sh.shape[1]} coefficients and {fields['scales'].shape[1]} scales of each Gaussian")
+    return {**fields, "sh": sh}
+
+
+def _gaussians_of(fields: Mapping[str, np.ndarray], path: Path) -> Gaussians:
+    quats, log_scales = fields["quats"], fields["scales"]
+    if log_scales.shape[1] == 3:
+        quats, log_scales = flattened(quats, log_scales, str(path))
+    return Gaussians(
+        means=jnp.asarray(fields["means"]),
+        quats=jnp.asarray(quats),
+        log_scales=jnp.asarray(log_scales),
+        logit_opacities=jnp.asarray(fields["opacities"]),
+        sh=jnp.asarray(fields["sh"]),
+    )

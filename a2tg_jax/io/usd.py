@@ -1,0 +1,232 @@
+"""OpenUSD files of splats: particle fields with a kernel of planar Gaussians, as *.usdz, *.usdc or *.usda.
+
+A ParticleField of USD 26.03 or later whose kernel is ParticleFieldKernelGaussianSurfletAPI holds exactly these
+Gaussians: the kernel lies in the plane of the first two axes. Textures have no place in it. The library usd-core reads
+and writes the files.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.core.gaussians import check_gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.exchange import (
+    Splats,
+    Up,
+    gaussians_of,
+    matrix_of,
+    origin_from_json,
+    origin_to_json,
+    placed,
+    reading,
+    similarity_of,
+    splats_of,
+    upright,
+)
+from a2tg_jax.io.suffixes import check_saved, check_suffix
+from a2tg_jax.io.validate import check_model
+from a2tg_jax.model import Model, concatenate
+
+ORIGIN = "a2tg:origin"
+"""Name of the origin, as JSON, in the custom data of a particle field."""
+ATTRIBUTES = ("Position", "Orientation", "Scale", "Opacity", "SphericalHarmonics")
+SURFLET, ELLIPSOID = "ParticleFieldKernelGaussianSurfletAPI", "ParticleFieldKernelGaussianEllipsoidAPI"
+MOST_FIELDS = 256
+"""Largest number of particle fields in one file."""
+
+
+def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = False) -> None:
+    """Write a model's live rows as a particle field of OpenUSD, without textures, and with its origin.
+
+    Args:
+      path: the file, *.usdz, *.usdc or *.usda; *.usd is as *.usdc. An older one is replaced once the new one is whole.
+      model: any model; its splats are as plain as `save_ply` makes them.
+      ellipsoids: write a ParticleField3DGaussianSplat with a thin third axis, for programs that draw only these.
+
+    Raises:
+      ValueError: if usd-core is missing, or the model has a number that is not finite or too large.
+    """
+    check_saved(path, model, "save_usd")
+    check_gaussians(model.gaussians, "model.gaussians")
+    model = model.live
+    check_model(model)
+    stage = _stage_of(model, ellipsoids)
+    path = Path(path)
+    with replacing(path) as temporary, tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        suffix = path.suffix.lower() if path.suffix.lower() in (".usda", ".usdz") else ".usdc"
+        layer = Path(folder, f"splats{'.usdc' if suffix == '.usdz' else suffix}")
+        written = stage.GetRootLayer().Export(str(layer))
+        if written and suffix == ".usdz":
+            written = _library().UsdUtils.CreateNewUsdzPackage(str(layer), str(layer.with_suffix(suffix)))
+        if not written:
+            raise ValueError(f"{path}: usd-core could not write the file")
+        shutil.move(layer.with_suffix(suffix), temporary)
+
+
+def _library() -> Any:
+    """Return the modules of usd-core. ValueError, with what to install, if it is missing or too old."""
+    try:
+        import pxr
+        from pxr import Gf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401 - as attributes of the package
+
+        if not hasattr(UsdVol, SURFLET):
+            raise ImportError("it is older than 26.03")
+    except ImportError as error:
+        raise ValueError(f"OpenUSD files need usd-core ({error}): pip install 'a2tg-jax[usd]'") from error
+    return pxr
+
+
+def _stage_of(model: Model, ellipsoids: bool) -> Any:
+    """Return a stage of one particle field."""
+    usd, splats = _library(), splats_of(model)
+    stage = usd.Usd.Stage.CreateInMemory()
+    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.z)
+    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    world = usd.UsdGeom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    kind = usd.UsdVol.ParticleField3DGaussianSplat if ellipsoids else usd.UsdVol.ParticleField
+    field = kind.Define(stage, "/World/Splats")
+    prim = field.GetPrim()
+    if not ellipsoids:
+        for name in ATTRIBUTES:
+            getattr(usd.UsdVol, f"ParticleField{name}AttributeAPI").Apply(prim)
+        getattr(usd.UsdVol, SURFLET).Apply(prim)
+    matrix = matrix_of(upright(model.origin, "z"))
+    field.AddTransformOp().Set(usd.Gf.Matrix4d(*matrix.T.ravel().tolist()))
+    _set_numbers(usd, prim, splats)
+    if model.num:
+        reach = 3 * splats.scales.max(axis=1, keepdims=True)
+        corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
+        field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
+    if model.origin is not None:
+        prim.SetCustomDataByKey(ORIGIN, json.dumps(origin_to_json(model.origin), allow_nan=False))
+    return stage
+
+
+def _set_numbers(usd: Any, prim: Any, splats: Splats) -> None:
+    """Set the attributes of a particle field; coefficients go particle by particle."""
+    volume, arrays = usd.UsdVol, usd.Vt
+    xyzw = np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])
+    harmonics = volume.ParticleFieldSphericalHarmonicsAttributeAPI(prim)
+    numbers = (
+        (volume.ParticleFieldPositionAttributeAPI(prim).CreatePositionsAttr(), arrays.Vec3fArray, splats.means),
+        (volume.ParticleFieldOrientationAttributeAPI(prim).CreateOrientationsAttr(), arrays.QuatfArray, xyzw),
+        (volume.ParticleFieldScaleAttributeAPI(prim).CreateScalesAttr(), arrays.Vec3fArray, splats.scales),
+        (volume.ParticleFieldOpacityAttributeAPI(prim).CreateOpacitiesAttr(), arrays.FloatArray, splats.opacities),
+        (
+            harmonics.CreateRadianceSphericalHarmonicsCoefficientsAttr(),
+            arrays.Vec3fArray,
+            splats.sh.reshape(-1, 3),
+        ),
+    )
+    for attribute, kind, values in numbers:
+        attribute.Set(kind.FromNumpy(np.ascontiguousarray(values)))
+    harmonics.CreateRadianceSphericalHarmonicsDegreeAttr(NUM_BASES.index(splats.sh.shape[1]))
+
+
+def load_usd(path: str | os.PathLike[str]) -> Model:
+    """Return the model of the particle fields of an OpenUSD file, float32, of this program or another.
+
+    Files of `save_usd` bring the origin along, and the model back in its world. Fields of other programs are turned so
+    that +z is up, in metres. The thinnest axis of ellipsoids becomes the normal, with a warning if that changes much.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if usd-core is missing, or it is no USD file, is damaged, or holds no splats.
+    """
+    check_suffix(path, "load_usd")
+    usd, path = _library(), Path(path)
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such USD file")
+    open_regular(path, MOST_ARRAY_BYTES).close()
+
+    def loaded() -> Model:
+        try:
+            return _loaded(usd, path)
+        except RuntimeError as error:  # Those of usd-core, of several lines.
+            raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
+
+    return reading(path, loaded)
+
+
+def _loaded(usd: Any, path: Path) -> Model:
+    stage = usd.Usd.Stage.Open(str(path))
+    up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
+    unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
+    models: list[Model] = []
+    first: Origin | None = None
+    for field in _fields(usd, stage):
+        model = _model_of(usd, field, path)
+        first = first or model.origin
+        matrix = np.array(field.ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())).T
+        matrix[:3] *= unit
+        models.append(placed(model, similarity_of(matrix, "the transform of its splats"), up, first))
+        if len(models) > MOST_FIELDS:
+            raise ValueError(f"holds more than {MOST_FIELDS} particle fields")
+    if not models:
+        raise ValueError("holds no splats (ParticleField)")
+    return models[0] if len(models) == 1 else concatenate(models)
+
+
+def _fields(usd: Any, stage: Any) -> Iterator[Any]:
+    for prim in stage.Traverse():
+        if prim.IsA(usd.UsdVol.ParticleField):
+            yield usd.UsdVol.ParticleField(prim)
+
+
+def _model_of(usd: Any, field: Any, path: Path) -> Model:
+    """Return the model of a particle field, in the field's own world."""
+    prim = field.GetPrim()
+    kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
+    if len(kernels) != 1:
+        raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
+    gaussians = gaussians_of(_splats(usd, prim), path, is_flat=SURFLET in kernels)
+    kept = prim.GetCustomDataByKey(ORIGIN)
+    origin = origin_from_json(parse_json(kept)) if isinstance(kept, str) else None
+    model = Model(gaussians, origin=origin)
+    check_model(model)
+    return model
+
+
+def _splats(usd: Any, prim: Any) -> Splats:
+    """Return the numbers of a particle field.
+
+    Attributes that are too long are cut, and those that are missing or too short have the values of the schema.
+    """
+    means = _numbers(usd, prim, "positions", 3)
+    if means is None:
+        means = np.zeros((0, 3), np.float32)
+    num = len(means)
+    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get(usd.Usd.TimeCode.EarliestTime())
+    bases = (int(degree) + 1) ** 2
+    sh = _numbers(usd, prim, "radiance:sphericalHarmonicsCoefficients", 3, num * bases)
+    sh = np.zeros((num, 1, 3), np.float32) if sh is None else sh.reshape(num, bases, 3)[:, : NUM_BASES[-1]]
+
+    def column(name: str, default: tuple[float, ...]) -> np.ndarray:
+        values = _numbers(usd, prim, name, len(default), num)
+        return np.tile(np.asarray(default, np.float32), (num, 1)) if values is None else values
+
+    quats = column("orientations", (0.0, 0.0, 0.0, 1.0))[:, [3, 0, 1, 2]]
+    return Splats(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
+
+
+def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = None) -> np.ndarray | None:
+    """Return the `wanted` first rows [n, columns] of an attribute, in floats or else in halves; None if it has none."""
+    for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
+        values = attribute.Get(usd.Usd.TimeCode.EarliestTime()) if attribute else None
+        if values is not None and len(values) >= (wanted or 0):
+            rows: np.ndarray = np.asarray(values).reshape(-1, columns)[:wanted].astype(np.float32)
+            return rows
+    return None

@@ -1,0 +1,97 @@
+"""Conversion of models between formats of files."""
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+
+from a2tg_jax.appearance import Plain
+from a2tg_jax.core.display import counted, in_bytes
+from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
+from a2tg_jax.finish.distilling import pictures
+from a2tg_jax.io.formats import file_bytes, format_of, lost_by, save_splats
+from a2tg_jax.model import Model
+from a2tg_jax.results.output import check_output
+from a2tg_jax.results.viewing import open_source
+
+
+@dataclasses.dataclass(frozen=True)
+class Converted:
+    """A converted model, and its bytes before and after."""
+
+    source: Path
+    out: Path
+    model: Model
+    bytes_before: int
+    bytes_after: int
+    lost: tuple[str, ...]
+    seconds: float
+    baked: str = ""
+    """What baking did, in words."""
+
+    @property
+    def text(self) -> str:
+        """Summary in a line or two."""
+        ratio = self.bytes_after / max(self.bytes_before, 1)
+        sizes = f"{in_bytes(self.bytes_after)} from {in_bytes(self.bytes_before)} ({ratio:.2f} times)"
+        lines = [f"{self.out}: {counted(self.model.num, 'Gaussian')}, {sizes}, {self.seconds:.1f} s"]
+        if self.baked:
+            lines.insert(0, self.baked)
+        if self.lost:
+            lines.append(f"not kept by this format: {', '.join(self.lost)}")
+        if self.model.origin is not None and not format_of(self.out).keeps_origin:
+            lines.append("world: the original one, in its units and axes")
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class BakeOptions:
+    """Baking of textured splats into plain ones."""
+
+    growth: float = MOST_GROWTH
+    iterations: int = ITERATIONS
+
+
+def convert(source: Path, out: Path, name: str | None = None, *, baking: BakeOptions | None = None) -> Converted:
+    """Write a model in the format of another suffix.
+
+    Args:
+      source: a run folder or a file of any known format.
+      out: the file.
+      name: which model of a run; None is the last of its main system.
+      baking: how textures become plain splats; None leaves them as they are.
+
+    Raises:
+      FileNotFoundError: if there is no such file, or the run's stage is not finished.
+      ValueError: if a format is unknown, or the source cannot be read or written.
+    """
+    format_of(out)
+    if out.is_dir():
+        raise ValueError(f"{out} is a folder; give the path of a file")
+    if source.resolve() == out.resolve():
+        raise ValueError(f"{out} is the source: choose another name")
+    check_output(out)
+    start = time.perf_counter()
+    opened = open_source(source, name)
+    model, baked = (opened.model, "") if baking is None else _baked(source, opened.model, baking)
+    save_splats(out, model)
+    lost, seconds = tuple(lost_by(model, out)), time.perf_counter() - start
+    return Converted(source, out, model, opened.num_bytes, file_bytes(out), lost, seconds, baked)
+
+
+def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:
+    """Return a plain model, and what was done in words."""
+    cameras = () if model.origin is None else model.origin.cameras
+    if not cameras:
+        raise ValueError(f"--bake needs a model that knows its cameras; {source} has none")
+    if type(model.appearance) is Plain:
+        return model, "baked: nothing, for the model is plain"
+    plain = bake(model, cameras, growth=options.growth, iterations=options.iterations, progress=True)
+    views = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    pairs = zip(pictures(plain, views), pictures(model, views), strict=True)
+    likeness = -10 * math.log10(max(float(np.mean([np.mean((x - y) ** 2) for x, y in pairs])), 1e-10))
+    degree, ratio = plain.gaussians.sh_degree, plain.num_bytes / model.num_bytes
+    numbers = f"{counted(model.num, 'splat')} into {plain.num:,} plain ones of SH degree {degree}"
+    return plain, f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness:.1f} dB beside the model"

@@ -1,0 +1,91 @@
+"""The files that the reference readers are tried on: `python tests/reference_files.py tests/data`.
+
+One small model in each published format, its numbers as text, and the checksums of all. They are kept as they were
+written, for coders of later versions may code the same bytes otherwise.
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from a2tg_jax import CompactChoices, load_compact, load_gltf, load_model, save_compact, save_gltf, save_model
+from a2tg_jax.appearance import Banded, Textured, TextureOptions
+from a2tg_jax.appearance.banded import BandedLayout, BandedParams
+from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.io.web_scene import decode_web_scene, encode_web_scene
+from a2tg_jax.model import Model
+from a2tg_jax.texture import textures_from_arrays
+
+NUM = 10
+SUMS = "SHA256SUMS"
+SIZES = [(0, 0), (1, 1), (2, 3), (4, 1)]
+FILES = ("model.npz", "lzma.a2tgz", "zstd.a2tgz", "webp.a2tgz", "floats.a2tgz", "model.a2tgw", "model.glb", "bytes.glb")
+FLOATS = CompactChoices(
+    means="float32", log_scales="float16", quats="float32", opacities="float32", sh_0="float16", texels="float32",
+    coder="none",
+)  # fmt: skip
+
+
+def reference_model() -> Model:
+    """Splats of all degrees, with textures of several sizes, in a world of its own."""
+    rng = np.random.default_rng(11)
+    draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
+    textures, atlas = textures_from_arrays([draw(*SIZES[i % len(SIZES)], 4, scale=0.3) for i in range(NUM)])
+    bands, owners = split_sh(draw(NUM, 16, 3, scale=0.4), np.arange(NUM) % 4, 0)
+    gaussians = Gaussians(
+        draw(NUM, 3), draw(NUM, 4), draw(NUM, 2, scale=0.5) - np.float32(2), draw(NUM), draw(NUM, 1, 3)
+    )  # type: ignore[arg-type]
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 4.0
+    camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
+    world = Similarity(0.5, np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]))
+    origin = Origin.of_cameras([camera], ["a.png"], transform=world, background=(0.25, 0.5, 0.75))
+    params, layout = BandedParams(bands, textures), BandedLayout(owners, atlas)
+    return Model(gaussians, params, layout, appearance=Banded(Textured(options=TextureOptions())), origin=origin)
+
+
+def load(path: Path) -> Model:
+    """Read a file with this library."""
+    if path.suffix == ".a2tgw":
+        return decode_web_scene(path.read_bytes()).model
+    return {".npz": load_model, ".a2tgz": load_compact, ".glb": load_gltf}[path.suffix](path)
+
+
+def numbers(model: Model) -> dict[str, np.ndarray]:
+    """What a reader must find, in the order of the file."""
+    arrays = model.appearance.arrays(model.params, model.layout)
+    fields = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales", "opacities")}
+    fields |= {"degrees": arrays["degrees"], "sh": model.sh}
+    found = fields | {name: arrays[f"inner.{name}"] for name in ("sizes", "texels")}
+    return {name: np.asarray(values, np.float64) for name, values in found.items()}
+
+
+def write(folder: Path) -> None:
+    model = reference_model()
+    save_model(folder / "model.npz", model)
+    for coder in ("lzma", "zstd", "webp"):
+        save_compact(folder / f"{coder}.a2tgz", model, choices=CompactChoices(coder=coder))
+    save_compact(folder / "floats.a2tgz", model, choices=FLOATS)
+    (folder / "model.a2tgw").write_bytes(encode_web_scene(model, title="reference"))
+    save_gltf(folder / "model.glb", model)
+    save_gltf(folder / "bytes.glb", model, texels="uint8")
+    found = {name: numbers(load(folder / name)) for name in FILES}
+    text = {name: {key: np.round(x, 6).ravel().tolist() for key, x in held.items()} for name, held in found.items()}
+    kept = {name: held for name, held in text.items() if name in ("model.npz", "model.a2tgw")}
+    (folder / "numbers.json").write_text(json.dumps(kept) + "\n")
+    (folder / SUMS).write_text("".join(f"{checksum(folder / name)}  {name}\n" for name in (*FILES, "numbers.json")))
+
+
+def checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]))

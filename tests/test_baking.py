@@ -1,0 +1,103 @@
+"""Baking: plain Gaussians in place of textured ones look like them."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_values import some_gaussians
+
+from a2tg_jax import Camera, Model, load_splats, save_model, textures_from_arrays
+from a2tg_jax.appearance import Textured
+from a2tg_jax.cli.main import main
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
+from a2tg_jax.finish.distilling import distill, pictures
+from a2tg_jax.finish.texel_choice import fewest_texels
+from a2tg_jax.texture import Textures
+
+CAMERA = Camera(jnp.eye(4).at[2, 3].set(4), jnp.asarray([[60.0, 0, 24], [0, 60, 18], [0, 0, 1]]), 48, 36)
+
+
+def textured(num: int = 3, side: int = 4, seed: int = 0) -> Model:
+    """A few large splats with random textures, before a camera."""
+    rng = np.random.default_rng(seed)
+    texels = [rng.uniform(size=(side, side, 4)) * [0.8, 0.8, 0.8, 1] for _ in range(num)]
+    textures, layout = textures_from_arrays([np.asarray(t, np.float32) for t in texels])
+    gaussians = Gaussians(
+        means=jnp.asarray(rng.normal(size=(num, 3)) * 0.5, jnp.float32),
+        quats=jnp.asarray(np.c_[np.ones(num), 0.3 * rng.normal(size=(num, 3))], jnp.float32),
+        log_scales=jnp.full((num, 2), -1.0),
+        logit_opacities=jnp.full(num, 2.0),
+        sh=jnp.zeros((num, 1, 3)),
+    )
+    return Model(gaussians, textures, layout, appearance=Textured(), origin=Origin.of_cameras([CAMERA]))
+
+
+def psnr(model: Model, other: Model) -> float:
+    (found,), (wanted,) = pictures(model, [CAMERA]), pictures(other, [CAMERA])
+    return float(-10 * np.log10(np.mean((found - wanted) ** 2)))
+
+
+@pytest.mark.parametrize("num", [1, 2, 4, 8])
+@pytest.mark.parametrize("convention", ["texel-centre", "align-corners"])
+def test_kernels_add_up_to_the_gaussian(num, convention):
+    if (num, convention) == (1, "align-corners"):
+        return
+    means, scales = kernels(num, convention)
+    u = np.linspace(-4, 4, 401)
+    each = np.exp(-0.5 * ((u[:, None] - means) / scales) ** 2)
+    peaks = np.linalg.lstsq(each, np.exp(-0.5 * u * u), rcond=None)[0]
+    assert peaks.min() > 0
+    # Gaussians of a bilinear kernel's variance h²/6, h apart, have a ripple of 2·exp(−2π²/6), 7.5 % of their sum.
+    np.testing.assert_allclose(each @ peaks, np.exp(-0.5 * u * u), atol=0.075)
+
+
+@pytest.fixture(scope="module")
+def split() -> Model:
+    return split_splats(textured(), [CAMERA], 2.0)
+
+
+def test_a_splat_per_texel_looks_like_the_texture(split):
+    model = textured()
+    assert split.num > 3 * model.num and split.num_bytes <= 2 * model.num_bytes
+    assert psnr(split, model) > psnr(as_plain(model.gaussians, model), model) + 5
+
+
+def test_texels_are_kept_where_pictures_need_them():
+    even, striped = np.ones((4, 4, 4), np.float32), np.ones((4, 4, 4), np.float32)
+    striped[:, ::2, :3] = 0.2
+    textures, layout = textures_from_arrays([even, striped, striped])
+    shown = Textures(tuple(jnp.ones_like(bucket) for bucket in textures.buckets))
+    weights = Textures(tuple(bucket.at[2].set(1e-6) for bucket in shown.buckets))
+    tables = fewest_texels(textures, layout, weights, 6)
+    sizes = {int(index): texels.shape[1:3] for ids, texels in tables for index in ids}
+    assert sizes == {0: (1, 1), 1: (1, 4), 2: (1, 1)}
+    found = next(texels for ids, texels in tables if 1 in ids)
+    np.testing.assert_allclose(found[0, 0, :, 0], [0.2, 1, 0.2, 1], rtol=1e-5)
+
+
+def test_training_on_pictures_brings_a_plain_model_nearer(split):
+    model = textured()
+    trained = distill(split, model, [CAMERA], iterations=30)
+    assert trained.num == split.num and trained.origin == model.origin
+    assert psnr(trained, model) > psnr(split, model) + 0.5
+
+
+def test_other_appearances_give_their_gaussians():
+    model = dataclasses.replace(Model(some_gaussians(5)), origin=Origin.of_cameras([CAMERA]))
+    np.testing.assert_array_equal(bake(model, [CAMERA], iterations=0).gaussians.means, model.gaussians.means)
+    with pytest.raises(ValueError, match="growth of at least 1"):
+        bake(model, [CAMERA], growth=0.5)
+
+
+def test_convert_bakes(tmp_path, capsys):
+    save_model(tmp_path / "a.npz", textured())
+    arguments = ["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply"), "--bake", "--bake-iterations", "0"]
+    assert main(arguments) == 0
+    told = capsys.readouterr().out
+    assert "baked: 3 splats into" in told and "textures" not in told
+    assert load_splats(tmp_path / "b.ply").num > 3
+    assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--bake"]) == 2
+    assert "knows its cameras" in capsys.readouterr().err

@@ -1,0 +1,139 @@
+"""Formats of other programs: what is read back after writing, what each keeps, and the conversion of files."""
+
+import dataclasses
+import json
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_values import some_gaussians
+
+from a2tg_jax import Model, load_model, load_ply, load_splats, save_model, save_ply, save_splats
+from a2tg_jax.appearance import Textured
+from a2tg_jax.cli.main import main
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.io.formats import FORMATS, format_of, lost_by
+from a2tg_jax.io.gaussforge_files import SUFFIXES
+
+OTHERS = [".ply", *SUFFIXES]
+TEXTURES = "textures (--bake turns them into plain splats)"
+RNG = np.random.default_rng(0)
+
+
+def needs_gaussforge() -> None:
+    pytest.importorskip("gaussforge", reason="gaussforge is not installed")
+
+
+def textured() -> Model:
+    """Textures of one texel that change nothing."""
+    params, layout = Textured().allocate(jax.random.key(0), some_gaussians())
+    return Model(some_gaussians(), params, layout, appearance=Textured())
+
+
+def small_scene() -> Model:
+    """Gaussians with colours that bytes can hold, far enough apart to be told by their places."""
+    gaussians = some_gaussians(300)
+    unit = gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    sh = jnp.asarray(RNG.normal(size=gaussians.sh.shape) * 0.1, jnp.float32)
+    return Model(dataclasses.replace(gaussians, quats=unit, log_scales=gaussians.log_scales - 3, sh=sh))
+
+
+def matched(found: Model, model: Model) -> Model:
+    """The rows of a model in the order of another, whose means are nearest."""
+    apart = np.asarray(found.gaussians.means)[:, None] - np.asarray(model.gaussians.means)
+    return found[np.linalg.norm(apart, axis=-1).argmin(axis=0)]
+
+
+@pytest.mark.parametrize("suffix", OTHERS)
+def test_splats_come_back_from_files_of_other_programs(tmp_path, suffix):
+    needs_gaussforge()
+    model = small_scene()
+    save_splats(tmp_path / f"a{suffix}", model)
+    found = matched(load_splats(tmp_path / f"a{suffix}"), model).gaussians
+    own = model.gaussians
+    dots = np.sum(np.asarray(found.quats) * np.asarray(own.quats), axis=1)
+    np.testing.assert_allclose(found.means, own.means, atol=5e-3)
+    np.testing.assert_allclose(np.abs(dots), 1, atol=1e-3)
+    np.testing.assert_allclose(found.log_scales, own.log_scales, atol=0.04)
+    np.testing.assert_allclose(found.opacities, own.opacities, atol=5e-3)
+    np.testing.assert_allclose(found.sh[:, 0], own.sh[:, 0], atol=0.02)
+    degree = FORMATS[suffix].highest_degree
+    assert found.sh_degree == degree
+    np.testing.assert_allclose(found.sh[:, 1:], own.sh[:, 1 : (degree + 1) ** 2], atol=0.07)
+
+
+def test_compressed_ply_and_sog_say_that_splats_are_flat(tmp_path):
+    needs_gaussforge()
+    save_splats(tmp_path / "a.compressed.ply", small_scene())
+    assert b"\ncomment SplatRenderMode: 2dgs\n" in (tmp_path / "a.compressed.ply").read_bytes()[:200]
+    save_splats(tmp_path / "a.sog", small_scene())
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert json.loads(archive.read("meta.json"))["model"] == "2dgs"
+
+
+def test_the_library_reads_what_a_run_leaves(tmp_path):
+    needs_gaussforge()
+    import gaussforge
+
+    save_ply(tmp_path / "a.ply", some_gaussians(5))
+    read = gaussforge.GaussForge().read((tmp_path / "a.ply").read_bytes(), "ply")["data"]
+    np.testing.assert_array_equal(np.frombuffer(read["positions"], "<f4").reshape(-1, 3), some_gaussians(5).means)
+    np.testing.assert_array_equal(np.frombuffer(read["rotations"], "<f4").reshape(-1, 4), some_gaussians(5).quats)
+    np.testing.assert_array_equal(np.frombuffer(read["alphas"], "<f4"), some_gaussians(5).logit_opacities)
+
+
+def test_a_damaged_file_is_one_clear_line(tmp_path):
+    needs_gaussforge()
+    for suffix in (".spz", ".sog"):
+        (tmp_path / f"a{suffix}").write_bytes(b"nothing of the kind")
+        with pytest.raises(ValueError, match="gaussforge says"):
+            load_splats(tmp_path / f"a{suffix}")
+
+
+def test_a_missing_library_is_told_with_its_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "gaussforge", None)
+    with pytest.raises(ValueError, match=r"pip install 'a2tg-jax\[formats\]'"):
+        save_splats(tmp_path / "a.spz", small_scene())
+
+
+def test_what_a_format_does_not_keep():
+    world = Similarity(2.0, np.eye(3), np.zeros(3))
+    model = dataclasses.replace(textured(), origin=Origin.of_cameras([], transform=world))
+    assert lost_by(model, "a.npz") == []
+    assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
+    assert lost_by(model, "a.SPZ") == [TEXTURES, "cameras and background", "last digits"]
+    assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
+    assert format_of("a.compressed.ply").name != format_of("a.ply").name
+    with pytest.raises(ValueError, match=r"known are \.npz"):
+        format_of("a.xyz")
+
+
+def test_convert_on_the_command_line(tmp_path, capsys):
+    save_model(tmp_path / "a.npz", textured())
+    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply")]) == 0
+    told = capsys.readouterr().out
+    assert f"not kept by this format: {TEXTURES}\n" in told and "times)" in told
+    assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.npz")]) == 0
+    np.testing.assert_array_equal(load_model(tmp_path / "c.npz").gaussians.means, load_ply(tmp_path / "b.ply").means)
+    assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "b.ply")]) == 2
+    assert "is the source" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.xyz")]) == 2
+    assert "no format is known" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
+    """There and back by the command, with the bytes of the buffer beside a *.gltf."""
+    model = dataclasses.replace(
+        textured(), origin=Origin.of_cameras([], transform=Similarity(2.0, np.eye(3), np.arange(3.0)))
+    )
+    save_model(tmp_path / "a.npz", model)
+    main(["convert", str(tmp_path / "a.npz"), str(tmp_path / f"b{suffix}")])
+    assert "not kept by this format: last digits\n" in (told := capsys.readouterr().out) and "(0." not in told
+    main(["convert", str(tmp_path / f"b{suffix}"), str(tmp_path / "c.npz")])
+    found = load_model(tmp_path / "c.npz")
+    assert found.origin == model.origin and found.appearance == model.appearance
+    np.testing.assert_array_equal(found.gaussians.means, model.gaussians.means)

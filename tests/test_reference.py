@@ -1,0 +1,96 @@
+"""The published formats: readers without this library find in the kept files what it finds, and checksums hold."""
+
+import dataclasses
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference_model
+
+from a2tg_jax import save_model
+from a2tg_jax.appearance import Banded, Textured, TextureOptions
+from a2tg_jax.io.web_scene import encode_web_scene
+
+DATA = Path(__file__).parent / "data"
+READER = Path(__file__).parents[1] / "docs" / "reference" / "read_model.py"
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """The reference reader and renderer; none of their modules is left behind."""
+    names = {path.stem for path in READER.parent.glob("*.py")}
+    sys.path.insert(0, str(READER.parent))
+    try:
+        yield importlib.import_module("read_model").read_model, importlib.import_module("draw").draw
+    finally:
+        sys.path.remove(str(READER.parent))
+        for name in names:
+            sys.modules.pop(name, None)
+
+
+def test_checksums_hold():
+    listed = dict(reversed(line.split("  ")) for line in (DATA / SUMS).read_text().splitlines())
+    assert set(listed) == {*FILES, "numbers.json"} == {path.name for path in DATA.iterdir()} - {SUMS}
+    assert listed == {name: checksum(DATA / name) for name in listed}
+    assert sum(path.stat().st_size for path in DATA.iterdir()) < 50_000
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_reference_reader_finds_what_this_library_finds(reference, name):
+    read_model, _ = reference
+    found, wanted = read_model(DATA / name), numbers(load(DATA / name))
+    assert set(found) == {*wanted, "header"} and len(found["means"]) == NUM
+    for key, values in wanted.items():
+        np.testing.assert_allclose(found[key], values, atol=2e-6, rtol=2e-6, err_msg=key)
+
+
+def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path):
+    """By the rules of the page alone."""
+    read_model, draw = reference
+    model, options = reference_model(), {"outside": "identity"}
+    appearance = Banded(Textured(options=TextureOptions(**options)))
+    model = dataclasses.replace(model, appearance=appearance)
+    save_model(tmp_path / "m.npz", model)
+    origin = model.origin
+    image = draw(read_model(tmp_path / "m.npz"), origin.viewmats[0], origin.Ks[0], 64, 48, origin.background, **options)
+    wanted = np.asarray(model.render(origin.cameras[0]).color)
+    assert np.ptp(wanted) > 0.5
+    np.testing.assert_allclose(image, wanted, atol=2e-3)
+    assert np.mean(np.abs(image - wanted)) < 1e-5
+
+
+def test_the_kept_files_hold_the_model():
+    """Exactly, or as coarsely as they say; a reader of both is compared with the numbers in text."""
+    wanted = numbers(reference_model())
+    texts = json.loads((DATA / "numbers.json").read_text())
+    for name, held in texts.items():
+        found = numbers(load(DATA / name))
+        for key, values in held.items():
+            np.testing.assert_allclose(found[key].ravel(), values, atol=1e-6, err_msg=key)
+    for key, values in numbers(load(DATA / "model.npz")).items():
+        np.testing.assert_array_equal(values, wanted[key])
+    found = numbers(load(DATA / "floats.a2tgz"))
+    order = np.argmin(np.linalg.norm(found["means"][:, None] - wanted["means"], axis=2), axis=1)
+    np.testing.assert_array_equal(found["means"], wanted["means"][order])
+    np.testing.assert_array_equal(found["sizes"], wanted["sizes"][order])
+
+
+def test_web_scenes_are_still_written_so():
+    """All but what zlib codes."""
+    length = int.from_bytes((DATA / "model.a2tgw").read_bytes()[10:14], "little")
+    wanted = json.loads((DATA / "model.a2tgw").read_bytes()[22 : 22 + length])
+    data = encode_web_scene(reference_model(), title="reference")
+    found = json.loads(data[22 : 22 + int.from_bytes(data[10:14], "little")])
+    assert found == wanted
+
+
+def test_the_reference_reader_takes_nothing_of_this_library():
+    sources = [path.read_text() for path in READER.parent.glob("*.py")]
+    assert not any("a2tg_jax" in source for source in sources)
+    assert max(source.count("\n") for source in sources) <= 120
+    command = [sys.executable, str(READER), str(DATA / "webp.a2tgz")]
+    assert "means: float64 [10, 3]" in subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -1,0 +1,149 @@
+"""Checkpoints of PyTorch are read without PyTorch, and nothing that they pickle is run."""
+
+import io
+import os
+import pickle
+import sys
+import types
+import zipfile
+from collections import OrderedDict
+
+import numpy as np
+import pytest
+from small_values import assert_same, some_gaussians
+
+from a2tg_jax import Model, load_splats
+from a2tg_jax.io.formats import save_splats
+
+UTILS, TORCH = types.ModuleType("torch._utils"), types.ModuleType("torch")
+
+
+def _named(module, name):
+    """A function or class that is pickled by the name that PyTorch gives it."""
+    function = type(name, (), {"__module__": module.__name__, "__qualname__": name})
+    setattr(module, name, function)
+    return function
+
+
+REBUILD, PARAMETER, FLOATS = (
+    _named(UTILS, "_rebuild_tensor_v2"),
+    _named(UTILS, "_rebuild_parameter"),
+    _named(TORCH, "FloatStorage"),
+)
+
+
+class Tensor:
+    """A tensor as PyTorch pickles it; `lie` changes what it says of itself."""
+
+    def __init__(self, array, lie=lambda *told: told):
+        self.array, self.lie = np.ascontiguousarray(array, "<f4"), lie
+
+    def __reduce__(self):
+        strides = tuple(stride // 4 for stride in self.array.strides)
+        data = _Call(REBUILD, self.lie(_Storage(self.array), 0, self.array.shape, strides), (False, OrderedDict()))
+        return PARAMETER, (data, True, OrderedDict())
+
+
+class _Call:
+    def __init__(self, function, told, rest):
+        self.function, self.arguments = function, (*told, *rest)
+
+    def __reduce__(self):
+        return self.function, self.arguments
+
+
+class _Storage:
+    def __init__(self, array):
+        self.array = array
+
+
+def write_checkpoint(path, value):
+    """A file as torch.save writes it."""
+    storages, buffer = [], io.BytesIO()
+
+    class Pickler(pickle._Pickler):
+        def persistent_id(self, found):
+            if not isinstance(found, _Storage):
+                return None
+            storages.append(found.array)
+            return "storage", FLOATS, str(len(storages) - 1), "cpu", found.array.size
+
+    modules = {"torch": TORCH, "torch._utils": UTILS}
+    before = {name: sys.modules.get(name) for name in modules}
+    sys.modules.update(modules)
+    try:
+        Pickler(buffer, 2).dump(value)
+    finally:
+        for name, module in before.items():
+            sys.modules.pop(name) if module is None else sys.modules.update({name: module})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", buffer.getvalue())
+        archive.writestr("archive/byteorder", b"little")
+        for index, array in enumerate(storages):
+            archive.writestr(f"archive/data/{index}", array.tobytes())
+
+
+def tensors(third: bool = True) -> dict:
+    g = some_gaussians()
+    scales = np.asarray(g.log_scales)
+    scales = np.concatenate([scales, scales.min(1, keepdims=True) - 7], 1) if third else scales
+    return {
+        "means": Tensor(g.means), "quats": Tensor(g.quats), "scales": Tensor(scales),
+        "opacities": Tensor(g.logit_opacities), "sh0": Tensor(g.sh[:, :1]), "shN": Tensor(g.sh[:, 1:]),
+    }  # fmt: skip
+
+
+def as_nerfstudio() -> dict:
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    own = {f"_model.gauss_params.{names.get(name, name)}": tensor for name, tensor in tensors().items()}
+    return {"step": 3, "pipeline": own}
+
+
+def as_2dgs() -> tuple:
+    t = tensors(third=False)
+    own = (3, t["means"], t["sh0"], t["shN"], t["scales"], t["quats"], t["opacities"])
+    return (*own, Tensor(np.zeros(7)), Tensor(np.zeros(7)), Tensor(np.zeros(7)), {"state": {}}, np.float64(2.0)), 30_000
+
+
+@pytest.mark.parametrize("kind", ["gsplat", "nerfstudio", "2dgs"])
+def test_gaussians_of_checkpoints(tmp_path, kind):
+    value = {"gsplat": {"step": 7, "splats": OrderedDict(tensors())}, "nerfstudio": as_nerfstudio(), "2dgs": as_2dgs()}
+    write_checkpoint(tmp_path / "a.pt", value[kind])
+    assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians())
+
+
+class Harm:
+    def __reduce__(self):
+        return os.system, ("touch harmed",)
+
+
+def reaching(storage, offset, size, stride):
+    return storage, offset + 1, size, stride
+
+
+HOSTILE = {
+    "pickles": {"splats": {**tensors(), "more": Harm()}},
+    "reaches beyond": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), reaching)}},
+    "negative": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), lambda s, o, n, t: (s, o, n, (-1, 1)))}},
+    "no means": {"splats": {name: tensor for name, tensor in tensors().items() if name != "means"}},
+    "no checkpoint": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), lambda s, o, n, t: (s, o, 3, t))}},
+    "coefficients": {"splats": {**tensors(), "shN": Tensor(np.zeros((7, 5, 3)))}},
+    "finite": {"splats": {**tensors(), "means": Tensor(np.full((7, 3), np.nan))}},
+}
+
+
+@pytest.mark.parametrize("message", HOSTILE)
+def test_anything_else_is_refused_in_one_line(tmp_path, monkeypatch, message):
+    monkeypatch.chdir(tmp_path)
+    write_checkpoint(tmp_path / "a.pt", HOSTILE[message])
+    with pytest.raises(ValueError, match=message) as raised:
+        load_splats(tmp_path / "a.pt")
+    assert "a.pt" in str(raised.value) and "\n" not in str(raised.value) and not (tmp_path / "harmed").exists()
+
+
+def test_checkpoints_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match="can be read, but not written"):
+        save_splats(tmp_path / "a.pt", Model(some_gaussians()))
+    (tmp_path / "a.pt").write_bytes(b"\x80\x02}q\x00.")
+    with pytest.raises(ValueError, match=r"PyTorch 1\.6"):
+        load_splats(tmp_path / "a.pt")
