@@ -1,6 +1,7 @@
 """Numbers that are not finite and losses that explode: seen in the step, told, undone, and stops that lose nothing."""
 
 import dataclasses
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -133,3 +134,26 @@ def test_a_stop_between_any_two_steps_changes_nothing(scene, tmp_path, calls, st
     resumed = fit(scene, system, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False)
     whole = fit(scene, system, progress=False)
     jax.tree.map(np.testing.assert_array_equal, resumed.model, whole.model)
+
+
+def test_ctrl_c_in_the_last_step_interrupts_too(scene):
+    system, kept = Gaussians2dMcmc(stage1_iterations=10, **SIZES), []
+    press = lambda row: signal.raise_signal(signal.SIGINT)  # noqa: E731
+    with pytest.raises(Interrupted, match="after iteration 10 of stage 1") as stopped:
+        fit(scene, system, on_log=press, on_checkpoint=kept.append, progress=False)
+    assert [checkpoint.iteration for checkpoint in kept] == [10]
+    resumed = fit(scene, system, resume=stopped.value.checkpoint, progress=False)
+    jax.tree.map(np.testing.assert_array_equal, resumed.model.gaussians, stopped.value.checkpoint.model.gaussians)
+
+
+def test_a_stop_before_the_first_step_is_a_checkpoint(scene, tmp_path):
+    system, path = Gaussians2dMcmc(stage1_iterations=10, **SIZES), tmp_path / "checkpoint.npz"
+    with pytest.raises(Interrupted, match="after iteration 0 of stage 1"):
+        fit(
+            scene,
+            system,
+            on_checkpoint=lambda checkpoint: save_checkpoint(path, checkpoint),
+            progress=False,
+            is_stopped=lambda: True,
+        )
+    assert load_checkpoint(path).iteration == 0

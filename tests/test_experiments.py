@@ -658,6 +658,21 @@ def test_sigterm_ends_as_ctrl_c_does(capsys):
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_a_second_sigterm_ends_at_once():
+    code = (
+        "import signal\n"
+        "from lab.interrupts import interruptible\n"
+        "with interruptible():\n"
+        "    try:\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "    finally:\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "        print('it went on')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=EXPERIMENTS, capture_output=True, text=True, check=False)
+    assert done.returncode == 143 and done.stdout == "" and done.stderr.count("what is finished is kept") == 1
+
+
 def test_processes_begin_without_ctrl_c():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
