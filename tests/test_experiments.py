@@ -19,7 +19,7 @@ import polish
 import pytest
 import shrink
 import upscale_gains
-from lab import pages, queue, spreadsheet, tables
+from lab import pages, queue, spreadsheet, tables, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
 from lab.grid import GRIDS, Cell, Grid, Method, Run, read_grid, splats_in
@@ -29,7 +29,7 @@ from lab.plan import Machine, duration, finished_pace, plan_of
 from lab.progress import Progress
 from lab.scenes import SceneAt, own_scene
 from lab.stages import stages_of
-from run import experiments, main, parse_arguments
+from run import chosen, experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
@@ -223,6 +223,14 @@ def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([str(path)])
     assert "rename the file" in capsys.readouterr().err
+
+
+def test_experiments_and_grid_files_are_not_mixed_in_one_folder(tmp_path, capsys):
+    given = ["claim", own_grid(tmp_path), "--tables-only", "--work", str(tmp_path / "work")]
+    with pytest.raises(SystemExit) as ended:
+        main(given)
+    assert ended.value.code == 2 and "call them one after another" in capsys.readouterr().err
+    assert len(chosen(experiments(), parse_arguments(experiments(), [*given, "--out", str(tmp_path)]))) == 2
 
 
 def test_smoke_and_grid_files_leave_the_committed_results_alone(tmp_path):
@@ -656,6 +664,27 @@ def test_sigterm_ends_as_ctrl_c_does(capsys):
     told = capsys.readouterr().err.strip()
     assert ended.value.code == 143 and told.count("\n") == 0 and "terminated; what is finished is kept" in told
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_records_of_an_earlier_version_are_told_and_trained_again_on_request(tmp_path):
+    old, new = record(system="bytewise"), record(system="bytewise", version=a2tg.Bytewise.version)
+    assert versions.told([old, new, old]) == "2 of bytewise (version 1, now 2)"
+    assert versions.told([new, record(system="a2tg"), record(system="nowhere:Gone", version=3)]) == ""
+    (tmp_path / "records.json").write_text(json.dumps({"old": old, "new": new}), encoding="utf-8")
+    given = ["claim", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
+    assert set(Lab(parse_arguments(experiments(), given)).records) == {"old", "new"}
+    assert set(Lab(parse_arguments(experiments(), [*given, "--renew"])).records) == {"new"}
+
+
+def test_pages_say_which_rows_are_from_before(tmp_path, capsys):
+    shutil.copy(EXPERIMENTS / "results" / "small" / "records.json", tmp_path)
+    main(["equal_bytes", "claim", "--tables-only", "--out", str(tmp_path), "--work", str(tmp_path / "work")])
+    assert "--renew trains them again" in capsys.readouterr().out
+    assert (
+        "*Runs from before: 50 of bytewise "
+        in (tmp_path / "equal_bytes.md").read_text(encoding="utf-8").splitlines()[-1]
+    )
+    assert "from before" not in (tmp_path / "claim.md").read_text(encoding="utf-8")
 
 
 def test_a_second_sigterm_ends_at_once():

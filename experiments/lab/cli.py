@@ -14,7 +14,7 @@ from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.record import SYNTHETIC
-from lab import machine, spreadsheet, tables
+from lab import machine, spreadsheet, tables, versions
 from lab.grid import Grid, read_grid
 from lab.jobs import Folders, Job, Record
 from lab.plan import Machine, plan_of
@@ -48,6 +48,8 @@ class Lab:
         self.folders = Folders(args.scenes, self.work, args.lpips_weights, network)
         self._file = self.out / "records.json"
         self.records: dict[str, Record] = self._all_records()
+        self.note = ""
+        """Remark below the pages of an experiment."""
 
     def _default_out(self) -> Path:
         """Return the folder of the committed results, or one that git ignores for the smoke scale and grids of one's
@@ -120,6 +122,7 @@ class Lab:
         """Print a page and save it among the results."""
         if self.args.validation:
             text = f"*Measured on validation views, taken from the training views; test views were not used.*\n\n{text}"
+        text = f"{text.rstrip()}\n{self.note}"
         path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -130,6 +133,13 @@ class Lab:
         found = [(grid.name, result) for grid in grids for result in tables.results_of(grid, self.records)]
         with replacing(self.pages / f"{name}.csv") as temporary:
             temporary.write_text(spreadsheet.rows_text(found), encoding="utf-8")
+
+    def records_of(self, grids: Sequence[Grid]) -> list[Record]:
+        """Return the records of the finished runs of some grids, each once."""
+        found = {
+            result.run.job.key: result.record for grid in grids for result in tables.results_of(grid, self.records)
+        }
+        return list(found.values())
 
     def check_inputs(self, grids: Sequence[Grid]) -> None:
         """Raise if a scene is missing, before anything is trained."""
@@ -156,7 +166,8 @@ class Lab:
     def _all_records(self) -> dict[str, Record]:
         """Return the records of the results and of jobs that were never collected."""
         own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
-        return {**own, **self._kept()}
+        found = {**own, **self._kept()}
+        return {key: one for key, one in found.items() if not (self.args.renew and versions.is_from_before(one))}
 
     def machine(self) -> Machine:
         """Return what --plan plans for."""
@@ -200,6 +211,8 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         lab = Lab(args)
         names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
         grids = {name: lab.grid(name) for name in names}
+        if old := versions.told(lab.records_of(list(grids.values()))):
+            print(f"Runs from before: {old}. --renew trains them again.", flush=True)
         if args.plan:
             lab.check_inputs(list(grids.values()))
             print(plan_of(list(grids.values()), lab.records, lab.folders, lab.machine()))
@@ -211,6 +224,8 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         own = [grids[name] for name in experiment.grids]
         try:
             lab.write_rows(experiment.name, own)
+            old = versions.told(lab.records_of(own))
+            lab.note = f"\n*Runs from before: {old}.*\n" if old else ""
             experiment.present(lab, own)
         except (ValueError, OSError) as error:
             errors.append(f"{experiment.name}: {error}")
@@ -262,6 +277,7 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
     add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="submitit's parameters: mem_gb=32 …")
     add("--plan", action="store_true", help="run nothing; print what is left to run and about how long it takes")
+    add("--renew", action="store_true", help="train again what earlier versions of systems made")
     add("--tables-only", action="store_true", help="run nothing; write tables and plots of the finished runs")
     return parser
 
