@@ -776,7 +776,7 @@ def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
     lab = Lab(argument_parser("").parse_args(arguments))
     for name, experiment in experiments().items():
         if name not in made_from_models and name != "quick_preset":  # its runs are not among the committed ones
-            experiment.present(lab, [lab.grid(grid) for grid in experiment.grids])
+            lab.present(experiment, [lab.grid(grid) for grid in experiment.grids])
     made = {path.name for path in tmp_path.glob("*.md")}
     assert shown == made | {f"{name}.md" for name in made_from_models} - {"comparison_pictures.md"}
     unshown = {path.name for path in committed.glob("*.md")} - shown

@@ -48,8 +48,7 @@ class Lab:
         self.folders = Folders(args.scenes, self.work, args.lpips_weights, network)
         self._file = self.out / "records.json"
         self.records: dict[str, Record] = self._all_records()
-        self.note = ""
-        """Remark below the pages of an experiment."""
+        self._note = ""
 
     def _default_out(self) -> Path:
         """Return the folder of the committed results, or one that git ignores for the smoke scale and grids of one's
@@ -122,7 +121,7 @@ class Lab:
         """Print a page and save it among the results."""
         if self.args.validation:
             text = f"*Measured on validation views, taken from the training views; test views were not used.*\n\n{text}"
-        text = f"{text.rstrip()}\n{self.note}"
+        text = f"{text.rstrip()}\n{self._note}"
         path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -136,10 +135,15 @@ class Lab:
 
     def records_of(self, grids: Sequence[Grid]) -> list[Record]:
         """Return the records of the finished runs of some grids, each once."""
-        found = {
-            result.run.job.key: result.record for grid in grids for result in tables.results_of(grid, self.records)
-        }
-        return list(found.values())
+        results = (result for grid in grids for result in tables.results_of(grid, self.records))
+        return list({result.run.job.key: result.record for result in results}.values())
+
+    def present(self, experiment: "Experiment", grids: Sequence[Grid]) -> None:
+        """Write the rows and the pages of an experiment."""
+        old = versions.told(self.records_of(grids))
+        self._note = f"\n*Runs from before: {old}.*\n" if old else ""
+        self.write_rows(experiment.name, grids)
+        experiment.present(self, grids)
 
     def check_inputs(self, grids: Sequence[Grid]) -> None:
         """Raise if a scene is missing, before anything is trained."""
@@ -223,10 +227,7 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
     for experiment in experiments:
         own = [grids[name] for name in experiment.grids]
         try:
-            lab.write_rows(experiment.name, own)
-            old = versions.told(lab.records_of(own))
-            lab.note = f"\n*Runs from before: {old}.*\n" if old else ""
-            experiment.present(lab, own)
+            lab.present(experiment, own)
         except (ValueError, OSError) as error:
             errors.append(f"{experiment.name}: {error}")
     if errors:

@@ -193,8 +193,8 @@ def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Rec
     first = scene.test[0].camera
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
-        "system": reference_of(job.system), "version": job.system.version, "options": differences(job.system), "stage": result.name,
-        "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
+        "system": reference_of(job.system), "version": job.system.version, "options": differences(job.system),
+        "stage": result.name, "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "seconds": result.seconds, "ms_per_step": _milliseconds(result.history),
     }  # fmt: skip
