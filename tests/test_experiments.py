@@ -803,7 +803,7 @@ def test_the_plan_counts_what_is_left(tmp_path):
     assert "| built-in 1/2 | 400 | 0 | 30+20 | 0 of 6 | all |" in everything
     assert "8 of 8 stages are left" in everything and "rough figure of CPUs" in everything
     assert "on this machine, 2 at a time, with compilation" in everything and "Disk: about" in everything
-    assert "8.0 GB may be used" in everything
+    assert "8.00 GB may be used" in everything
     on_gpu = plan_of([grid], {}, folders, dataclasses.replace(here, has_gpu=True))
     assert "the paper's program on its GPU" in on_gpu and "compilation" not in on_gpu
     first = next(grid.jobs({}))

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
@@ -13,7 +14,6 @@ from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import warn_of_small_budget
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
-from a2tg_jax.training.progress import told_size
 
 
 def test_a_file_in_the_way_is_told(tmp_path):
@@ -54,12 +54,15 @@ def test_a_budget_for_few_gaussians_is_warned_of(recwarn):
 
 def test_a_limit_below_the_program_itself_says_so():
     forecast = RunForecast({"evaluation": Bytes(program=1.1e9, pixels=1e6)}, 1e6, 0)
-    with pytest.raises(ValueError, match=r"20 MB may be used: the program itself takes about 1.1 GB of it: allow more"):
+    with pytest.raises(
+        ValueError, match=r"20.0 MB may be used: the program itself takes about 1.10 GB of it: allow more"
+    ):
         forecast.check(20e6)
 
 
-def test_small_models_are_told_in_kilobytes():
-    assert [told_size(size) for size in (0.0007, 0.01, 2.5)] == ["0.7 kB", "0.01 MB", "2.50 MB"]
+def test_sizes_have_three_digits_and_a_unit_that_suits_them():
+    told = {1: "1 byte", 999: "999 bytes", 9_996: "10.0 kB", 999_600: "1.00 MB", 2.5e6: "2.50 MB", 12.34e9: "12.3 GB"}
+    assert {size: in_bytes(size) for size in told} == told and in_bytes(1234e9) == "1,234 GB"
 
 
 def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):

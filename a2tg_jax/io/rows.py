@@ -44,7 +44,7 @@ class Rows:
     """Texels [T, 4], one texture after the other, each row by row."""
 
 
-def check_kind(appearance: Appearance) -> None:
+def check_encodable(appearance: Appearance) -> None:
     """Raise ValueError unless a compact file can hold what splats show."""
     if not appearance.is_portable:
         raise ValueError(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
@@ -12,7 +13,6 @@ from a2tg_jax.results.folder import RunFolder, iteration_of, read_json, resuming
 from a2tg_jax.results.record import read_record, repeating_command
 from a2tg_jax.results.replacement import old_run
 
-REWRITES = "; a2tg eval rewrites it"
 SPLITS = ("test", "validation", "train")
 
 
@@ -56,13 +56,13 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     data = read_json(path)
     models = data.get("models") if isinstance(data, dict) else None
     if not isinstance(models, dict):
-        raise ValueError(f"{path}: has no models{REWRITES}")
+        raise ValueError(f"{path}: has no models")
     psnrs: dict[str, dict[str, float]] = {}
     for name, model in models.items():
         splits = {split: model[split] for split in SPLITS if split in model} if isinstance(model, dict) else None
         found = None if splits is None else [isinstance(x, dict) and x.get("psnr") for x in splits.values()]
         if splits is None or found is None or not all(type(psnr) in (int, float) for psnr in found):
-            raise ValueError(f"{path}: has no PSNR of {shortened(name)}{REWRITES}")
+            raise ValueError(f"{path}: has no PSNR of {shortened(name)}")
         psnrs[name] = {split: float(psnr) for split, psnr in zip(splits, found, strict=True)}  # type: ignore[arg-type]
     return psnrs
 
@@ -72,7 +72,7 @@ def _psnrs_or_damage(path: Path) -> tuple[dict[str, dict[str, float]], str]:
     try:
         return (read_psnrs(path) if is_regular(path) else {}), ""
     except ValueError as error:
-        return {}, str(error).removesuffix(REWRITES)
+        return {}, str(error)
 
 
 def _describe_stage(run: RunFolder, name: str, measured: dict[str, float] | None) -> str:
@@ -82,7 +82,7 @@ def _describe_stage(run: RunFolder, name: str, measured: dict[str, float] | None
         model = load_model(run.model(name))
     except ValueError as error:
         return f"damaged: {error}; delete it, and a2tg train --resume trains the stage again"
-    parts = [f"{model.num:,} Gaussians", f"{model.num_bytes / 1e6:.2f} MB"]
+    parts = [f"{model.num:,} Gaussians", in_bytes(model.num_bytes)]
     if model.bands is not None:
         counts = np.bincount(model.bands[1].degrees)
         parts.append("degrees " + ", ".join(f"{degree}: {n:,}" for degree, n in enumerate(counts)))
