@@ -1,16 +1,20 @@
 """Places to write to, and budgets too small to show a scene, are told before any work."""
 
+import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax.cli import main as cli
 from a2tg_jax.core.display import in_bytes
+from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.preflight import warn_of_small_budget
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
@@ -75,3 +79,47 @@ def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
     assert f"damaged  {run.metrics}" in told and f"a2tg eval {run.path} rewrites it" in told
     assert "a2tg-gaussians  damaged: " in told and "a2tg-textures   not begun" in told
     assert told.endswith(f"training is not finished; continue with: a2tg train --out {run.path} --resume")
+
+
+def test_info_is_json_on_request(tmp_path, capsys):
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg()))
+    run.metrics.write_text(json.dumps({"models": {"a2tg-gaussians": {"test": {"psnr": 20.5}}}}))
+    run.model("a2tg-gaussians").parent.mkdir()
+    a2tg.save_model(run.model("a2tg-gaussians"), a_model())
+    run.checkpoint("a2tg-textures", 40).parent.mkdir()
+    run.checkpoint("a2tg-textures", 40).write_bytes(b"")
+    assert cli.main(["info", str(run.path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    first, second = facts["stages"]
+    assert (facts["scene"], facts["is_finished"], facts["report"], facts["damage"]) == ("synthetic", False, None, None)
+    assert first["state"] == "finished" and first["num_gaussians"] == 3 and first["psnr"] == {"test": 20.5}
+    assert second["state"] == "in training" and second["iteration"] == 40 and second["psnr"] is None
+    assert "a2tg-gaussians  3 Gaussians; 696 bytes; test 20.50 dB" in describe_run(run)
+
+
+def a_model():
+    return a2tg.Model(init_from_points(np.eye(3), np.full((3, 3), 0.5)))
+
+
+@pytest.mark.parametrize(
+    ("command", "name"), [("export {} --ply", "x.ply"), ("export {} --web", "x.html"), ("compress {} --out", "x.a2tgz")]
+)
+def test_a_file_is_not_replaced_unasked(tmp_path, capsys, command, name):
+    model, out = tmp_path / "model.npz", tmp_path / name
+    a2tg.save_model(model, a_model())
+    out.write_text("mine")
+    words = [*command.format(model).split(), str(out)]
+    assert cli.main(words) == 2
+    assert f"{name} exists; add --overwrite to replace it, or choose another {words[2]}" in capsys.readouterr().err
+    assert out.read_text() == "mine"
+    if name == "x.ply":
+        assert cli.main([*words, "--overwrite"]) == 0 and out.read_bytes().startswith(b"ply")
+
+
+def test_a_page_in_a_folder_is_not_replaced_unasked(tmp_path):
+    check_new(tmp_path / "index.html", "--web", overwrite=False)
+    (tmp_path / "index.html").touch()
+    with pytest.raises(FileExistsError, match=r"index\.html exists; add --overwrite"):
+        check_new(tmp_path / "index.html", "--web", overwrite=False)
+    check_new(tmp_path / "index.html", "--web", overwrite=True)
