@@ -23,8 +23,11 @@ from a2tg_jax import (
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.divergence import largest_loss
+from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.start import initial_model
 
 SIZES = {"initial_gaussians": 60, "densify": McmcConfig(cap=60)}
 BAD_ROW = 7
@@ -85,6 +88,28 @@ def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_pat
     save_checkpoint(tmp_path / "kept.npz", raised.value.checkpoint)
     kept = load_checkpoint(tmp_path / "kept.npz", Poisoned)
     assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.log_scales).all()
+
+
+@event
+class Nothing(StepEvent):
+    """Changes one parameter, to what it was."""
+
+    def apply(self, now, model, moments, state):
+        gaussians = dataclasses.replace(model.gaussians, quats=1 * model.gaussians.quats)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, monkeypatch):
+    """Gradients say that they are finite. What events made is checked."""
+    checked = []
+    monkeypatch.setattr(step, "_all_finite", lambda tree: checked.append(tree) or jnp.asarray(True))
+    system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
+    run = StageRun(scene, system, 0, initial_model(scene, system))
+    settings, stage, _, _, *others = run._arguments(1)
+    stage, state = dataclasses.replace(stage, events=(Nothing(),)), dataclasses.replace(run.state, events=(None,))
+    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(), state, *others), state)
+    ((_, grads, _, (made, _)),) = checked
+    assert len(jax.tree.leaves(grads)) == 5 and [leaf.shape for leaf in made] == [(60, 4)]
 
 
 def test_an_explosion_is_seen_in_the_step(scene):
