@@ -106,9 +106,10 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
     run = StageRun(scene, system, 0, initial_model(scene, system))
     settings, stage, _, _, *others = run._arguments(1)
+    settings = dataclasses.replace(settings, due=(True,))
     stage, state = dataclasses.replace(stage, events=(Nothing(),)), dataclasses.replace(run.state, events=(None,))
     jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(), state, *others), state)
-    ((_, grads, _, (made, _)),) = checked
+    ((_, grads, _, made, _),) = checked
     assert len(jax.tree.leaves(grads)) == 5 and [leaf.shape for leaf in made] == [(60, 4)]
 
 

@@ -181,10 +181,11 @@ def attempt(
         for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
     )
     after = TrainState(model, moments, events, iteration, state.status, corrections)
-    # Adam's steps are finite if gradients are. Parameters that nothing else changed need no check, which would make a
-    # GPU write them twice.
-    made = _others(step.params, (model.gaussians, model.params)), [known.rows for known in corrections]
-    is_finite = _all_finite((found.loss, grads, found.grads[2], made))
+    made: Any = (model.gaussians, model.params)
+    if settings.due is not None:
+        # Adam's steps are finite if gradients are. A check of what nothing else changed makes a GPU write it twice.
+        made = _others(step.params, made)
+    is_finite = _all_finite((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
     return Attempt(found, (*grads, found.grads[2]), after, info, is_finite)
 
 
