@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax
-from a2tg_jax.render import appearance_of, render_traced
+from a2tg_jax.render import render_traced, rule_of
 from benchmarks.arrays import random_image
 from benchmarks.timing import timed
 from benchmarks.workload import random_scene, random_textures
@@ -79,7 +79,7 @@ def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSetting
     target = jnp.asarray(random_image(camera.width, camera.height))
 
     def image(gaussians, textures, probe=None):
-        rule = appearance_of(gaussians, textures, layout, settings)
+        rule = rule_of(gaussians, textures, layout, settings)
         return render_traced(gaussians, camera, rule, jnp.zeros(3), settings, has_geometry=False, probe=probe)[0].color
 
     def loss(gaussians, textures, probe=None):

@@ -11,7 +11,7 @@ from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.splats import CompositingSettings, project_gaussians
 from a2tg_jax.rasterize.tiles import TileGrid
-from a2tg_jax.render import appearance_of
+from a2tg_jax.render import rule_of
 from benchmarks import timing
 from benchmarks.workload import random_scene, random_textures
 
@@ -25,7 +25,7 @@ def measure_stages(case: dict) -> dict:
     textures, layout = random_textures(num, case.get("textures", "none"))
     settings = a2tg_jax.plan_render(gaussians, camera, textures, layout)
     capacity = settings.capacity or 0
-    rule, grid = appearance_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
+    rule, grid = rule_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
     project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, rule, settings.near_plane, 3))
     splats, cutoff = project(gaussians)
     find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))

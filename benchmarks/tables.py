@@ -194,6 +194,26 @@ def trained(report: dict) -> str:
     return table(["image", "textures", "forward", "forward + backward", "composited"], rows)
 
 
+def bounds(report: dict) -> str:
+    """Return the least milliseconds of each stage, with what needs them."""
+    found = report["bounds"]
+    head = ["stage", *(f"{case['num']:,}{', textured' if case['textures'] == 'mixed' else ''}" for case in found)]
+    rows = []
+    for index, stage in enumerate(found[0]["stages"]):
+        rows.append([stage["stage"], *(_least(case["stages"][index]) for case in found)])
+    total = (sum(max(_kinds(stage).values()) for stage in case["stages"]) for case in found)
+    return table(head, [*rows, ["*sum*", *(f"{value:.2f}" for value in total)]])
+
+
+def _kinds(stage: dict) -> dict[str, float]:
+    return {kind: value for kind, value in stage.items() if kind != "stage"}
+
+
+def _least(stage: dict) -> str:
+    kind, value = max(_kinds(stage).items(), key=lambda item: item[1])
+    return f"{value:.3f} {kind}"
+
+
 TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "machine": (machine, ("machine",)),
     "render": (render, ("render", "pixels")),
@@ -206,6 +226,7 @@ TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "full_size": (full_size, ("full_size",)),
     "training": (training, ("training",)),
     "trained": (trained, ("trained",)),
+    "bounds": (bounds, ("bounds",)),
 }
 """Function of each table, with the sections of the report that it needs."""
 

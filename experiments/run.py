@@ -61,6 +61,10 @@ def chosen(known: Mapping[str, Experiment], args: argparse.Namespace) -> list[Ex
         if name not in known and name not in OTHERS and name not in args.own_grids:
             hint = did_you_mean(name, [*known, *OTHERS]) or "; --help lists all"
             stop(f"there is no experiment {name!r}{hint}")
+    are_both = len(set(args.names) - set(args.own_grids) - {APPENDIX}) and args.own_grids
+    if are_both and args.out is None and args.scale != "smoke":
+        stop("results of grid files and of experiments lie in different folders: call them one after another, or name "
+             "a folder for both with --out")  # fmt: skip
     if EVERYTHING in args.names:
         whole = [found for found in known.values() if all(has_scale(grid, args.scale) for grid in found.grids)]
         return [*whole, *_file_experiments(known, args.own_grids)]

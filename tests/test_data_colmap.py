@@ -1,5 +1,6 @@
 """COLMAP scenes: written here in every variant, read back, compared with pycolmap's own projection."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -308,3 +309,22 @@ def test_real_scenes(shared, name, num_train, num_test):
         scale = np.array([view.camera.width / image.camera.width, view.camera.height / image.camera.height])
         errors = np.linalg.norm(project(view.camera, scene.transform.apply(points)) / scale - places, axis=1)
         assert np.median(errors) < 1
+
+
+def test_threads_wait_for_the_whole_library(tmp_path):
+    """Photographs are read by several threads, of which each may be the first to need pycolmap."""
+    (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(0.2)\nCamera = int\n")
+    code = (
+        "from concurrent.futures import ThreadPoolExecutor as Pool\n"
+        "from a2tg_jax.data.colmap_library import pycolmap\n"
+        "print(list(Pool(2).map(lambda _: pycolmap().Camera(1), range(2))))\n"
+    )
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "[1, 1]\n", done.stderr

@@ -1,6 +1,7 @@
 """Numbers that are not finite and losses that explode: seen in the step, told, undone, and stops that lose nothing."""
 
 import dataclasses
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +23,11 @@ from a2tg_jax import (
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.divergence import largest_loss
+from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.start import initial_model
 
 SIZES = {"initial_gaussians": 60, "densify": McmcConfig(cap=60)}
 BAD_ROW = 7
@@ -86,6 +90,29 @@ def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_pat
     assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.log_scales).all()
 
 
+@event
+class Nothing(StepEvent):
+    """Changes one parameter, to what it was."""
+
+    def apply(self, now, model, moments, state):
+        gaussians = dataclasses.replace(model.gaussians, quats=1 * model.gaussians.quats)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
+
+
+def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, monkeypatch):
+    """Gradients say that they are finite. What events made is checked."""
+    checked = []
+    monkeypatch.setattr(step, "_all_finite", lambda tree: checked.append(tree) or jnp.asarray(True))
+    system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
+    run = StageRun(scene, system, 0, initial_model(scene, system))
+    settings, stage, _, _, *others = run._arguments(1)
+    settings = dataclasses.replace(settings, due=(True,))
+    stage, state = dataclasses.replace(stage, events=(Nothing(),)), dataclasses.replace(run.state, events=(None,))
+    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(), state, *others), state)
+    ((_, grads, _, made, _),) = checked
+    assert len(jax.tree.leaves(grads)) == 5 and [leaf.shape for leaf in made] == [(60, 4)]
+
+
 def test_an_explosion_is_seen_in_the_step(scene):
     with pytest.raises(
         DivergedError, match=r"exploded at iteration \d+ of stage .*, view \S+: the loss of \S+ is \d"
@@ -133,3 +160,26 @@ def test_a_stop_between_any_two_steps_changes_nothing(scene, tmp_path, calls, st
     resumed = fit(scene, system, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False)
     whole = fit(scene, system, progress=False)
     jax.tree.map(np.testing.assert_array_equal, resumed.model, whole.model)
+
+
+def test_ctrl_c_in_the_last_step_interrupts_too(scene):
+    system, kept = Gaussians2dMcmc(stage1_iterations=10, **SIZES), []
+    press = lambda row: signal.raise_signal(signal.SIGINT)  # noqa: E731
+    with pytest.raises(Interrupted, match="after iteration 10 of stage 1") as stopped:
+        fit(scene, system, on_log=press, on_checkpoint=kept.append, progress=False)
+    assert [checkpoint.iteration for checkpoint in kept] == [10]
+    resumed = fit(scene, system, resume=stopped.value.checkpoint, progress=False)
+    jax.tree.map(np.testing.assert_array_equal, resumed.model.gaussians, stopped.value.checkpoint.model.gaussians)
+
+
+def test_a_stop_before_the_first_step_is_a_checkpoint(scene, tmp_path):
+    system, path = Gaussians2dMcmc(stage1_iterations=10, **SIZES), tmp_path / "checkpoint.npz"
+    with pytest.raises(Interrupted, match="after iteration 0 of stage 1"):
+        fit(
+            scene,
+            system,
+            on_checkpoint=lambda checkpoint: save_checkpoint(path, checkpoint),
+            progress=False,
+            is_stopped=lambda: True,
+        )
+    assert load_checkpoint(path).iteration == 0

@@ -20,7 +20,7 @@ import polish
 import pytest
 import shrink
 import upscale_gains
-from lab import pages, queue, spreadsheet, tables
+from lab import pages, queue, spreadsheet, tables, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
 from lab.grid import GRIDS, Cell, Grid, Method, Run, has_scale, read_grid, splats_in
@@ -249,6 +249,14 @@ def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([str(path)])
     assert "rename the file" in capsys.readouterr().err
+
+
+def test_experiments_and_grid_files_are_not_mixed_in_one_folder(tmp_path, capsys):
+    given = ["claim", own_grid(tmp_path), "--tables-only", "--work", str(tmp_path / "work")]
+    with pytest.raises(SystemExit) as ended:
+        main(given)
+    assert ended.value.code == 2 and "call them one after another" in capsys.readouterr().err
+    assert len(chosen(experiments(), parse_arguments(experiments(), [*given, "--out", str(tmp_path)]))) == 2
 
 
 def test_smoke_and_grid_files_leave_the_committed_results_alone(tmp_path):
@@ -684,6 +692,42 @@ def test_sigterm_ends_as_ctrl_c_does(capsys):
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_records_of_an_earlier_version_are_told_and_trained_again_on_request(tmp_path):
+    old, new = record(system="bytewise"), record(system="bytewise", version=a2tg.Bytewise.version)
+    assert versions.told([old, new, old]) == "2 of bytewise (version 1, now 2)"
+    assert versions.told([new, record(system="a2tg"), record(system="nowhere:Gone", version=3)]) == ""
+    (tmp_path / "records.json").write_text(json.dumps({"old": old, "new": new}), encoding="utf-8")
+    given = ["claim", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
+    assert set(Lab(parse_arguments(experiments(), given)).records) == {"old", "new"}
+    assert set(Lab(parse_arguments(experiments(), [*given, "--renew"])).records) == {"new"}
+
+
+def test_pages_say_which_rows_are_from_before(tmp_path, capsys):
+    shutil.copy(EXPERIMENTS / "results" / "small" / "records.json", tmp_path)
+    main(["equal_bytes", "claim", "--tables-only", "--out", str(tmp_path), "--work", str(tmp_path / "work")])
+    assert "--renew trains them again" in capsys.readouterr().out
+    assert (
+        "*Runs from before: 50 of bytewise "
+        in (tmp_path / "equal_bytes.md").read_text(encoding="utf-8").splitlines()[-1]
+    )
+    assert "from before" not in (tmp_path / "claim.md").read_text(encoding="utf-8")
+
+
+def test_a_second_sigterm_ends_at_once():
+    code = (
+        "import signal\n"
+        "from lab.interrupts import interruptible\n"
+        "with interruptible():\n"
+        "    try:\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "    finally:\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "        print('it went on')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=EXPERIMENTS, capture_output=True, text=True, check=False)
+    assert done.returncode == 143 and done.stdout == "" and done.stderr.count("what is finished is kept") == 1
+
+
 def test_processes_begin_without_ctrl_c():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -761,7 +805,7 @@ def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
     lab = Lab(argument_parser("").parse_args(arguments))
     for name, experiment in experiments().items():
         if name not in made_from_models and name != "quick_preset":  # its runs are not among the committed ones
-            experiment.present(lab, [lab.grid(grid) for grid in experiment.grids])
+            lab.present(experiment, [lab.grid(grid) for grid in experiment.grids])
     made = {path.name for path in tmp_path.glob("*.md")}
     assert shown == made | {f"{name}.md" for name in made_from_models} - {"comparison_pictures.md"}
     unshown = {path.name for path in committed.glob("*.md")} - shown
@@ -788,7 +832,7 @@ def test_the_plan_counts_what_is_left(tmp_path):
     assert "| built-in 1/2 | 400 | 0 | 30+20 | 0 of 6 | all |" in everything
     assert "8 of 8 stages are left" in everything and "rough figure of CPUs" in everything
     assert "on this machine, 2 at a time, with compilation" in everything and "Disk: about" in everything
-    assert "8.0 GB may be used" in everything
+    assert "8.00 GB may be used" in everything
     on_gpu = plan_of([grid], {}, folders, dataclasses.replace(here, has_gpu=True))
     assert "the paper's program on its GPU" in on_gpu and "compilation" not in on_gpu
     first = next(grid.jobs({}))

@@ -155,8 +155,10 @@ def forecast_with(**sizes):
 )
 def test_what_does_not_fit_is_refused_with_the_option_to_change(name, option):
     found = forecast_with(**{"program": 1e6, "photographs": 1e6, "model": 1e6, "pixels": 1e6, name: 5e9})
-    advice = "the program itself takes about 5.0 GB" if name == "program" else "change"
-    with pytest.raises(ValueError, match=rf"5.0 GB of memory \(a-gaussians: .*4.0 GB may be used: {advice} .*{option}"):
+    advice = "the program itself takes about 5.00 GB" if name == "program" else "change"
+    with pytest.raises(
+        ValueError, match=rf"5.00 GB of memory \(a-gaussians: .*4.00 GB may be used: {advice} .*{option}"
+    ):
         found.check(4e9)
     found.check(5.1e9)
 
@@ -200,8 +202,8 @@ def test_the_downscale_of_quick_runs():
 
 def test_what_is_told():
     told = forecast_with(program=0.5e9, photographs=1e9, model=2e6, pixels=0).told(8e9)
-    assert "about 1.5 GB at the peak (a-gaussians: program 500 MB, photographs 1.0 GB, model 2 MB" in told
-    assert "8.0 GB may be used" in told and "about 3 MB in the run folder" in told
+    assert "about 1.50 GB at the peak (a-gaussians: program 500 MB, photographs 1.00 GB, model 2.00 MB" in told
+    assert "8.00 GB may be used" in told and "about 3.00 MB in the run folder" in told
     assert "very roughly 5 min to 20 min" in told
     assert "time" not in dataclasses.replace(forecast_with(), seconds=0).told(8e9)
 

@@ -3,6 +3,7 @@
 import io
 import itertools
 import struct
+import sys
 import tracemalloc
 import zlib
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax.data import run_sfm
+from a2tg_jax.data import decoding, run_sfm
 from a2tg_jax.data.decoding import MAX_PIXELS, check_picture, read_pixels
 from a2tg_jax.data.images import check_inside, locate_image
 from a2tg_jax.results.images import picture_names
@@ -96,6 +97,30 @@ def test_pictures_of_8_bits_are_read(tmp_path, kind):
     (tmp_path / "picture").write_bytes(encoded(kind))
     assert read_pixels(tmp_path / "picture").shape == (12, 16, 3)
     assert check_picture(tmp_path / "picture") == (16, 12)
+
+
+def test_heic_is_read_with_its_library(tmp_path):
+    library = pytest.importorskip("pillow_heif")
+    colors = np.full((12, 16, 3), (200, 100, 50), np.uint8)
+    library.from_pillow(Image.fromarray(colors)).save(tmp_path / "photo.heic", quality=90)
+    assert np.abs(read_pixels(tmp_path / "photo.heic").astype(int) - colors).max() < 10
+    assert check_picture(tmp_path / "photo.heic") == (16, 12)
+    whole, rng = (tmp_path / "photo.heic").read_bytes(), np.random.default_rng(1)
+    for data in (*(whole[:size] for size in range(0, len(whole), 40)), *(flipped(whole, rng) for _ in range(60))):
+        (tmp_path / "broken").write_bytes(data)
+        try:
+            assert read_pixels(tmp_path / "broken").ndim == 3
+        except ValueError as error:
+            assert "broken: " in str(error) and "\n" not in str(error)
+
+
+def test_heic_without_its_library_is_one_line_with_the_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    decoding._reads_heic.cache_clear()
+    (tmp_path / "photo.heic").write_bytes(b"\0\0\0\x1cftypheic\0\0\0\0mif1heic")
+    with pytest.raises(ValueError, match=r"photo\.heic: is a HEIC .* pip install 'a2tg-jax\[heic\]'$"):
+        read_pixels(tmp_path / "photo.heic")
+    decoding._reads_heic.cache_clear()
 
 
 def test_photographs_of_several_pictures_are_read(tmp_path):

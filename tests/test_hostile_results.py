@@ -32,7 +32,7 @@ HEAD = ",".join(NAMES)
 def test_metrics_of_wrong_types(tmp_path, value):
     file = tmp_path / "metrics.json"
     file.write_text(json.dumps(value))
-    with pytest.raises(ValueError, match=r"metrics\.json: has no .*a2tg eval rewrites it"):
+    with pytest.raises(ValueError, match=r"metrics\.json: has no "):
         read_psnrs(file)
 
 

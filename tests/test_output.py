@@ -1,19 +1,23 @@
 """Places to write to, and budgets too small to show a scene, are told before any work."""
 
+import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax.cli import main as cli
+from a2tg_jax.core.display import in_bytes
+from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.preflight import warn_of_small_budget
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
-from a2tg_jax.training.progress import told_size
 
 
 def test_a_file_in_the_way_is_told(tmp_path):
@@ -54,12 +58,15 @@ def test_a_budget_for_few_gaussians_is_warned_of(recwarn):
 
 def test_a_limit_below_the_program_itself_says_so():
     forecast = RunForecast({"evaluation": Bytes(program=1.1e9, pixels=1e6)}, 1e6, 0)
-    with pytest.raises(ValueError, match=r"20 MB may be used: the program itself takes about 1.1 GB of it: allow more"):
+    with pytest.raises(
+        ValueError, match=r"20.0 MB may be used: the program itself takes about 1.10 GB of it: allow more"
+    ):
         forecast.check(20e6)
 
 
-def test_small_models_are_told_in_kilobytes():
-    assert [told_size(size) for size in (0.0007, 0.01, 2.5)] == ["0.7 kB", "0.01 MB", "2.50 MB"]
+def test_sizes_have_three_digits_and_a_unit_that_suits_them():
+    told = {1: "1 byte", 999: "999 bytes", 9_996: "10.0 kB", 999_600: "1.00 MB", 2.5e6: "2.50 MB", 12.34e9: "12.3 GB"}
+    assert {size: in_bytes(size) for size in told} == told and in_bytes(1234e9) == "1,234 GB"
 
 
 def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
@@ -72,3 +79,47 @@ def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
     assert f"damaged  {run.metrics}" in told and f"a2tg eval {run.path} rewrites it" in told
     assert "a2tg-gaussians  damaged: " in told and "a2tg-textures   not begun" in told
     assert told.endswith(f"training is not finished; continue with: a2tg train --out {run.path} --resume")
+
+
+def test_info_is_json_on_request(tmp_path, capsys):
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg()))
+    run.metrics.write_text(json.dumps({"models": {"a2tg-gaussians": {"test": {"psnr": 20.5}}}}))
+    run.model("a2tg-gaussians").parent.mkdir()
+    a2tg.save_model(run.model("a2tg-gaussians"), a_model())
+    run.checkpoint("a2tg-textures", 40).parent.mkdir()
+    run.checkpoint("a2tg-textures", 40).write_bytes(b"")
+    assert cli.main(["info", str(run.path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    first, second = facts["stages"]
+    assert (facts["scene"], facts["is_finished"], facts["report"], facts["damage"]) == ("synthetic", False, None, None)
+    assert first["state"] == "finished" and first["num_gaussians"] == 3 and first["psnr"] == {"test": 20.5}
+    assert second["state"] == "in training" and second["iteration"] == 40 and second["psnr"] is None
+    assert "a2tg-gaussians  3 Gaussians; 696 bytes; test 20.50 dB" in describe_run(run)
+
+
+def a_model():
+    return a2tg.Model(init_from_points(np.eye(3), np.full((3, 3), 0.5)))
+
+
+@pytest.mark.parametrize(
+    ("command", "name"), [("export {} --ply", "x.ply"), ("export {} --web", "x.html"), ("compress {} --out", "x.a2tgz")]
+)
+def test_a_file_is_not_replaced_unasked(tmp_path, capsys, command, name):
+    model, out = tmp_path / "model.npz", tmp_path / name
+    a2tg.save_model(model, a_model())
+    out.write_text("mine")
+    words = [*command.format(model).split(), str(out)]
+    assert cli.main(words) == 2
+    assert f"{name} exists; add --overwrite to replace it, or choose another {words[2]}" in capsys.readouterr().err
+    assert out.read_text() == "mine"
+    if name == "x.ply":
+        assert cli.main([*words, "--overwrite"]) == 0 and out.read_bytes().startswith(b"ply")
+
+
+def test_a_page_in_a_folder_is_not_replaced_unasked(tmp_path):
+    check_new(tmp_path / "index.html", "--web", overwrite=False)
+    (tmp_path / "index.html").touch()
+    with pytest.raises(FileExistsError, match=r"index\.html exists; add --overwrite"):
+        check_new(tmp_path / "index.html", "--web", overwrite=False)
+    check_new(tmp_path / "index.html", "--web", overwrite=True)

@@ -214,6 +214,11 @@ def test_the_first_ctrl_c_is_noted_and_the_second_interrupts():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_a_noted_ctrl_c_is_not_lost_at_the_end():
+    with pytest.raises(KeyboardInterrupt), signals.ctrl_c_noted():
+        signal.raise_signal(signal.SIGINT)
+
+
 ROWS = {
     "concatenate needs at least one model": lambda: a2tg.concatenate([]),
     "models[1] must be a Model; got Gaussians": lambda: a2tg.concatenate([MODEL, GAUSSIANS]),

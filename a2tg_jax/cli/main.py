@@ -26,11 +26,12 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
-from a2tg_jax.results.folder import open_run
-from a2tg_jax.results.info import describe_run
+from a2tg_jax.results.folder import json_text, open_run
+from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.lock import opened
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.preflight import check_weights
+from a2tg_jax.results.summary import metrics_json
 from a2tg_jax.results.whole_run import measure
 from a2tg_jax.training import SYSTEMS
 
@@ -76,11 +77,17 @@ class Eval:
     lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, the LPIPS in metrics.json is kept if the
     models are the same."""
+    json: bool = False
+    """Print metrics.json, for programs, in place of a table."""
 
     def run(self) -> None:
         check_weights(self.lpips_weights)
         with opened(self.folder) as run:
-            tell_result(measure(run, lpips_weights=self.lpips_weights), self.folder)
+            result = measure(run, lpips_weights=self.lpips_weights)
+            if self.json:
+                print(json_text(metrics_json(result)))
+            else:
+                tell_result(result, self.folder)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,23 +108,33 @@ class Compress:
     """Output file."""
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
+    overwrite: bool = False
+    """Replace the file that --out names."""
 
     def run(self) -> None:
         if self.out is not None:
             check_output(self.out)
+            check_new(self.out, "--out", overwrite=self.overwrite)
         tell = functools.partial(print, flush=True)
         print(compression_text(compress(self.source, self.out, max_loss=self.max_loss, on_start=tell)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Info:
-    """Print the scene, the progress of each stage, the models and the metrics of a run."""
+    """Print the scene, the progress of each stage, the models and the metrics of a run.
+
+    Example:
+      a2tg info runs/fox --json
+    """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
+    json: bool = False
+    """Print JSON, for programs."""
 
     def run(self) -> None:
-        print(describe_run(open_run(self.folder)))
+        run = open_run(self.folder)
+        print(json_text(run_facts(run)) if self.json else describe_run(run))
 
 
 Command = Demo | Train | Eval | Finish | Render | View | Export | Convert | Compress | Info | Sfm

@@ -12,10 +12,10 @@ from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.live import shown_live
-from a2tg_jax.results.output import check_output
-from a2tg_jax.results.ply_export import export_ply
+from a2tg_jax.results.output import check_new, check_output
+from a2tg_jax.results.ply_export import check_ply, export_ply
 from a2tg_jax.results.viewing import open_source, routes_of
-from a2tg_jax.results.web_export import export_web, exported_text
+from a2tg_jax.results.web_export import check_page, export_web, exported_text
 from a2tg_jax.training.loop import Watch
 from a2tg_jax.web.server import LOOPBACK, serve
 
@@ -80,6 +80,8 @@ class Export:
     """Put the photographs of the run's cameras beside the page."""
     model: LastModel = None
     """Name of a run's model, as a2tg info prints it."""
+    overwrite: bool = False
+    """Replace what --web and --ply name."""
 
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
@@ -87,6 +89,12 @@ class Export:
         for out in (self.web, self.ply):
             if out is not None:
                 check_output(out)
+        if self.web is not None:
+            is_file = check_page(self.web, single_file=self.single_file, photographs=self.photographs)
+            check_new(self.web if is_file else self.web / "index.html", "--web", overwrite=self.overwrite)
+        if self.ply is not None:
+            check_ply(self.ply)
+            check_new(self.ply, "--ply", overwrite=self.overwrite)
         source = open_source(self.source, self.model)
         if self.ply is not None:
             print(export_ply(source, self.ply))

@@ -21,11 +21,15 @@ def counted(num: int, noun: str) -> str:
     return f"{num:,} {noun}{'' if num == 1 else 's'}"
 
 
-def in_bytes(num: int) -> str:
-    """Return a number of bytes in a unit that suits it: bytes, kB or MB."""
-    if num < 1000:
-        return counted(num, "byte")
-    return f"{num / 1e3:.1f} kB" if num < 1e6 else f"{num / 1e6:.2f} MB"
+def in_bytes(num: float) -> str:
+    """Return a number of bytes with three digits in a unit that suits it: bytes, kB, MB or GB (10^9 bytes)."""
+    size, told = float(num), counted(round(num), "byte")
+    for unit in ("kB", "MB", "GB"):
+        if size < 999.5:
+            break
+        size /= 1e3
+        told = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
+    return told
 
 
 def short_tuple_repr(value: Any) -> str:

@@ -18,7 +18,7 @@ from a2tg_jax.core.checks import check_shape
 with warnings.catch_warnings():
     # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
     warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-    from jaxopt import OptStep  # type: ignore[import-untyped]
+    from jaxopt import OptStep as OptStep  # type: ignore[import-untyped]
     from jaxopt.linear_solve import solve_cg as solve_cg  # type: ignore[import-untyped]
 
 

@@ -1,9 +1,11 @@
 """Decoding of photographs that may be broken or malicious.
 
-Only formats of photographs are tried, because Pillow knows others, one of which starts a program. Size and bits are
-checked before decoding. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
+Only formats of photographs are tried, because Pillow knows others, one of which starts a program. HEIC needs a library
+of its own. Size and bits are checked before decoding. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
 """
 
+import functools
+import importlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +18,10 @@ from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
+HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx"}
+"""Brands in the first box of HEIC files, one of which they name; AVIF files name others."""
+LONGEST_BOX = 64
+"""Bytes of the first box that are looked at."""
 BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
 LONGEST_REASON = 200
@@ -64,7 +70,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
 def _decoded(path: str | os.PathLike[str], file: BufferedReader) -> Iterator[Image.Image]:
     """Yield the image in an open file, once."""
     try:
-        with Image.open(file, formats=FORMATS) as image:
+        with Image.open(file, formats=_formats_of(path, file)) as image:
             _check_size(path, image)
             _check_depth(path, image)
             yield image
@@ -72,6 +78,27 @@ def _decoded(path: str | os.PathLike[str], file: BufferedReader) -> Iterator[Ima
         raise
     except Exception as error:  # what a damaged picture raises goes from SyntaxError to RuntimeError and struct.error
         raise _unreadable(path, error) from error
+
+
+def _formats_of(path: str | os.PathLike[str], file: BufferedReader) -> tuple[str, ...]:
+    """Return the formats to try on an open file."""
+    head = file.peek(LONGEST_BOX)[:LONGEST_BOX]
+    brands = {head[at : at + 4] for at in range(8, min(len(head), int.from_bytes(head[:4], "big")), 4)}
+    if head[4:8] != b"ftyp" or not brands & HEIC_BRANDS:
+        return FORMATS
+    if not _reads_heic():
+        raise PictureRefused(f"{path}: is a HEIC photograph, which needs pillow-heif: pip install 'a2tg-jax[heic]'")
+    return (*FORMATS, "HEIF")
+
+
+@functools.cache
+def _reads_heic() -> bool:
+    """Have Pillow read HEIC too, and return whether it can."""
+    try:
+        importlib.import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return False
+    return True
 
 
 def _unreadable(path: str | os.PathLike[str], error: Exception) -> ValueError:

@@ -64,7 +64,7 @@ def noted() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def ctrl_c_noted() -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C within the block; the second raises KeyboardInterrupt.
+    """Note the first Ctrl-C within the block; the second raises KeyboardInterrupt, and so does the end of the block.
 
     Yield a function that returns whether there was one. Programs that handle Ctrl-C themselves keep their handler.
     """
@@ -78,6 +78,8 @@ def ctrl_c_noted() -> Iterator[Callable[[], bool]]:
     is_own = signal.getsignal(CTRL_C) is not signal.default_int_handler
     with contextlib.nullcontext() if is_own else _handled_by(note, (CTRL_C,)):
         yield lambda: bool(numbers)
+    if numbers:
+        raise KeyboardInterrupt
 
 
 @contextlib.contextmanager

@@ -37,7 +37,7 @@ from a2tg_jax.io.model_file import (
     origin_to_dict,
 )
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
-from a2tg_jax.io.rows import Rows, check_kind, model_of, ordered, rows_of
+from a2tg_jax.io.rows import Rows, check_encodable, model_of, ordered, rows_of
 from a2tg_jax.io.streams import Layout, Reader, Writer
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
@@ -136,7 +136,7 @@ def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> byt
     """Return the bytes of `save_compact`. Raises as it does."""
     choices.check()
     check_gaussians(model.gaussians, "model.gaussians")
-    check_kind(model.appearance)
+    check_encodable(model.appearance)
     data, num_unpacked = _encoded(model.live, choices)
     check_model(model)
     if num_unpacked > _room(data):  # So alike are its numbers that the file would be taken for a bomb.
@@ -216,7 +216,7 @@ def _decoded(data: bytes) -> Model:
     header, body = _unframed(data)
     choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
     appearance = appearance_from_dict(header["appearance"], ())
-    check_kind(appearance)
+    check_encodable(appearance)
     reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
     rows = _rows_of(reader, header, choices, appearance.has_degrees)
     origin = _origin_of(reader, header["origin"]) if "origin" in header else None

@@ -35,7 +35,7 @@ from a2tg_jax.io.gltf_reader import Document
 from a2tg_jax.io.gltf_textures import EXTENSION, Shown, TexelKind, add_textures, kept_appearance, shown_of
 from a2tg_jax.io.gltf_writer import Builder
 from a2tg_jax.io.model_file import appearance_to_dict
-from a2tg_jax.io.rows import Rows, check_kind, model_of, rows_of
+from a2tg_jax.io.rows import Rows, check_encodable, model_of, rows_of
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model, concatenate
@@ -89,7 +89,7 @@ def save_gltf(
     if not model.num:
         raise ValueError("model has no Gaussians; a glTF file has at least one")
     if textures:
-        check_kind(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
+        check_encodable(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
     builder = Builder()
     primitive = _primitive(builder, model, texels if textures else None)
     used = [SPLATS, *primitive["extensions"][SPLATS].get("extensions", {})]

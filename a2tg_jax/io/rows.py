@@ -44,7 +44,7 @@ class Rows:
     """Texels [T, 4], one texture after the other, each row by row."""
 
 
-def check_kind(
+def check_encodable(
     appearance: Appearance, file: str = "a compact file", instead: str = "save_model keeps any model"
 ) -> None:
     """Raise ValueError, saying what to do instead, unless a file can hold what splats show."""

@@ -21,7 +21,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.compact import GROUPS, encode_model
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.io.rows import check_kind
+from a2tg_jax.io.rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.results.corrected import refined_views
@@ -76,7 +76,7 @@ def compress(
     run = open_run(source) if source.is_dir() else None
     path, settings = (source, RenderSettings()) if run is None else _last_model(run)
     model = load_model(path)
-    check_kind(model.appearance)
+    check_encodable(model.appearance)
     out = path.with_suffix(SUFFIX) if out is None else out
     if not 0 <= max_loss < math.inf:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")

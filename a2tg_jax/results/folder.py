@@ -256,10 +256,15 @@ def _is_file(path: Path) -> bool:
         return False
 
 
+def json_text(data: Any) -> str:
+    """Return indented JSON."""
+    return json.dumps(data, indent=2, ensure_ascii=False)
+
+
 def write_json(path: Path, data: Any) -> None:
     """Write indented JSON atomically."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(f"{json_text(data)}\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:

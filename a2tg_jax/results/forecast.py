@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import jax
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.data import Scene
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.cores import num_threads
@@ -76,10 +77,10 @@ class RunForecast:
     def told(self, limit: float) -> str:
         """Return the forecast as lines of text."""
         phase, needed = self.peak
-        parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
+        parts = ", ".join(f"{name} {in_bytes(size)}" for name, size in needed._asdict().items())
         lines = [
-            f"memory: about {_told(needed.total)} at the peak ({phase}: {parts}); {_told(limit)} may be used",
-            f"disk: about {_told(self.disk_bytes)} in the run folder",
+            f"memory: about {in_bytes(needed.total)} at the peak ({phase}: {parts}); {in_bytes(limit)} may be used",
+            f"disk: about {in_bytes(self.disk_bytes)} in the run folder",
         ]
         if self.seconds:
             cores = num_threads()
@@ -102,15 +103,15 @@ class RunForecast:
         if needed.total <= limit:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
-        parts = ", ".join(f"{name} {_told(size)}" for name, size in needed._asdict().items())
+        parts = ", ".join(f"{name} {in_bytes(size)}" for name, size in needed._asdict().items())
         advice = (
             f"change {self._told_options(largest)}, or"
             if largest != "program"
-            else (f"the program itself takes about {_told(needed.program)} of it:")
+            else (f"the program itself takes about {in_bytes(needed.program)} of it:")
         )
         raise ValueError(
-            f"the run would need about {_told(needed.total)} of memory ({phase}: {parts}), and {_told(limit)} may be "
-            f"used: {advice} allow more with --max-memory"
+            f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {parts}), and {in_bytes(limit)} "
+            f"may be used: {advice} allow more with --max-memory"
         )
 
     def _told_options(self, largest: str) -> str:
@@ -234,10 +235,6 @@ def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) ->
     num_pictures = 3 + max(1, len(plan.chains) - 1)
     kept = sum((KEPT_STATES * STATES + 1) * stage.model_bytes for stage in stages)
     return kept + PICTURE_PER_PIXEL * num_pictures * pixels
-
-
-def _told(num_bytes: float) -> str:
-    return f"{num_bytes / 1e9:.1f} GB" if num_bytes >= 1e9 else f"{math.ceil(num_bytes / 1e6)} MB"
 
 
 def _between(seconds: float) -> str:

@@ -1,10 +1,13 @@
 """Summary of a run folder in a few lines of text."""
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
@@ -12,7 +15,6 @@ from a2tg_jax.results.folder import RunFolder, iteration_of, read_json, resuming
 from a2tg_jax.results.record import read_record, repeating_command
 from a2tg_jax.results.replacement import old_run
 
-REWRITES = "; a2tg eval rewrites it"
 SPLITS = ("test", "validation", "train")
 
 
@@ -24,27 +26,47 @@ def describe_run(run: RunFolder) -> str:
     Raises:
       ValueError: if run.toml is damaged or of another version.
     """
-    record = read_record(run)
-    measured, damage = _psnrs_or_damage(run.metrics)
-    compared = f", compared with {', '.join(record.compare)}" if record.compare else ""
-    names = record.plan.names
-    width = max(map(len, names))
+    facts, old = run_facts(run), old_run(run)
+    stages, damage = facts["stages"], facts["damage"]
+    compared = f", compared with {', '.join(facts['compare'])}" if facts["compare"] else ""
+    width = max(len(stage["name"]) for stage in stages)
     lines = [
-        f"scene    {record.scene.path} (downscale {record.scene.downscale})",
-        f"system   {record.name}{compared}",
+        f"scene    {facts['scene']} (downscale {facts['downscale']})",
+        f"system   {facts['system']}{compared}",
         f"repeat   {repeating_command(run)}",
-        *(f"model    {name:<{width}}  {_describe_stage(run, name, measured.get(name))}" for name in names),
-        f"report   {run.report if run.report.is_file() else 'none yet: a2tg eval writes it'}",
+        *(f"model    {stage['name']:<{width}}  {_told_stage(stage)}" for stage in stages),
+        f"report   {facts['report'] or 'none yet: a2tg eval writes it'}",
         *([f"damaged  {damage}: {shlex.join(['a2tg', 'eval', str(run.path)])} rewrites it"] if damage else []),
     ]
-    if not all(is_regular(run.model(name)) for name in names):
+    if not facts["is_finished"]:
         lines.append(f"training is not finished; continue with: {resuming_command(run)}")
     if is_regular(run.finish):
         lines.append(f"finished {run.finish} says from which run and how")
-    old = old_run(run)
     if old is not None:
         lines.append(f"replaces a run that is kept in {old.path} until this one has its report")
     return "\n".join(lines)
+
+
+def run_facts(run: RunFolder) -> dict[str, Any]:
+    """Return what a run folder holds as JSON-able values, a dictionary for each stage.
+
+    Raises:
+      ValueError: if run.toml is damaged or of another version.
+    """
+    record = read_record(run)
+    measured, damage = _psnrs_or_damage(run.metrics)
+    names = record.plan.names
+    return {
+        "path": str(run.path),
+        "scene": record.scene.path,
+        "downscale": record.scene.downscale,
+        "system": record.name,
+        "compare": list(record.compare),
+        "is_finished": all(is_regular(run.model(name)) for name in names),
+        "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],
+        "report": str(run.report) if run.report.is_file() else None,
+        "damage": damage or None,
+    }
 
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
@@ -56,13 +78,13 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     data = read_json(path)
     models = data.get("models") if isinstance(data, dict) else None
     if not isinstance(models, dict):
-        raise ValueError(f"{path}: has no models{REWRITES}")
+        raise ValueError(f"{path}: has no models")
     psnrs: dict[str, dict[str, float]] = {}
     for name, model in models.items():
         splits = {split: model[split] for split in SPLITS if split in model} if isinstance(model, dict) else None
         found = None if splits is None else [isinstance(x, dict) and x.get("psnr") for x in splits.values()]
         if splits is None or found is None or not all(type(psnr) in (int, float) for psnr in found):
-            raise ValueError(f"{path}: has no PSNR of {shortened(name)}{REWRITES}")
+            raise ValueError(f"{path}: has no PSNR of {shortened(name)}")
         psnrs[name] = {split: float(psnr) for split, psnr in zip(splits, found, strict=True)}  # type: ignore[arg-type]
     return psnrs
 
@@ -72,29 +94,43 @@ def _psnrs_or_damage(path: Path) -> tuple[dict[str, dict[str, float]], str]:
     try:
         return (read_psnrs(path) if is_regular(path) else {}), ""
     except ValueError as error:
-        return {}, str(error).removesuffix(REWRITES)
+        return {}, str(error)
 
 
-def _describe_stage(run: RunFolder, name: str, measured: dict[str, float] | None) -> str:
-    if not is_regular(run.model(name)):
-        return _progress(run.checkpoints(name))
+def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
+    """Return the model of a stage, what is wrong with it, or how far its training has come."""
+    path = run.model(name)
+    if not is_regular(path):
+        checkpoints = run.checkpoints(name)
+        if not checkpoints:
+            return {"state": "not begun"}
+        newest = checkpoints[-1]
+        return {"state": "in training", "iteration": iteration_of(newest), "checkpoint": str(newest)}
     try:
-        model = load_model(run.model(name))
+        model = load_model(path)
     except ValueError as error:
-        return f"damaged: {error}; delete it, and a2tg train --resume trains the stage again"
-    parts = [f"{model.num:,} Gaussians", f"{model.num_bytes / 1e6:.2f} MB"]
+        return {"state": "damaged", "damage": str(error)}
+    facts = {"state": "finished", "model": str(path), "num_gaussians": model.num, "num_bytes": model.num_bytes}
     if model.bands is not None:
-        counts = np.bincount(model.bands[1].degrees)
-        parts.append("degrees " + ", ".join(f"{degree}: {n:,}" for degree, n in enumerate(counts)))
+        facts["degrees"] = np.bincount(model.bands[1].degrees).tolist()
     if model.textures is not None:
         sizes, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
-        parts.append("textures " + ", ".join(f"{tv}×{tu}: {n:,}" for (tv, tu), n in zip(sizes, counts, strict=True)))
-    if measured:
-        parts += [f"{split} {psnr:.2f} dB" for split, psnr in measured.items()]
-    return "; ".join(parts)
+        facts["textures"] = {f"{tv}×{tu}": int(num) for (tv, tu), num in zip(sizes, counts, strict=True)}
+    return facts
 
 
-def _progress(checkpoints: list[Path]) -> str:
-    if not checkpoints:
-        return "not begun"
-    return f"at iteration {iteration_of(checkpoints[-1])} ({checkpoints[-1]})"
+def _told_stage(stage: Mapping[str, Any]) -> str:
+    """Return what is known of a stage in words."""
+    match stage["state"]:
+        case "in training":
+            return f"at iteration {stage['iteration']} ({stage['checkpoint']})"
+        case "damaged":
+            return f"damaged: {stage['damage']}; delete it, and a2tg train --resume trains the stage again"
+        case "finished":
+            parts = [f"{stage['num_gaussians']:,} Gaussians", in_bytes(stage["num_bytes"])]
+            counts = {"degrees": dict(enumerate(stage.get("degrees", ()))), "textures": stage.get("textures", {})}
+            for noun, found in counts.items():
+                if found:
+                    parts.append(f"{noun} " + ", ".join(f"{kind}: {num:,}" for kind, num in found.items()))
+            return "; ".join([*parts, *(f"{split} {psnr:.2f} dB" for split, psnr in (stage["psnr"] or {}).items())])
+    return str(stage["state"])

@@ -30,3 +30,9 @@ def check_output(path: Path) -> None:
         raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
     if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
         print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
+
+
+def check_new(path: Path, flag: str, *, overwrite: bool) -> None:
+    """Raise FileExistsError if a file would be replaced without --overwrite, naming it and the flag it comes from."""
+    if path.is_file() and not overwrite:
+        raise FileExistsError(f"{path} exists; add --overwrite to replace it, or choose another {flag}")

@@ -153,6 +153,8 @@ class _Keeper:
         self.run, self.name, self.replaced_by = run, name, replaced_by
 
     def __call__(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.iteration == 0:
+            return  # The stage would begin with the same state again.
         if self.replaced_by is not None:
             set_aside(self.run)
         save_checkpoint(self.run.own(self.run.checkpoint(self.name, checkpoint.iteration)), checkpoint)

@@ -51,6 +51,18 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
       FileExistsError: if a folder is wanted where a file lies, or a file where a folder lies.
       ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
     """
+    single_file = check_page(out, single_file=single_file, photographs=photographs)
+    data = source.encoded
+    files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
+    for path, content in files.items():
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+    page, total = out if single_file else out / "index.html", sum(map(len, files.values()))
+    return Exported(page, len(data), len(files), total, source.model, _losses_of(source))
+
+
+def check_page(out: Path, *, single_file: bool, photographs: bool) -> bool:
+    """Return whether the page is to be one file. Arguments and errors are those of `export_web`."""
     single_file = single_file or (out.suffix.lower() == ".html" and not out.is_dir())
     if single_file and photographs:
         raise ValueError("--photographs needs a folder: leave out --single-file, and .html at the end of --web")
@@ -60,13 +72,7 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
         raise FileExistsError(f"{out} is a file; choose a folder with --web, or a name that ends in .html for one file")
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
-    data = source.encoded
-    files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
-    for path, content in files.items():
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-    page, total = out if single_file else out / "index.html", sum(map(len, files.values()))
-    return Exported(page, len(data), len(files), total, source.model, _losses_of(source))
+    return single_file
 
 
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:

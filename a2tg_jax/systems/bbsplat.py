@@ -49,6 +49,7 @@ class BBSplat(System):
     billboard: BillboardConfig = dataclasses.field(default_factory=BillboardConfig)
 
     name: ClassVar[str] = "bbsplat"
+    version: ClassVar[int] = 2
     ranges: ClassVar[Ranges] = {
         "billboard.side": (2, 16),
         "billboard.rgb": ANY_RATE,

@@ -88,6 +88,7 @@ class Bytewise(System):
     texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
 
     name: ClassVar[str] = "bytewise"
+    version: ClassVar[int] = 2
     ranges: ClassVar[Ranges] = LOOKUP_RANGES
     event_options: ClassVar[Mapping[str, str]] = {
         **MCMC_OPTIONS,

@@ -106,8 +106,8 @@ def fit(
       on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
         the fields of `History`.
       progress: show a progress bar.
-      is_stopped: asked between steps. If it returns True, `on_checkpoint` is called a last time and `Interrupted` is
-        raised. The first Ctrl-C does the same, unless the program handles it.
+      is_stopped: asked between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
+        `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
       session: shapes that trainings of this process share; None: a new one.
 
     Raises:

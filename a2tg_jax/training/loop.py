@@ -190,8 +190,7 @@ class StageRun:
         is_stopped: IsStopped,
         watch: Watch,
     ) -> None:
-        first, end = int(self.state.iteration), self.stage.iterations
-        iteration = first
+        iteration, end = int(self.state.iteration), self.stage.iterations
         with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress) as bar:
             while iteration < end:
                 stop = self._next_stop(iteration, checkpoint_every)
@@ -204,11 +203,11 @@ class StageRun:
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
-                is_asked = is_stopped() and iteration > first
+                is_asked = is_stopped()
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
                 if on_checkpoint is not None and (is_due or is_asked or iteration == end):
                     on_checkpoint(self.checkpoint)
-                if is_stopped() and iteration < end:
+                if is_asked:
                     raise Interrupted(self.checkpoint)
         if self.num_refused:
             advice = "; or ".join(self._told_by_events("refused"))

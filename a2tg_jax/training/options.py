@@ -95,6 +95,8 @@ class System:
 
     name: ClassVar[str] = ""
     """Name on the command line."""
+    version: ClassVar[int] = 1
+    """Version of the method. Raise it when the same options train another model."""
     ranges: ClassVar[Ranges] = {}
     """Ranges of the system's own options."""
     event_options: ClassVar[Mapping[str, str]] = {}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.step import StepInfo
 
@@ -120,7 +121,9 @@ class ProgressBar:
         words = [] if left is None or self._done == self._total else [f"{left} left"]
         words.append(f"loss {self._loss:.4f}, {self._psnr:.2f} dB")
         if len(history.iteration):
-            words.append(f"{int(history.num_gaussians[-1]):,} Gaussians, {told_size(float(history.megabytes[-1]))}")
+            words.append(
+                f"{int(history.num_gaussians[-1]):,} Gaussians, {in_bytes(1e6 * float(history.megabytes[-1]))}"
+            )
         return ", ".join(words)
 
     def _is_line_due(self) -> bool:
@@ -137,8 +140,3 @@ class ProgressBar:
 def has_terminal() -> bool:
     """Return whether stderr can redraw a line: it is a terminal or a notebook."""
     return sys.stderr.isatty() or type(sys.stderr).__module__.startswith("ipykernel")
-
-
-def told_size(megabytes: float) -> str:
-    """Return the size of a model in MB, or in kB where MB would round to nothing."""
-    return f"{megabytes:.2f} MB" if megabytes >= 0.01 else f"{1e3 * megabytes:.1f} kB"

@@ -17,7 +17,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.jit import Jitted
-from a2tg_jax.core.optim import AdamState, adam_init, adam_update
+from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
@@ -112,6 +112,8 @@ class Attempt(NamedTuple):
     state: TrainState
     """State after the step, with the status of the state before."""
     info: EventInfo
+    is_finite: Array
+    """Whether all numbers are: losses, gradients, and what projections and events made of Adam's results."""
 
 
 @functools.cache
@@ -167,7 +169,10 @@ def attempt(
     progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
     decay = jnp.exp(clock.log_decay * progress)
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
-    model, moments = _updated(stage, state, grads, rate)
+    step = _optimized(stage, state, grads, rate)
+    gaussians, params = step.params
+    moments: AdamState = step.state
+    model = dataclasses.replace(state.model, gaussians=gaussians, params=stage.appearance.project(params))
     now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
     seen = _seen(stage, batch, own, found)
     model, moments, events, info = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
@@ -176,7 +181,12 @@ def attempt(
         for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
     )
     after = TrainState(model, moments, events, iteration, state.status, corrections)
-    return Attempt(found, (*grads, found.grads[2]), after, info)
+    made: Any = (model.gaussians, model.params)
+    if settings.due is not None:
+        # Adam's steps are finite if gradients are. A check of what nothing else changed makes a GPU write it twice.
+        made = _others(step.params, made)
+    is_finite = _all_finite((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
+    return Attempt(found, (*grads, found.grads[2]), after, info, is_finite)
 
 
 class BatchGradients(NamedTuple):
@@ -273,16 +283,14 @@ def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: Batch
     return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height), colors)
 
 
-def _updated(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array) -> tuple[Model, AdamState]:
-    """Return model and moments after Adam, with projected parameters."""
+def _optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array) -> OptStep:
+    """Return (gaussians, params) and moments after Adam."""
     model = state.model
     rates = (
         stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree),
         stage.appearance.rates(stage.params_rate, model.params),
     )
-    step = adam_update((model.gaussians, model.params), grads, state.moments, rates)
-    gaussians, params = step.params
-    return dataclasses.replace(model, gaussians=gaussians, params=stage.appearance.project(params)), step.state
+    return adam_update((model.gaussians, model.params), grads, state.moments, rates)
 
 
 def _events(
@@ -336,14 +344,21 @@ def _at_its_times(
 
 def _status(clock: Clock, tried: Attempt) -> Array:
     """Return the first reason why a step may not be taken."""
-    found, model = tried.views, tried.state.model
-    rows = [known.rows for known in tried.state.corrections]
-    is_finite = _all_finite((found.loss, tried.grads, model.gaussians, model.params, rows))
+    found = tried.views
     status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
     status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
-    status = jnp.where(is_finite, status, NOT_FINITE)
+    status = jnp.where(tried.is_finite, status, NOT_FINITE)
     return jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
 
 
+def _others(known: Any, tree: Any) -> list[Array]:
+    """Return the leaves of a tree that are no leaves of a known one."""
+    ids = {id(leaf) for leaf in jax.tree.leaves(known)}
+    return [leaf for leaf in jax.tree.leaves(tree) if id(leaf) not in ids]
+
+
 def _all_finite(tree: Any) -> Array:
-    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
+    """Return whether all numbers are finite: row by row first, then by one reduction of all rows."""
+    rows = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(tree)]
+    # Without the barrier XLA would reduce each leaf to one flag apart, which costs a GPU two launches a leaf.
+    return jnp.all(jax.lax.optimization_barrier(jnp.concatenate(rows)))

@@ -14,7 +14,7 @@ from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.results.record import SYNTHETIC
-from lab import machine, spreadsheet, tables
+from lab import machine, spreadsheet, tables, versions
 from lab.grid import Grid, read_grid
 from lab.jobs import Folders, Job, Record
 from lab.plan import Machine, plan_of
@@ -48,6 +48,7 @@ class Lab:
         self.folders = Folders(args.scenes, self.work, args.lpips_weights, network)
         self._file = self.out / "records.json"
         self.records: dict[str, Record] = self._all_records()
+        self._note = ""
 
     def _default_out(self) -> Path:
         """Return the folder of the committed results, or one that git ignores for the smoke scale and grids of one's
@@ -123,6 +124,7 @@ class Lab:
         """Print a page and save it among the results."""
         if self.args.validation:
             text = f"*Measured on validation views, taken from the training views; test views were not used.*\n\n{text}"
+        text = f"{text.rstrip()}\n{self._note}"
         path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -133,6 +135,18 @@ class Lab:
         found = [(grid.name, result) for grid in grids for result in tables.results_of(grid, self.records)]
         with replacing(self.pages / f"{name}.csv") as temporary:
             temporary.write_text(spreadsheet.rows_text(found), encoding="utf-8")
+
+    def records_of(self, grids: Sequence[Grid]) -> list[Record]:
+        """Return the records of the finished runs of some grids, each once."""
+        results = (result for grid in grids for result in tables.results_of(grid, self.records))
+        return list({result.run.job.key: result.record for result in results}.values())
+
+    def present(self, experiment: "Experiment", grids: Sequence[Grid]) -> None:
+        """Write the rows and the pages of an experiment."""
+        old = versions.told(self.records_of(grids))
+        self._note = f"\n*Runs from before: {old}.*\n" if old else ""
+        self.write_rows(experiment.name, grids)
+        experiment.present(self, grids)
 
     def check_inputs(self, grids: Sequence[Grid]) -> None:
         """Raise if a scene is missing, before anything is trained."""
@@ -159,7 +173,8 @@ class Lab:
     def _all_records(self) -> dict[str, Record]:
         """Return the records of the results and of jobs that were never collected."""
         own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
-        return {**own, **self._kept()}
+        found = {**own, **self._kept()}
+        return {key: one for key, one in found.items() if not (self.args.renew and versions.is_from_before(one))}
 
     def machine(self) -> Machine:
         """Return what --plan plans for."""
@@ -203,6 +218,8 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         lab = Lab(args)
         names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
         grids = {name: lab.grid(name) for name in names}
+        if old := versions.told(lab.records_of(list(grids.values()))):
+            print(f"Runs from before: {old}. --renew trains them again.", flush=True)
         if args.plan:
             lab.check_inputs(list(grids.values()))
             print(plan_of(list(grids.values()), lab.records, lab.folders, lab.machine()))
@@ -213,8 +230,7 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
     for experiment in experiments:
         own = [grids[name] for name in experiment.grids]
         try:
-            lab.write_rows(experiment.name, own)
-            experiment.present(lab, own)
+            lab.present(experiment, own)
         except (ValueError, OSError) as error:
             errors.append(f"{experiment.name}: {error}")
     if errors:
@@ -267,6 +283,7 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
     add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="submitit's parameters: mem_gb=32 …")
     add("--plan", action="store_true", help="run nothing; print what is left to run and about how long it takes")
+    add("--renew", action="store_true", help="train again what earlier versions of systems made")
     add("--tables-only", action="store_true", help="run nothing; write tables and plots of the finished runs")
     return parser
 

@@ -1,6 +1,7 @@
 """Ctrl-C and SIGTERM: how a program of experiments ends. Imports nothing but the standard library."""
 
 import contextlib
+import os
 import shlex
 import signal
 import sys
@@ -18,20 +19,32 @@ class Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """End the program with one line and exit code 130 if Ctrl-C comes within the block, 143 if SIGTERM does."""
+    """End the program with one line and exit code 130 if Ctrl-C comes within the block, 143 if SIGTERM does.
+
+    A second SIGTERM ends it at once, without waiting for the end of running jobs.
+    """
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
     except KeyboardInterrupt as interrupt:
         is_terminated = isinstance(interrupt, Terminated)
-        command = shlex.join([Path(sys.executable).name, *sys.argv])
-        told = "terminated" if is_terminated else "interrupted"
-        print(f"\n{told}; what is finished is kept; continue with: {command}", file=sys.stderr)
+        print(_advice("terminated" if is_terminated else "interrupted"), file=sys.stderr)
         sys.exit(TERMINATED if is_terminated else INTERRUPTED)
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
+def _advice(told: str) -> str:
+    command = shlex.join([Path(sys.executable).name, *sys.argv])
+    return f"\n{told}; what is finished is kept; continue with: {command}"
+
+
 def _terminate(*_: Any) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # A second one would break the end.
+    signal.signal(signal.SIGTERM, _end_at_once)
     raise Terminated
+
+
+def _end_at_once(*_: Any) -> None:
+    """End this process; those of its jobs see that and end too."""
+    os.write(2, f"{_advice('terminated')}\n".encode())
+    os._exit(TERMINATED)

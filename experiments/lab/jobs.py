@@ -26,6 +26,7 @@ from a2tg_jax.results.record import SceneSource
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
 from a2tg_jax.training.start import no_rows
+from lab.versions import is_from_before
 
 MOST_TRAIN_VIEWS = 16
 """Largest number of training views that are measured, evenly chosen."""
@@ -146,7 +147,7 @@ def run_job(job: Job, folders: Folders) -> Record:
     """
     scene = folders.load_scene(job)
     path, model = folders.record(job), folders.model(job)
-    if path.is_file() and model.is_file():
+    if path.is_file() and model.is_file() and not is_from_before(read_json(path)):
         record = {**read_json(path), **_quality(scene, a2tg.load_model(model), folders)}
     else:
         result = _train(job, folders, scene)
@@ -192,8 +193,8 @@ def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Rec
     first = scene.test[0].camera
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
-        "system": reference_of(job.system), "options": differences(job.system), "stage": result.name,
-        "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
+        "system": reference_of(job.system), "version": job.system.version, "options": differences(job.system),
+        "stage": result.name, "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "seconds": result.seconds, "ms_per_step": _milliseconds(result.history),
     }  # fmt: skip

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.display import in_bytes
 from a2tg_jax.events import HostEvent
 from a2tg_jax.training.cost import forecast_stages
 from lab.grid import Grid
@@ -141,8 +142,8 @@ def _room(left: Sequence[Stage], folders: Folders, machine: Machine) -> str:
     disk = sum(model_size(stage.job) for stage in left)
     memory = max(estimated_bytes(stage.job) for stage in left)
     return (
-        f"Disk: about {_told(disk)} of models in {folders.work}. Memory: at most {_told(memory)} for a stage; "
-        f"{_told(machine.memory)} may be used."
+        f"Disk: about {in_bytes(disk)} of models in {folders.work}. Memory: at most {in_bytes(memory)} for a stage; "
+        f"{in_bytes(machine.memory)} may be used."
     )
 
 
@@ -150,10 +151,6 @@ def model_size(job: Job) -> float:
     """Return the bytes of a stage's model: its budget, or its Gaussians with all floats."""
     budget = job.system.budget_bytes
     return model_bytes(job.system) if budget is None else budget
-
-
-def _told(num_bytes: float) -> str:
-    return f"{num_bytes / 1e9:.1f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"
 
 
 def duration(seconds: float) -> str:
