@@ -31,7 +31,7 @@ from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.rasterize.compositor import Composited, composite, refusal
-from a2tg_jax.rasterize.exchange import Exchange, composite_in_bands
+from a2tg_jax.rasterize.exchange import Exchange, composite_in_bands, rows_to_send
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.pixel import Statistic
@@ -371,6 +371,27 @@ def pairs_of_view(
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
 
+def rows_of_view(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the rows that a device of `settings.exchange` must be able to send to another one in a view (host)."""
+    return int(_jitted_rows()(gaussians, camera, rule, settings, num_live))
+
+
+@functools.cache
+def _jitted_rows() -> Jitted[..., Array]:
+    return Jitted(_count_rows, static_argnums=(3,))
+
+
+def _count_rows(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any
+) -> Array:
+    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    assert settings.exchange is not None
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    return rows_to_send(settings.exchange, M, cutoff, settings.near_plane, grid)
+
+
 @functools.cache
 def _jitted_count() -> Jitted[..., Array]:
     return Jitted(_count_pairs, static_argnums=(3, 4))
@@ -379,12 +400,19 @@ def _jitted_count() -> Jitted[..., Array]:
 def _count_pairs(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
 ) -> Array:
+    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    bounds = screen_bounds(M, cutoff, near_plane)
+    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
+
+
+def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:
+    """Return homographies [N, 3, 3] and squared distances [N] of visibility, not positive for rows that do not
+    exist."""
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
         cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
-    bounds = screen_bounds(M, cutoff, near_plane)
-    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
+    return M, cutoff
 
 
 def with_capacity(

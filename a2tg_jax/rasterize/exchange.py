@@ -47,23 +47,31 @@ class Exchange:
         """Number D of devices."""
         return self.mesh.size
 
-    def spread(self, tree: Any) -> Any:
-        """Return arrays with their rows spread over the devices; those that D does not divide are on every device.
-
-        Under jit it constrains where results lie; else it moves the arrays.
-        """
-        return jax.tree.map(self._spread_one, tree)
-
-    def _spread_one(self, x: Any) -> Any:
-        sharding = NamedSharding(self.mesh, self.spec_of(jnp.shape(x)))
-        if isinstance(x, jax.core.Tracer):
-            return jax.lax.with_sharding_constraint(x, sharding)
-        return jax.device_put(x, sharding)
-
-    def spec_of(self, shape: tuple[int, ...]) -> P:
+    def sharding_of(self, shape: tuple[int, ...]) -> NamedSharding:
         """Return where the rows of an array lie."""
         is_divided = bool(shape) and shape[0] >= self.num and shape[0] % self.num == 0
-        return P(AXIS) if is_divided else P()
+        return NamedSharding(self.mesh, P(AXIS) if is_divided else P())
+
+
+def spread(exchange: Exchange | None, tree: Any) -> Any:
+    """Return arrays with their rows spread over the devices; those that D does not divide are on every device.
+
+    Under jit it constrains where results lie; else it moves the arrays. Without an exchange they stay.
+    """
+    if exchange is None:
+        return tree
+
+    def of_leaf(x: Any) -> Any:
+        sharding = exchange.sharding_of(jnp.shape(x))
+        is_traced = isinstance(x, jax.core.Tracer)
+        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else jax.device_put(x, sharding)
+
+    return jax.tree.map(of_leaf, tree)
+
+
+def gathered(exchange: Exchange | None, tree: Any) -> Any:
+    """Return arrays on the first of the devices; without an exchange they stay (host)."""
+    return tree if exchange is None else jax.device_put(tree, exchange.mesh.devices.flat[0])
 
 
 def exchange_among(devices: Any) -> Exchange:
@@ -117,7 +125,7 @@ def composite_in_bands(
     share = min(1.0, ROOM_OF_A_BAND / devices)
     room = _Room(
         pairs=math.ceil(capacity * share), pairs_share=share,
-        rows=min(num_rows // devices, math.ceil(capacity * exchange.rows_per_pair)),
+        rows=min(num_rows // devices, max(1, math.ceil(capacity * exchange.rows_per_pair))),
         rows_share=exchange.rows_per_pair,
     )  # fmt: skip
     on_device = functools.partial(_composite_band, settings, _Bands.of(settings.grid, devices), room, rule)
@@ -131,6 +139,19 @@ def composite_in_bands(
     )(splats, rule.regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian)
     height = settings.grid.height
     return Composited(channels[:, :height], transmittance[:height], num_pairs, overflow)
+
+
+def rows_to_send(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid) -> Array:
+    """Return the largest number of rows that a device sends to another one for a view.
+
+    Args:
+      exchange: the D devices.
+      M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`; D divides N.
+      grid: tiles of the image.
+    """
+    num = exchange.num
+    reached = _Bands.of(grid, num).reached(M, cutoff, near_plane)
+    return jnp.max(jnp.sum(reached.reshape(num, num, -1), axis=2, dtype=jnp.int32))
 
 
 class _Room(NamedTuple):
@@ -186,14 +207,3 @@ def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:
 def _shifted(M: Array, top: Array) -> Array:
     """Return homographies [N, 3, 3] to pixels counted from row `top`."""
     return M.at[:, 1].add(-top.astype(M.dtype) * M[:, 2])
-
-
-def plan_rows(exchange: Exchange, reached: Array) -> int:
-    """Return the largest number of rows that a device sends to another.
-
-    Args:
-      exchange: the devices.
-      reached: [D, N] whether each splat reaches each band.
-    """
-    num = exchange.num
-    return int(jnp.max(jnp.sum(reached.reshape(num, num, -1), axis=2, dtype=jnp.int32)))
