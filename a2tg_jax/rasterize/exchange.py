@@ -81,7 +81,7 @@ def exchange_among(devices: Any) -> Exchange:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Bands:
+class Bands:
     """Bands of an image; all static."""
 
     whole: TileGrid
@@ -90,9 +90,9 @@ class _Bands:
     num: int
 
     @staticmethod
-    def of(grid: TileGrid, num: int) -> "_Bands":
+    def of(grid: TileGrid, num: int) -> "Bands":
         rows = -(-grid.rows // num)
-        return _Bands(grid, TileGrid(grid.width, rows * grid.tile_size, grid.tile_size), num)
+        return Bands(grid, TileGrid(grid.width, rows * grid.tile_size, grid.tile_size), num)
 
     def reached(self, M: Array, cutoff: Array, near_plane: float) -> Array:
         """Return [D, n] whether each splat's box reaches each band."""
@@ -128,7 +128,7 @@ def composite_in_bands(
         rows=min(num_rows // devices, max(1, math.ceil(capacity * exchange.rows_per_pair))),
         rows_share=exchange.rows_per_pair,
     )  # fmt: skip
-    on_device = functools.partial(_composite_band, settings, _Bands.of(settings.grid, devices), room, rule)
+    on_device = functools.partial(_composite_band, settings, Bands.of(settings.grid, devices), room, rule)
     rows, everywhere = P(AXIS), P()
     channels, transmittance, num_pairs, overflow = jax.shard_map(
         on_device,
@@ -150,7 +150,7 @@ def rows_to_send(exchange: Exchange, M: Array, cutoff: Array, near_plane: float,
       grid: tiles of the image.
     """
     num = exchange.num
-    reached = _Bands.of(grid, num).reached(M, cutoff, near_plane)
+    reached = Bands.of(grid, num).reached(M, cutoff, near_plane)
     return jnp.max(jnp.sum(reached.reshape(num, num, -1), axis=2, dtype=jnp.int32))
 
 
@@ -168,7 +168,7 @@ class _Room(NamedTuple):
 
 
 def _composite_band(
-    settings: CompositingSettings, bands: _Bands, room: _Room, rule: AppearanceRule, splats: Splats,
+    settings: CompositingSettings, bands: Bands, room: _Room, rule: AppearanceRule, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return channels [D, h, W] and transmittance [h, W] of this device's band, the capacity needed, the overflow."""

@@ -120,6 +120,7 @@ class StageRun:
         if resume is not None:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
+            check_devices(resume, self.num_devices)
             self.state: TrainState = spread(self.exchange, jax.tree.map(jnp.array, resume.state))
             self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
@@ -408,6 +409,17 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         raise ValueError(
             f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
             "version, so train anew"
+        )
+
+
+def check_devices(resume: Checkpoint, num_devices: int) -> None:
+    """Raise ValueError unless the rows of a checkpoint can be spread evenly over so many devices."""
+    rows = resume.state.model.gaussians.num
+    if rows % num_devices:
+        fitting = [number for number in range(1, num_devices) if rows % number == 0]
+        raise ValueError(
+            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: resume on "
+            f"{' or '.join(map(str, fitting))}"
         )
 
 

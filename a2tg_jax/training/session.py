@@ -19,9 +19,7 @@ class Session:
     depends on the shapes; on several devices sums have another order, so that last digits differ.
     """
 
-    def __init__(
-        self, after_compiling: Callable[[], object] = _nothing, devices: Sequence[jax.Device] | None = None
-    ):
+    def __init__(self, after_compiling: Callable[[], object] = _nothing, devices: Sequence[jax.Device] | None = None):
         """Args:
         after_compiling: called after a step was compiled, such as `host.memory.tidy_memory`.
         devices: devices of this process that train one scene together, each with a share of the Gaussians and of the
