@@ -271,7 +271,7 @@ def devices_named(text: str) -> list[jax.Device]:
     Raises:
       ValueError: if the text is neither "all" nor a number from 1 to that of the devices.
     """
-    devices = jax.local_devices()
+    devices: list[jax.Device] = jax.local_devices()
     if text == "all":
         return devices
     if not text.isdecimal() or not 1 <= int(text) <= len(devices):

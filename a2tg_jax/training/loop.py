@@ -168,7 +168,8 @@ class StageRun:
     @property
     def model(self) -> Model:
         """The Gaussians that exist, and what they show, on one device."""
-        return gathered(self.exchange, self.state.model).live
+        model: Model = gathered(self.exchange, self.state.model)
+        return model.live
 
     @property
     def checkpoint(self) -> Checkpoint:
