@@ -30,13 +30,15 @@ from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.rasterize.compositor import composite, refusal
+from a2tg_jax.rasterize.compositor import Composited, composite, refusal
+from a2tg_jax.rasterize.exchange import Exchange, composite_in_bands, rows_to_send
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.splats import (
     CompositingSettings,
     Compositor,
+    Splats,
     Wanted,
     project_gaussians,
 )
@@ -71,6 +73,8 @@ class RenderSettings:
     mode; "autodiff", slower and by XLA, in any mode and to any order."""
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
+    exchange: Exchange | None = None
+    """Devices that render each image together (`exchange_among`); None: one."""
 
     def __post_init__(self) -> None:
         if not self.near_plane > 0:
@@ -262,15 +266,27 @@ def render_traced(
             gaussians, camera, rule, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
-    list_tiles = native.tile_lists if compositor == "native" else tile_lists
-    M = jax.lax.stop_gradient(splats.M)
-    lists = list_tiles(M, cutoff, settings.near_plane, compositing.grid, settings.capacity or 0)
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     probe = jnp.zeros((gaussians.num, 4), splats.M.dtype) if probe is None else probe
+    shown = _composited(compositing, settings, splats, rule, cutoff, jacobian, probe)
+    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
+    channels, transmittance = shown.channels + taint, shown.transmittance + taint
+    return _output(compositing, channels, transmittance, background, shown.overflow), shown.num_pairs
+
+
+def _composited(
+    compositing: CompositingSettings, settings: RenderSettings, splats: Splats, rule: AppearanceRule, cutoff: Array,
+    jacobian: Array, probe: Array,
+) -> Composited:  # fmt: skip
+    """Return the image without background, of one device or of several."""
+    capacity = settings.capacity or 0
+    if settings.exchange is not None:
+        return composite_in_bands(compositing, settings.exchange, capacity, splats, rule, cutoff, jacobian, probe)
+    list_tiles = native.tile_lists if compositing.compositor == "native" else tile_lists
+    M = jax.lax.stop_gradient(splats.M)
+    lists = list_tiles(M, cutoff, compositing.near_plane, compositing.grid, capacity)
     channels, transmittance = composite(compositing, splats, rule, cutoff, lists, jacobian, probe)
-    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
-    channels, transmittance = channels + taint, transmittance + taint
-    return _output(compositing, channels, transmittance, background, lists.overflow), lists.num_pairs
+    return Composited(channels, transmittance, lists.num_pairs, lists.overflow)
 
 
 def _compositing_settings(
@@ -355,6 +371,27 @@ def pairs_of_view(
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
 
+def rows_of_view(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the rows that a device of `settings.exchange` must be able to send to another one in a view (host)."""
+    return int(_jitted_rows()(gaussians, camera, rule, settings, num_live))
+
+
+@functools.cache
+def _jitted_rows() -> Jitted[..., Array]:
+    return Jitted(_count_rows, static_argnums=(3,))
+
+
+def _count_rows(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any
+) -> Array:
+    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    assert settings.exchange is not None
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    return rows_to_send(settings.exchange, M, cutoff, settings.near_plane, grid)
+
+
 @functools.cache
 def _jitted_count() -> Jitted[..., Array]:
     return Jitted(_count_pairs, static_argnums=(3, 4))
@@ -363,12 +400,19 @@ def _jitted_count() -> Jitted[..., Array]:
 def _count_pairs(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
 ) -> Array:
+    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    bounds = screen_bounds(M, cutoff, near_plane)
+    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
+
+
+def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:
+    """Return homographies [N, 3, 3] and squared distances [N] of visibility, not positive for rows that do not
+    exist."""
     M, _ = homographies(gaussians, camera)
     cutoff = rule.cutoff(rule.opacities(gaussians))
     if num_live is not None:
         cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
-    bounds = screen_bounds(M, cutoff, near_plane)
-    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
+    return M, cutoff
 
 
 def with_capacity(

@@ -2,14 +2,17 @@
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
 from a2tg_jax.cli.view import in_browser
+from a2tg_jax.core.display import counted
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.host.text import shortened
@@ -129,11 +132,13 @@ class Train:
     max_memory: Annotated[str | None, defaulting_to("all available", "SIZE")] = None
     """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training refuses to start if it needs more.
     Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
+    devices: Annotated[str, arg(metavar="N")] = "1"
+    """Number of GPUs of this machine that train the scene together, each with a share of its Gaussians; or all."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
-        watched, session = in_browser if self.view else unseen, tidy_session()
+        watched, session = in_browser if self.view else unseen, tidy_session(devices_named(self.devices))
         if not self.resume:
             result = begin_run(
                 self.record,
@@ -255,9 +260,24 @@ def _check_resumed_only(overwrite: bool) -> None:
         raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
 
 
-def tidy_session() -> Session:
+def tidy_session(devices: Sequence[jax.Device] | None = None) -> Session:
     """Return a session that tidies this process's memory after each compilation."""
-    return Session(after_compiling=tidy_memory)
+    return Session(after_compiling=tidy_memory, devices=devices)
+
+
+def devices_named(text: str) -> list[jax.Device]:
+    """Return the first N devices of this machine, or all.
+
+    Raises:
+      ValueError: if the text is neither "all" nor a number from 1 to that of the devices.
+    """
+    devices: list[jax.Device] = jax.local_devices()
+    if text == "all":
+        return devices
+    if not text.isdecimal() or not 1 <= int(text) <= len(devices):
+        found = f"this machine has {counted(len(devices), f'{devices[0].platform.upper()} device')}"
+        raise ValueError(f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: {found}")
+    return devices[: int(text)]
 
 
 def tell_result(result: RunResult, folder: Path) -> None:

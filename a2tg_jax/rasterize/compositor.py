@@ -8,7 +8,7 @@ The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so tha
 
 import functools
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,19 @@ from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
 from a2tg_jax.rasterize.reverse_only import once, reverse_only
 from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
+
+
+class Composited(NamedTuple):
+    """Image of a view without its background."""
+
+    channels: Array
+    """[D, H, W]; D is red, green, blue(, depth, depth², normal x, y, z)."""
+    transmittance: Array
+    """[H, W] of what is behind all splats."""
+    num_pairs: Array
+    """Number of pairs, the least capacity."""
+    overflow: Array
+    """Whether the capacity was too small."""
 
 
 def composite(
@@ -39,14 +52,22 @@ def composite(
       probe: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
         `rasterize.pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
     """
+    return composite_arrays(settings, rule, splats, rule.texels, rule.regions, cutoff, lists, jacobian, probe)
+
+
+def composite_arrays(
+    settings: CompositingSettings, rule: AppearanceRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return what `composite` does, with texels and regions in place of the rule's own."""
     static = StaticRule.of(rule)
     if settings.compositor == "autodiff":
         if settings.statistic:
             raise ValueError("the statistic of densification needs another compositor than 'autodiff'")
-        channels, transmittance = autodiff.composite_tiles(settings, static, splats, rule.texels, rule.regions, lists)
+        channels, transmittance = autodiff.composite_tiles(settings, static, splats, texels, regions, lists)
     else:
-        splats, texels, probe = reverse_only(settings.compositor, (splats, rule.texels, probe))
-        arrays = splats, texels, rule.regions, cutoff, lists, jacobian, probe
+        splats, texels, probe = reverse_only(settings.compositor, (splats, texels, probe))
+        arrays = splats, texels, regions, cutoff, lists, jacobian, probe
         channels, transmittance = _composite_tiles(settings, static, *arrays)
     return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
 

@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view
+from a2tg_jax.rasterize.exchange import Exchange, gathered, spread
+from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
 from a2tg_jax.training.corrections import check_corrections
@@ -110,6 +112,7 @@ class StageRun:
         session: what trainings of this process share; None: a new one.
         """
         self.session = Session() if session is None else session
+        self.exchange = self.session.exchange
         self.views, self.system, self.index = scene.train, system, index
         self.stage = system.stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
@@ -117,12 +120,14 @@ class StageRun:
         if resume is not None:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
-            self.state: TrainState = jax.tree.map(jnp.array, resume.state)
+            check_devices(resume, self.num_devices)
+            self.state: TrainState = spread(self.exchange, jax.tree.map(jnp.array, resume.state))
             self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
             # Steps take over the buffers they are given: the caller keeps his own.
-            model = padded(jax.tree.map(jnp.array, start.live), self.stage, system)
-            self.state = initial_state(self.stage, model, [view.name for view in self.views], start.origin)
+            model = padded(jax.tree.map(jnp.array, start.live), self.stage, system, self.num_devices)
+            state = initial_state(self.stage, model, [view.name for view in self.views], start.origin)
+            self.state = spread(self.exchange, state)
         else:
             raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
@@ -140,6 +145,7 @@ class StageRun:
         )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.capacities: dict[tuple[int, int], int] = {}
+        self.exchanges: dict[tuple[int, int], Exchange] = {}
         self.on_log: OnLog | None = None
         """Called with each row of the history."""
         self.started = time.perf_counter()
@@ -155,9 +161,15 @@ class StageRun:
         return self.earlier_seconds + time.perf_counter() - self.started
 
     @property
+    def num_devices(self) -> int:
+        """Number of devices that train together."""
+        return 1 if self.exchange is None else self.exchange.num
+
+    @property
     def model(self) -> Model:
-        """The Gaussians that exist, and what they show."""
-        return self.state.model.live
+        """The Gaussians that exist, and what they show, on one device."""
+        model: Model = gathered(self.exchange, self.state.model)
+        return model.live
 
     @property
     def checkpoint(self) -> Checkpoint:
@@ -320,7 +332,14 @@ class StageRun:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:
-        """Apply the host events that follow an iteration, and drop the statistics of past events."""
+        """Apply the host events that follow an iteration, on one device, and drop the statistics of past events."""
+        if iteration not in self._due_on_host():
+            return
+        self.state = gathered(self.exchange, self.state)
+        self._apply_host_events(iteration)
+        self.state = spread(self.exchange, self.state)
+
+    def _apply_host_events(self, iteration: int) -> None:
         for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
             state = self.state.events[place]
             if isinstance(event, HostEvent):
@@ -358,7 +377,17 @@ class StageRun:
             pairs = max(pairs_of_view(live.gaussians, camera, live.rule, settings) for camera in cameras)
             growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
             self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
-        return dataclasses.replace(settings, capacity=self.capacities[size])
+            if self.exchange is not None:
+                self.exchanges[size] = self._planned_exchange(self.exchange, cameras, self.capacities[size])
+        return dataclasses.replace(settings, capacity=self.capacities[size], exchange=self.exchanges.get(size))
+
+    def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
+        """Return the exchange with room for the rows that travel in some views once all rows exist."""
+        model, rows = self.state.model, self.state.model.gaussians.num // exchange.num
+        settings = RenderSettings(tile_size=self.system.tile_size, exchange=exchange)
+        most = max(rows_of_view(model.gaussians, one, model.rule, settings, model.num_live) for one in cameras)
+        share = min(1.0, GROWTH_ROOM * most / max(1, min(model.num, rows)))
+        return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity)
 
     def _capacity(self, size: tuple[int, int], pairs: float) -> int:
         """Return a capacity for so many pairs in views of a size, one that the session knows if possible."""
@@ -380,6 +409,17 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         raise ValueError(
             f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
             "version, so train anew"
+        )
+
+
+def check_devices(resume: Checkpoint, num_devices: int) -> None:
+    """Raise ValueError unless the rows of a checkpoint can be spread evenly over so many devices."""
+    rows = resume.state.model.gaussians.num
+    if rows % num_devices:
+        fitting = [number for number in range(1, num_devices) if rows % number == 0]
+        raise ValueError(
+            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: resume on "
+            f"{' or '.join(map(str, fitting))}"
         )
 
 

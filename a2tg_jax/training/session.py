@@ -1,7 +1,10 @@
-"""Sessions: shapes that several trainings of one process share, so that they compile less."""
+"""Sessions: what several trainings of one process share: compiled shapes, and the devices they use."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 
+import jax
+
+from a2tg_jax.rasterize.exchange import exchange_among
 from a2tg_jax.texture import Shape
 
 
@@ -10,16 +13,21 @@ def _nothing() -> None:
 
 
 class Session:
-    """Shapes that steps are compiled for. Trainings of one session prefer them; no result depends on it.
+    """Shapes that steps are compiled for, which trainings of one session prefer, and the devices that they use.
 
-    `fit` makes a session of its own unless you pass one. Pass the same session to all trainings of a sweep.
+    `fit` makes a session of its own unless you pass one. Pass the same session to all trainings of a sweep. No result
+    depends on the shapes; on several devices sums have another order, so that last digits differ.
     """
 
-    def __init__(self, after_compiling: Callable[[], object] = _nothing):
+    def __init__(self, after_compiling: Callable[[], object] = _nothing, devices: Sequence[jax.Device] | None = None):
         """Args:
         after_compiling: called after a step was compiled, such as `host.memory.tidy_memory`.
+        devices: devices of this process that train one scene together, each with a share of the Gaussians and of the
+          pixels, such as `jax.devices()`; None: JAX's default device.
         """
         self.after_compiling = after_compiling
+        self.exchange = exchange_among(devices) if devices is not None and len(devices) > 1 else None
+        """Devices among which rows are spread; None: one."""
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
         self.capacities: dict[Hashable, set[int]] = {}

@@ -113,16 +113,17 @@ def num_rows(stage: Stage, num: int) -> int:
     return max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
 
 
-def padded(model: Model, stage: Stage, system: System) -> Model:
+def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
     """Return the model with the appearance of a stage and with spare rows for its events.
 
-    If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew.
+    If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew. The number of
+    devices divides that of the rows.
 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
     """
     num = model.gaussians.num
-    room = _rows_needed(stage, num, system)
+    room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
     gaussians = _with_rows(model.gaussians, room)
     params, layout = model.params, model.layout
     if model.appearance != stage.appearance or room > num:

@@ -21,6 +21,7 @@ from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (
@@ -143,6 +144,7 @@ def train_step(
     status = jnp.where(state.status == FINE, _status(clock, tried), state.status)
     new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
+    chosen = spread(settings.render.exchange, chosen)
     found = tried.views
     return chosen, StepInfo(
         loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,

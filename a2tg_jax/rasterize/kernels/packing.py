@@ -37,7 +37,7 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
     num_colors = like.colors.shape[1]
     normal, first = 10 + num_colors, num_numbers(has_geometry, num_colors)
     return Splats(
-        M=packed[:, :9].reshape(like.M.shape).astype(like.M.dtype),
+        M=packed[:, :9].reshape(-1, 3, 3).astype(like.M.dtype),
         opacities=packed[:, 9].astype(like.opacities.dtype),
         colors=packed[:, 10:normal].astype(like.colors.dtype),
         normals=packed[:, normal:first].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),

@@ -1,0 +1,89 @@
+"""Rows and bytes that travel between devices in one rendering and its gradient, counted on one device.
+
+    python -m benchmarks.scaling --out benchmarks/results/scaling.json
+
+The random scene of the other benchmarks at 1600×1060 pixels, spread over 1 to 64 devices. A device sends a fixed number
+of rows to each other one, the largest that any pair needs; the least that must travel are the rows that reach a band
+which another device owns. Gradients come back in the same rows.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax import RenderSettings
+from a2tg_jax.core.gaussians import floats_per_gaussian
+from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.pixel_sizes import NEAR_PLANE
+from a2tg_jax.rasterize.exchange import Bands
+from a2tg_jax.rasterize.kernels.packing import num_numbers
+from a2tg_jax.rasterize.tiles import TileGrid
+from a2tg_jax.render import rule_of
+from benchmarks.workload import random_scene
+
+NUMS, DEVICES = (100_000, 1_000_000, 4_000_000), (1, 2, 4, 8, 16, 64)
+WIDTH, HEIGHT = 1600, 1060
+PROBE, CUTOFF = 4, 1
+STATES = 4
+"""Parameters, their gradients, and the two moments of Adam."""
+BYTES = 4
+
+
+def row_bytes() -> tuple[int, int]:
+    """Return the bytes of a travelling row, and of its gradient."""
+    splat = num_numbers(True, 3) + PROBE
+    return BYTES * (splat + CUTOFF), BYTES * splat
+
+
+def counted(num: int, devices: int) -> dict[str, float]:
+    """Return the counts of one rendering of `num` Gaussians."""
+    num = num // devices * devices
+    gaussians, camera = random_scene(num, WIDTH, HEIGHT)
+    M, _ = homographies(gaussians, camera)
+    rule = rule_of(gaussians, None, None, RenderSettings())
+    bands = Bands.of(TileGrid(WIDTH, HEIGHT, 8), devices)
+    reached = np.asarray(jax.jit(bands.reached)(M, rule.cutoff(rule.opacities(gaussians)), jnp.float32(NEAR_PLANE)))
+    per_pair = reached.reshape(devices, devices, -1).sum(axis=2)
+    least = per_pair.sum() - np.trace(per_pair)
+    forward, back = row_bytes()
+    sent = per_pair.max() * devices * (devices - 1)
+    return {
+        "gaussians": num,
+        "devices": devices,
+        "state_bytes_per_device": BYTES * STATES * floats_per_gaussian(3) * num / devices,
+        "rows_received": float(per_pair.sum(axis=1).max()),
+        "least_bytes": float(least * (forward + back)),
+        "sent_bytes": float(sent * (forward + back)),
+        "copies_per_splat": float(per_pair.sum() / max(1, reached.any(axis=0).sum())),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--largest", type=int, default=NUMS[-1], help="largest number of Gaussians")
+    args = parser.parse_args()
+    found = [counted(num, devices) for num in NUMS if num <= args.largest for devices in DEVICES]
+    args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    print(table(found))
+
+
+def table(found: Sequence[Mapping[str, float]]) -> str:
+    """Return a row for each case."""
+    header = ["Gaussians", "devices", "state on a device", "rows received", "sent by all", "least"]
+    lines = [header, ["---"] * len(header)]
+    for row in found:
+        sizes = [f"{row[name] / 1e6:,.0f} MB" for name in ("state_bytes_per_device", "sent_bytes", "least_bytes")]
+        lines.append(
+            [f"{row['gaussians']:,}", f"{row['devices']}", sizes[0], f"{row['rows_received']:,.0f}", *sizes[1:]]
+        )
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""Renders and trains on one, two and four devices of a CPU and compares; run by `test_devices` in a process of its own.
+
+python tests/on_devices.py rendering|overflowing|training|textures FOLDER
+"""
+
+import dataclasses
+import functools
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import a2tg_jax as a2tg
+from a2tg_jax.rasterize.exchange import exchange_among, spread
+from a2tg_jax.render import render_traced
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.training import Session
+from a2tg_jax.training.registry import with_changes
+from a2tg_jax.training.start import padded
+
+ROWS = 96
+"""Number of Gaussians that are rendered: divisible by 4."""
+
+
+@functools.cache
+def scene():
+    return a2tg.synthetic_scene(num_views=9, width=72, height=54, num_points=ROWS)
+
+
+def plain():
+    found = scene()
+    return a2tg.Model(a2tg.init_from_points(found.points, found.colors, sh_degree=1, opacity=0.6))
+
+
+def textured():
+    """Textures of two sizes, of which every second Gaussian has the larger one."""
+    model = plain()
+    sizes = np.where(np.arange(ROWS)[:, None] % 2, [[2, 4]], [[1, 1]])
+    textures, layout = a2tg.allocate_textures(sizes, rgb=0.1)
+    textures = jax.tree.map(lambda texels: texels * jnp.linspace(0.2, 1.0, texels.size).reshape(texels.shape), textures)
+    return a2tg.Model(model.gaussians, textures, layout, appearance=a2tg.Textured())
+
+
+def rendering(folder):
+    """Image, gradients and statistic are those of one device, the last band being partly outside the image."""
+    view = scene().train[0]
+    target = a2tg.view_image(view)
+
+    def loss(model, output):
+        return jnp.mean((output.color - target) ** 2) + 0.01 * jnp.mean(output.depth) + jnp.mean(output.distortion)
+
+    exchange = exchange_among(jax.devices())
+    for model, compositor in ((textured(), "native"), (plain(), "xla")):
+        settings = dataclasses.replace(a2tg.plan_render(model, [view.camera]), compositor=compositor)
+        alone = a2tg.view_gradients(loss, model, view.camera, settings=settings)
+        own = dataclasses.replace(settings, exchange=exchange)
+        together = jax.jit(lambda m, own=own: a2tg.view_gradients(loss, m, view.camera, settings=own))
+        found = together(spread(exchange, model))
+        assert not found.output.overflow and found.num_pairs > 0
+        close(alone._replace(num_pairs=0), found._replace(num_pairs=0))
+        assert found.gaussians.means.sharding.spec[0] == "rows", "the gradient stays where its rows are"
+
+
+def close(expected, found):
+    """Floats agree to 1e-5 of the largest of their array, all else is equal."""
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        a, b = np.asarray(a), np.asarray(b)
+        if a.dtype.kind == "f":
+            np.testing.assert_allclose(b, a, rtol=0, atol=3e-5 * max(np.abs(a).max(), 1e-9))
+        else:
+            np.testing.assert_array_equal(a, b)
+
+
+def overflowing(folder):
+    """Too little room for pairs, or for rows on their way, is said with the capacity that has it."""
+    view, model, exchange = scene().train[0], plain(), exchange_among(jax.devices()[:4])
+    enough = a2tg.plan_render(model, [view.camera]).capacity
+
+    def told(capacity, rows_per_pair):
+        own = dataclasses.replace(exchange, rows_per_pair=rows_per_pair)
+        settings = a2tg.RenderSettings(capacity=capacity, exchange=own)
+        render = jax.jit(lambda m: render_traced(m.gaussians, view.camera, m.rule, jnp.zeros(3), settings))
+        output, num_pairs = render(spread(exchange, model))
+        return bool(output.overflow), float(num_pairs)
+
+    assert told(enough, 1.0)[0] is False
+    for rows_per_pair in (1.0, 4 / enough):
+        is_overflow, needed = told(64 if rows_per_pair == 1.0 else enough, rows_per_pair)
+        assert is_overflow
+        assert told(int(np.ceil(needed)), rows_per_pair)[0] is False, "what is asked for is enough"
+
+
+def system(kind, **options):
+    return with_changes(kind.preset("smoke"), {"initial_gaussians": ROWS, "seed": 3, **options}, "here")
+
+
+def psnr_of(result):
+    return a2tg.evaluate(scene().test, result.model).psnr
+
+
+def fit(own, count, **options):
+    return a2tg.fit(scene(), own, progress=False, session=Session(devices=jax.devices()[:count]), **options)
+
+
+def training(folder):
+    """The same devices give the same bits twice and when resumed; other numbers of them end with the same quality."""
+    own = system(Gaussians2dMcmc, stage1_iterations=24, densify={"cap": 152})
+    path, kept = Path(folder) / "checkpoint.npz", []
+
+    def keep(checkpoint):
+        if checkpoint.iteration == 12:
+            kept.append(a2tg.save_checkpoint(path, checkpoint))
+
+    whole = fit(own, 4, on_checkpoint=keep, checkpoint_every=12)
+    assert kept and len(whole.model.gaussians.means.devices()) == 1, "results lie on one device"
+    alone = fit(own, 1)
+    for count in (4, 2, 1):
+        again = fit(own, count, resume=a2tg.load_checkpoint(path))
+        if count == 4:
+            np.testing.assert_array_equal(whole.model.gaussians.means, again.model.gaussians.means)
+        assert again.model.num == alone.model.num
+        assert abs(psnr_of(again) - psnr_of(alone)) < 0.02, count
+    try:
+        fit(own, 3, resume=a2tg.load_checkpoint(path))
+    except ValueError as error:
+        assert "152 rows, which 3 devices cannot share evenly: resume on 1 or 2" in str(error)
+    else:
+        raise AssertionError("152 rows were spread over 3 devices")
+
+
+def textures(folder):
+    """Textures grow as on one device; rows that do not divide evenly are filled up."""
+    lengths = {"stage1_iterations": 8, "stage2_iterations": 8}
+    own = system(a2tg.A2tg, densify={"cap": 120}, texture={"upscale_at": (0.5,)}, **lengths)
+    alone, together = fit(own, 1), fit(own, 4)
+    assert alone.model.num == together.model.num
+    assert alone.model.num_bytes == together.model.num_bytes > 4 * (58 + 4) * alone.model.num, "textures have grown"
+    assert abs(psnr_of(alone) - psnr_of(together)) < 0.02
+    uneven = system(a2tg.A2tg, densify={"cap": 118}, **lengths)
+    assert padded(plain(), uneven.stages()[0], uneven, 4).gaussians.num == 120
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](sys.argv[2])

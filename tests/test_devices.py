@@ -1,0 +1,19 @@
+"""One scene on several devices: those of a CPU, in a process that is told to have four (`on_devices`)."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
+FOUR = "--xla_force_host_platform_device_count=4"
+
+
+@pytest.mark.parametrize("what", ["rendering", "overflowing", "training", "textures"])
+def test_several_devices_do_what_one_does(what, tmp_path, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} {FOUR}")
+    command = [sys.executable, str(SCRIPT), what, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
