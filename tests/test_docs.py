@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 ROOMS = "|".join(path.parent.name for path in sorted((ROOT / "a2tg_jax").glob("*/__init__.py")))
-FOLDERS = "a2tg_jax|benchmarks|docs|experiments|tests|web"
+FOLDERS = "a2tg_jax|benchmarks|docs|experiments|notebooks|tests|web"
 
 
 def without_code(text: str) -> str:

@@ -4,9 +4,10 @@ import json
 import posixpath
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.structure.files import File, Files
+if TYPE_CHECKING:
+    from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"\]\((?!\w+:|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
@@ -16,8 +17,10 @@ FILES = "repository"
 """Folder of the site with the files that pages link to."""
 
 
-def on_files(files: Files, config: Any) -> Files:
+def on_files(files: "Files", config: Any) -> "Files":
     """Add the pages at the top of the repository, the notebooks, and the files that pages link to."""
+    from mkdocs.structure.files import File
+
     texts = {f"docs/{file.src_uri}": file.content_string for file in files.documentation_pages()}
     texts |= {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
     for name, place in PAGES.items():
