@@ -25,9 +25,7 @@ SMALL = {
     "gradients_and_differences": {"width": 12, "height": 9, "num_gaussians": 5},
 }  # fmt: skip
 """Values for the cell that is tagged "parameters"."""
-MOST_BYTES = {"training_by_hand": 900_000, "a_system_of_your_own": 900_000}
-"""Sizes of the files that show the most pictures; the others are below `MOST_BYTES_ELSE`."""
-MOST_BYTES_ELSE = 300_000
+MOST_BYTES = 300_000
 
 
 def code_cells(name: str) -> list[dict]:
@@ -101,7 +99,7 @@ def test_gradients_agree_with_differences(monkeypatch):
 @pytest.mark.parametrize("name", SMALL)
 def test_outputs_are_committed_and_small(name):
     assert {path.stem for path in FOLDER.glob("*.ipynb")} == SMALL.keys()
-    assert (FOLDER / f"{name}.ipynb").stat().st_size < MOST_BYTES.get(name, MOST_BYTES_ELSE)
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < MOST_BYTES
     cells = code_cells(name)
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1)), "run it from the top"
     outputs = [output for cell in cells for output in cell["outputs"]]
