@@ -5,7 +5,7 @@ import sys
 import types
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot
 import pytest
 
 import a2tg_jax as a2tg
