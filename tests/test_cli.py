@@ -1,6 +1,7 @@
 """The command line, from bad input to a whole tiny run that is interrupted and resumed."""
 
 import dataclasses
+import importlib.util
 import json
 import os
 import re
@@ -27,6 +28,7 @@ from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import compression, finishing, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.history import read_history
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.record import SceneSource, read_record, write_record
 from a2tg_jax.results.viewing import open_source, routes_of
@@ -37,6 +39,7 @@ TINY = [
     *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.upscale-at", "0.5"),
 ]
 """One upscaling event and few shapes: what takes time is compiling."""
+TENSORBOARD = ("--tensorboard",) if importlib.util.find_spec("tensorboardX") else ()
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +52,7 @@ def untouched_jax(monkeypatch):
 def tiny_run(tmp_path_factory):
     """A run interrupted after the first checkpoint of its textures and resumed, with both exit codes."""
     out = tmp_path_factory.mktemp("cli") / "run"
-    arguments = ["train", "synthetic", "--out", str(out)]
+    arguments = ["train", "synthetic", "--out", str(out), *TENSORBOARD]
     save = run_training.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
@@ -63,7 +66,7 @@ def tiny_run(tmp_path_factory):
         interrupted = cli.main([*arguments, *TINY])
         patch.undo()
         patch.setattr(cli, "configure_cpu", lambda: None)
-        resumed = cli.main(["train", "--out", str(out), "--resume"])
+        resumed = cli.main(["train", "--out", str(out), "--resume", *TENSORBOARD])
     return RunFolder(out), interrupted, resumed
 
 
@@ -403,6 +406,18 @@ def test_run_folder_is_complete(tiny_run):
     assert "http" not in run.report.read_text(encoding="utf-8").replace("http-equiv", "")
     assert '<a href="viewer.html">' in run.report.read_text(encoding="utf-8")
     assert 'id="scene-data"' in run.viewer.read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not TENSORBOARD, reason="the extra [tensorboard] is not installed")
+def test_tensorboard_has_the_rows_of_the_histories_once(tiny_run):
+    from tensorboard_events import scalars
+
+    run, found = tiny_run[0], scalars(tiny_run[0].tensorboard)
+    for name in ("a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"):
+        history = read_history(run.history(name))
+        steps, values = zip(*found[f"psnr/{name}"], strict=True)
+        assert [*steps] == history.iteration.tolist()
+        np.testing.assert_allclose(values, history.psnr, rtol=1e-6)
 
 
 def test_info(tiny_run, capsys):

@@ -1,15 +1,20 @@
-"""Pages point at what exists: files, headings, modules and their names."""
+"""Pages point at what exists: files, headings, modules and their names, commands and their options."""
 
+import contextlib
 import importlib
+import io
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
+from a2tg_jax.cli import main as cli
+
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 ROOMS = "|".join(path.parent.name for path in sorted((ROOT / "a2tg_jax").glob("*/__init__.py")))
-FOLDERS = "a2tg_jax|benchmarks|docs|experiments|tests|web"
+FOLDERS = "a2tg_jax|benchmarks|docs|experiments|notebooks|tests|web"
 
 
 def without_code(text: str) -> str:
@@ -51,3 +56,25 @@ def test_named_parts_of_the_package_exist(page):
             if not hasattr(found, part):
                 importlib.import_module(f"{found.__name__}.{part}")
             found = getattr(found, part)
+
+
+COMMANDS = sorted(
+    {
+        command
+        for page in PAGES
+        for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+        for line in block.replace("\\\n", " ").splitlines()
+        for command in re.findall(r"(?:^|&& )(a2tg (?!COMMAND)[^#&|]*[^#&| ])", line)
+    }
+)
+"""Command lines in blocks of pages."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_are_understood(command, monkeypatch):
+    """All but those that read a run's or a file's options, for which there would have to be one."""
+    _, name, *arguments = shlex.split(command)
+    if {"--resume", "--config"} & set(arguments) or any(":" in word for word in arguments):
+        pytest.skip("reads a file")
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        assert cli._parse(name, arguments)

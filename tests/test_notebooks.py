@@ -5,7 +5,7 @@ import sys
 import types
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot
 import pytest
 
 import a2tg_jax as a2tg
@@ -19,9 +19,13 @@ SMALL = {
     "a_system_of_your_own": {
         "width": 40, "height": 30, "num_views": 4, "num_points": 120, "iterations": 24, "cap": 60,
     },
+    "fitting_one_image": {"width": 32, "height": 24, "num_gaussians": 40, "num_iterations": 20},
+    "refining_poses": {"width": 40, "height": 30, "num_views": 5, "iterations": 20, "pose_iterations": 3,
+        "all_degrees": (6,)},
+    "gradients_and_differences": {"width": 12, "height": 9, "num_gaussians": 5},
 }  # fmt: skip
 """Values for the cell that is tagged "parameters"."""
-MOST_BYTES = 900_000
+MOST_BYTES = 300_000
 
 
 def code_cells(name: str) -> list[dict]:
@@ -64,6 +68,32 @@ def test_a_system_of_your_own_trains_beside_others_and_is_loaded_again(monkeypat
     assert abs(models["edges"].params[:, 3:]).max() > 1e-3
     assert max(model.num_bytes for model in models.values()) <= names["budget"]
     assert names["model"].num == models["edges"].num and len(names["frames"]) == 4
+
+
+def test_one_image_is_fitted(monkeypatch):
+    names = run("fitting_one_image", monkeypatch)
+    losses = {name: losses for name, (_, losses) in names["fits"].items()}
+    assert all(each[-1] < 0.8 * each[0] for each in losses.values())
+    assert losses["4×4 texels"][-1] < losses["plain"][-1]
+    assert names["starts"]["plain, equal bytes"].num_bytes == pytest.approx(names["textured"].num_bytes, rel=0.05)
+
+
+def test_poses_descend(monkeypatch):
+    """So short a training and descent find no pose; they take cameras nearer in the picture."""
+    names = run("refining_poses", monkeypatch)
+    starts, ends, _ = names["results"][6, "coarse to fine"]
+    before, after = (
+        [float(abs(names["model"].render(camera).color - photo).mean()) for camera, photo in pairs]
+        for pairs in (zip(starts, names["photographs"], strict=True), zip(ends, names["photographs"], strict=True))
+    )
+    assert sum(after) < sum(before)
+
+
+def test_gradients_agree_with_differences(monkeypatch):
+    names = run("gradients_and_differences", monkeypatch)
+    assert len(names["found"]) == 9
+    assert max(map(names["error"], names["found"].values())) < 1e-6
+    assert min(names["curves"]["float64"]) < 1e-3 * min(names["curves"]["float32"])
 
 
 @pytest.mark.parametrize("name", SMALL)

@@ -34,6 +34,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.summary import RunResult, summary_text
+from a2tg_jax.results.tensorboard import check_tensorboard
 from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -127,6 +128,8 @@ class Train:
     """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, LPIPS is not computed."""
     quiet: bool = False
     """Show no progress of training; forecasts, warnings and results stay."""
+    tensorboard: bool = False
+    """Write the histories as files of TensorBoard too, into RUN/tensorboard, at each checkpoint."""
     view: bool = False
     """Show the training in a browser, where you can pause it."""
     max_memory: Annotated[str | None, defaulting_to("all available", "SIZE")] = None
@@ -138,6 +141,8 @@ class Train:
 
     def run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
+        if self.tensorboard:
+            check_tensorboard()
         watched, session = in_browser if self.view else unseen, tidy_session(devices_named(self.devices))
         if not self.resume:
             result = begin_run(
@@ -149,6 +154,7 @@ class Train:
                 watched=watched,
                 session=session,
                 progress=not self.quiet,
+                tensorboard=self.tensorboard,
             )
             tell_result(result, self.out)
             return
@@ -158,7 +164,15 @@ class Train:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
             tell_forecast(scene, record.plan, most)
-            result = go_on(run, scene, lpips_weights=weights, watched=watched, session=session, progress=not self.quiet)
+            result = go_on(
+                run,
+                scene,
+                lpips_weights=weights,
+                watched=watched,
+                session=session,
+                progress=not self.quiet,
+                tensorboard=self.tensorboard,
+            )
             tell_result(result, self.out)
 
     @property

@@ -7,6 +7,7 @@
       models/NAME.npz            what each finished stage left behind, with cameras, world and background
       corrections/NAME.json      exposure and pose of each training view, if they were learned
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
+      tensorboard/events.*       the same for TensorBoard, if it was asked for
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
       figures/                   curves, texture resolutions, some textures, depth, normals, a flight
@@ -114,6 +115,10 @@ class RunFolder:
     @property
     def record(self) -> Path:
         return self.path / "run.toml"
+
+    @property
+    def tensorboard(self) -> Path:
+        return self.path / "tensorboard"
 
     @property
     def metrics(self) -> Path:

@@ -14,6 +14,7 @@ from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
 from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
 from a2tg_jax.results.replacement import set_aside
+from a2tg_jax.results.tensorboard import EventWriter
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,
@@ -42,6 +43,7 @@ def train_run(
     is_stopped: IsStopped = never,
     watch: Watch = unwatched,
     session: Session | None = None,
+    tensorboard: bool = False,
 ) -> None:
     """Train every stage of the run's record that is not finished yet.
 
@@ -56,6 +58,7 @@ def train_run(
       is_stopped: asked between steps. Once it says True, there is a checkpoint and a KeyboardInterrupt.
       watch: called between steps with the stage under way (`training.loop.Watch`).
       session: shapes that trainings of this process share; None: a new one.
+      tensorboard: write the histories as files of TensorBoard too, at each checkpoint.
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other numbers
@@ -64,7 +67,8 @@ def train_run(
     record = replaced_by or read_record(run)
     session = Session() if session is None else session
     for planned in record.plan.stages:
-        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch, session)
+        events = EventWriter(run, planned.name) if tensorboard else None
+        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch, session, events)
         if replaced_by is not None:
             result = training.train(replaced_by)
         elif run.model(planned.name).is_file():
@@ -74,6 +78,9 @@ def train_run(
         else:
             result = training.train()
         replaced_by = None
+        if events is not None:
+            events.add(result.history)
+            events.close()
         write_history(run.own(run.history(planned.name)), result.history)
         save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
         run.drop_old_checkpoints(planned.name, keep=0)
@@ -91,11 +98,12 @@ class _Training:
     is_stopped: IsStopped
     watch: Watch
     session: Session
+    events: EventWriter | None
 
     def train(self, replaced_by: RunRecord | None = None) -> StageResult:
         """Train the stage from its newest checkpoint or from its beginning; after a divergence, restore if that is
         allowed."""
-        keep = _Keeper(self.run, self.planned.name, replaced_by)
+        keep = _Keeper(self.run, self.planned.name, replaced_by, self.events)
         num_restored = None
         while True:
             resume = None if keep.replaced_by is not None else _newest_checkpoint(self.run, self.planned)
@@ -107,6 +115,8 @@ class _Training:
 
     def _train(self, resume: Checkpoint | None, keep: "_Keeper", num_restored: int | None) -> StageResult:
         planned = self.planned
+        if self.events is not None and resume is not None:
+            self.events.skip(resume.history)
         return fit_stage(
             self.scene,
             planned.system,
@@ -149,14 +159,16 @@ class _Training:
 class _Keeper:
     """Writer of checkpoints. The first checkpoint of a replacing run sets the old run aside."""
 
-    def __init__(self, run: RunFolder, name: str, replaced_by: RunRecord | None):
-        self.run, self.name, self.replaced_by = run, name, replaced_by
+    def __init__(self, run: RunFolder, name: str, replaced_by: RunRecord | None, events: EventWriter | None):
+        self.run, self.name, self.replaced_by, self.events = run, name, replaced_by, events
 
     def __call__(self, checkpoint: Checkpoint) -> None:
         if checkpoint.iteration == 0:
             return  # The stage would begin with the same state again.
         if self.replaced_by is not None:
             set_aside(self.run)
+        if self.events is not None:
+            self.events.add(checkpoint.history)
         save_checkpoint(self.run.own(self.run.checkpoint(self.name, checkpoint.iteration)), checkpoint)
         if self.replaced_by is not None:
             # Last: a folder without a record is one in which the old run is put back.

@@ -37,6 +37,7 @@ def begin_run(
     watched: Watched = unseen,
     session: Session | None = None,
     progress: bool = True,
+    tensorboard: bool = False,
 ) -> RunResult:
     """Train and measure a new run, after checking everything about it.
 
@@ -50,6 +51,7 @@ def begin_run(
       watched: who looks at the training of a scene meanwhile.
       session: shapes that trainings of this process share; None: a new one.
       progress: show the progress of training.
+      tensorboard: write files of TensorBoard.
 
     Raises:
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
@@ -70,6 +72,7 @@ def begin_run(
             watched=watched,
             session=session,
             progress=progress,
+            tensorboard=tensorboard,
         )
 
 
@@ -82,6 +85,7 @@ def go_on(
     watched: Watched = unseen,
     session: Session | None = None,
     progress: bool = True,
+    tensorboard: bool = False,
 ) -> RunResult:
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
@@ -95,6 +99,7 @@ def go_on(
                 is_stopped=is_stopped,
                 watch=watch,
                 session=session,
+                tensorboard=tensorboard,
             )
         return measure(run, scene, lpips_weights=lpips_weights)
 

@@ -1,0 +1,52 @@
+"""The messages that the page on troubleshooting quotes are still told by the program."""
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+NOT_OURS = {"Killed", "a2tg render"}
+"""Code in bold that is no message of the program."""
+QUOTED = {
+    " ".join(code.split())
+    for bold in re.findall(r"\*\*(.+?)\*\*", PAGE, re.DOTALL)
+    for code in re.findall(r"`([^`]+)`", bold)
+} - NOT_OURS
+
+
+@cache
+def texts() -> tuple[str, ...]:
+    """All texts of the package; what an f-string fills in is …."""
+    found = []
+    for path in (ROOT / "a2tg_jax").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = (part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+                found.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return tuple(found)
+
+
+def pieces(message: str) -> list[str]:
+    return [piece for piece in (piece.strip() for piece in message.split("…")) if re.search(r"\w{2}", piece)]
+
+
+def is_told(message: str) -> bool:
+    """Whether some text has all pieces of a message in their order."""
+    pattern = re.compile(".*".join(map(re.escape, pieces(message))), re.DOTALL)
+    return any(pattern.search(text) for text in texts())
+
+
+@pytest.mark.parametrize("message", sorted(QUOTED))
+def test_the_program_tells_the_message(message):
+    assert is_told(message), f"no text of the package has {pieces(message)}"
+
+
+def test_there_are_messages_and_an_invented_one_is_not_told():
+    assert len(QUOTED) > 40
+    assert not is_told("… has been told by nobody; …")
