@@ -119,7 +119,7 @@ MISTAKES = {
     "compress done --max-loss -1": "--max-loss",
     "compress done --out photos": "other than the model",
     "view nowhere.npz": "nowhere.npz",
-    "view photo.png": "is not a scene to show; give a run folder, or a file *.npz, *.a2tgz or *.ply",
+    "view photo.png": "is not a scene to show; give a run folder, or a file *.npz, *.a2tgz, *.compressed.ply, *.ply",
     "view nowhere": "nowhere: no such file or folder",
     "view .": "holds run folders; give one of them: done, run",
     "view scene": "is a scene that must be trained first: a2tg train scene --out runs/scene",
