@@ -86,7 +86,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     cameras = () if model.origin is None else model.origin.cameras
     if not cameras:
         raise ValueError(f"--bake needs a model that knows its cameras; {source} has none")
-    if type(model.appearance) is Plain:
+    if type(model.appearance.base) is Plain:
         return model, "baked: nothing, for the model is plain"
     plain = bake(model, cameras, growth=options.growth, iterations=options.iterations, progress=True)
     views = cameras[:: -(-len(cameras) // MOST_VIEWS)]
