@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_values import some_gaussians
 
-from a2tg_jax import Camera, Model, load_splats, save_model, textures_from_arrays
+from a2tg_jax import Camera, Model, TextureOptions, load_splats, save_model, textures_from_arrays
 from a2tg_jax.appearance import Textured
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
@@ -93,7 +93,8 @@ def test_other_appearances_give_their_gaussians():
 
 
 def test_convert_bakes(tmp_path, capsys):
-    save_model(tmp_path / "a.npz", textured())
+    official = dataclasses.replace(textured(), appearance=Textured((1, 1), TextureOptions.official()))
+    save_model(tmp_path / "a.npz", official)
     arguments = ["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply"), "--bake", "--bake-iterations", "0"]
     assert main(arguments) == 0
     told = capsys.readouterr().out

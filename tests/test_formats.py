@@ -10,13 +10,28 @@ import numpy as np
 import pytest
 from small_values import some_gaussians
 
-from a2tg_jax import Model, load_model, load_ply, load_splats, save_model, save_ply, save_splats
+from a2tg_jax import (
+    A2tg,
+    Gaussians2d,
+    Model,
+    load_model,
+    load_ply,
+    load_splats,
+    save_model,
+    save_ply,
+    save_splats,
+    synthetic_scene,
+    transform_gaussians,
+)
 from a2tg_jax.appearance import Textured
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.formats import FORMATS, format_of, lost_by
 from a2tg_jax.io.gaussforge_files import SUFFIXES
+from a2tg_jax.results import run_training
+from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 
 OTHERS = [".ply", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"
@@ -137,3 +152,31 @@ def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
     found = load_model(tmp_path / "c.npz")
     assert found.origin == model.origin and found.appearance == model.appearance
     np.testing.assert_array_equal(found.gaussians.means, model.gaussians.means)
+
+
+def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsys, monkeypatch):
+    scene, started = synthetic_scene(width=32, height=24, num_views=4, num_points=50), []
+
+    def begun(scene, system, index, start, **options):
+        started.append((index, start))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_training, "fit_stage", begun)
+    system = A2tg(stage1_iterations=5, stage2_iterations=4, sh_degree=1)
+    original = transform_gaussians(some_gaussians(40), scene.transform.inverse())
+    save_ply(tmp_path / "a.ply", original)
+    run = create_run(tmp_path / "run")
+    record = RunRecord(SceneSource("synthetic"), "a2tg", system, init=str(tmp_path / "a.ply"))
+    record.check()
+    write_record(run, record)
+    assert read_record(run) == record
+    with pytest.raises(KeyboardInterrupt):
+        run_training.train_run(run, scene, progress=False)
+    ((index, first),) = started
+    assert index == 1
+    np.testing.assert_allclose(first.gaussians.means, some_gaussians(40).means, atol=1e-5)
+    np.testing.assert_allclose(first.gaussians.sh, some_gaussians(40).sh[:, :4], atol=1e-5)
+    with pytest.raises(ValueError, match="has no second one"):
+        dataclasses.replace(record, name="gaussians-2d", system=Gaussians2d()).check()
+    command = ["train", "synthetic", "--out", str(tmp_path / "new"), "--init", str(tmp_path / "no.ply")]
+    assert main(command) == 2 and "there is no file" in capsys.readouterr().err

@@ -78,6 +78,13 @@ def test_ply_of_lower_degree_is_filled_with_zeros(tmp_path):
     assert np.all(sh[:, 4:] == 0)
 
 
+def test_infinite_logits_of_opacities_become_finite(tmp_path):
+    rows = np.ones((2, len(ATTRIBUTES)))
+    rows[:, ATTRIBUTES.index("opacity")] = -np.inf, np.inf
+    write_ply(tmp_path / "g.ply", ATTRIBUTES, rows)
+    np.testing.assert_allclose(load_ply(tmp_path / "g.ply").opacities, [0, 1], atol=2e-6)
+
+
 def test_ply_of_3d_gaussians_warns(tmp_path):
     write_ply(tmp_path / "g.ply", (*ATTRIBUTES, "scale_2"), np.ones((2, 62)))
     with pytest.warns(UserWarning, match="3D Gaussians"):

@@ -15,8 +15,8 @@ class Convert:
     """Convert splats between formats, chosen by the suffixes of the files.
 
     Reads and writes *.npz, *.a2tgz, *.ply, *.compressed.ply, *.spz, *.sog, *.splat, *.ksplat, *.glb, *.gltf, *.usda,
-    *.usdc and *.usdz. Gaussians of 3DGS are flattened along their thinnest axis. Files of other programs hold the
-    original world.
+    *.usdc and *.usdz. Reads checkpoints of gsplat, Nerfstudio, 3DGS and 2DGS (*.pt, *.pth, *.ckpt), too. Gaussians of
+    3DGS are flattened along their thinnest axis. Files of other programs hold the original world.
 
     Other programs know no textures. --bake turns a textured splat into plain ones, as many as its texels or fewer, and
     trains them on pictures of the model. The photographs are not needed.

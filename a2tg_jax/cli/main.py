@@ -49,7 +49,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg eval runs/scene                 evaluate a run again
   a2tg finish runs/scene --out runs/f  shrink and polish the trained model, in a new run folder
   a2tg render runs/scene               render frames and a video of a flight, or the test views
-  a2tg view runs/scene                 show a run in a browser; also *.npz, *.a2tgz and *.ply
+  a2tg view runs/scene                 show a run in a browser; also *.npz, *.ply, *.spz, ...
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
   a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
   a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others

@@ -120,6 +120,9 @@ class Train:
     on_nan: OnNan = "stop"
     """Action if training diverges (a loss or gradient is not finite, or the loss explodes): stop, or restore the newest
     checkpoint and continue with the views in another order."""
+    init: Annotated[Path | None, arg(metavar="FILE")] = None
+    """File of splats (PLY, SPZ, SOG, a checkpoint of gsplat, ...) in place of the first stage, in the world of the
+    scene folder."""
     resume: bool = False
     """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False
@@ -181,7 +184,9 @@ class Train:
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
         source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.validation)
-        return RunRecord(source, self.system, self.options, tuple(dict.fromkeys(compare)), self.preset, self.on_nan)
+        init = None if self.init is None else str(self.init.resolve())
+        compare = tuple(dict.fromkeys(compare))
+        return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init)
 
     def _resumed(self, run: RunFolder) -> RunRecord:
         """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it."""
@@ -232,6 +237,7 @@ def train_defaults(arguments: list[str]) -> Train:
         validation=file.validation,
         compare=file.compare,
         on_nan=file.on_nan,
+        init=None if file.init is None else Path(file.init),
         options=file.chosen(path),
     )
 

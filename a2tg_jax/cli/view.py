@@ -34,7 +34,7 @@ class View:
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
-    """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
+    """Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, *.sog, ...)."""
     model: LastModel = None
     """Name of a run's model, as a2tg info prints it."""
     host: str = LOOPBACK
@@ -69,7 +69,7 @@ class Export:
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
-    """Run folder, model (*.npz), compact scene (*.a2tgz) or point cloud of Gaussians (*.ply)."""
+    """Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, *.sog, ...)."""
     web: Path | None = None
     """Output folder of the page; a name that ends in .html is one HTML file that needs no other."""
     ply: Annotated[Path | None, arg(metavar="FILE")] = None

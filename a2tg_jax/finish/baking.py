@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Plain
-from a2tg_jax.appearance.textured import texel_coordinates
+from a2tg_jax.appearance.textured import shown_textures, texel_coordinates
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.finish.distilling import distill, pictures
-from a2tg_jax.finish.shrinking import can_shrink, texel_weights_of
+from a2tg_jax.finish.shrinking import texel_weights_of
 from a2tg_jax.finish.texel_choice import Tables, fewest_texels
 from a2tg_jax.io.ply import plain_gaussians
 from a2tg_jax.model import Model
@@ -57,8 +57,8 @@ def bake(
     """Return a plain model that looks like a textured one (host).
 
     Args:
-      model: of any appearance. `Textured` with signed RGB, and `Banded` around it, becomes a splat per texel or fewer;
-        of others the Gaussians are taken.
+      model: of any appearance. `Textured`, and `Banded` around it, becomes a splat per texel or fewer; of others the
+        Gaussians are taken.
       cameras: views that the new model is trained on.
       growth: largest ratio of the bytes of all floats to those of the model.
       iterations: of training on pictures of the model; 0: none.
@@ -76,15 +76,16 @@ def bake(
 
 def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Model:
     """Return a plain model with a splat per texel or fewer, without training. Arguments as in `bake`."""
-    if not can_shrink(model):
+    options = model.appearance.texture_options if model.appearance.is_portable else None
+    if options is None or model.textures is None:
         return as_plain(plain_gaussians(dataclasses.replace(model, origin=None)), model)
     degree = least_degree(model, cameras)
     most = int(growth * model.num_bytes / (4 * floats_per_gaussian(degree)))
-    assert model.textures is not None
+    shown = shown_textures(*model.textures, options)
     weights = texel_weights_of(model, cameras, model.background)
-    tables = fewest_texels(*model.textures, weights, max(most, model.num))
+    tables = fewest_texels(shown, model.textures[1], weights, max(most, model.num))
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
-    return as_plain(_split(whole, tables, model.appearance.texture_options.uv), model)  # type: ignore[union-attr]
+    return as_plain(_split(whole, tables, options.uv), model)
 
 
 def as_plain(gaussians: Gaussians, model: Model) -> Model:

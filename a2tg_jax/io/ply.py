@@ -153,7 +153,7 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Gaussian
         means=jnp.asarray(_columns(vertices, MEANS)),
         quats=jnp.asarray(quats),
         log_scales=jnp.asarray(log_scales),
-        logit_opacities=jnp.asarray(_columns(vertices, ("opacity",))[:, 0]),
+        logit_opacities=jnp.asarray(_logits_of(vertices)),
         sh=jnp.asarray(_sh_of(vertices, path)),
     )
     try:
@@ -190,6 +190,13 @@ def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
         raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
     header.require(REQUIRED, "a PLY of 2D Gaussians")
     return header.read_binary(file)
+
+
+def _logits_of(vertices: np.ndarray) -> np.ndarray:
+    """Return the logits [N] of opacities. Infinite ones of opacities 0 and 1, as programs write them, become finite."""
+    given = vertices["opacity"]
+    most = np.where(given > 0, -np.log(LEAST_OPACITY), np.log(LEAST_OPACITY))
+    return np.where(np.isinf(given), most, given).astype(np.float32)
 
 
 def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:

@@ -8,12 +8,13 @@ programs of 3DGS and 2DGS ((parameters, iteration)).
 """
 
 import collections
+import functools
 import io
 import math
 import os
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ STORAGES = {
     "DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "LongStorage": "<i8", "IntStorage": "<i4",
     "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
 }  # fmt: skip
-MOST_PICKLE_BYTES = 1 << 24
+MOST_PICKLE_BYTES = 1 << 20
 MOST_ENTRIES = 10_000
 GSPLAT = ("means", "quats", "scales", "opacities", "sh0", "shN")
 NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
@@ -107,7 +108,7 @@ def _rebuild_parameter(data: Any, *rest: Any) -> Any:
     return data
 
 
-KNOWN = {
+KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
     ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
     ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
     ("torch.nn.parameter", "Parameter"): _rebuild_parameter,
@@ -132,7 +133,7 @@ class _Unpickler(pickle.Unpickler):
                 f"pickles {shortened(f'{module}.{name}')}, which could run any code; save a dictionary of tensors "
                 "alone, or export a PLY"
             )
-        return KNOWN[module, name]
+        return functools.partial(KNOWN[module, name])  # What a pickle sets on it, it sets on no other.
 
     def persistent_load(self, pid: Any) -> _Storage:
         kind, dtype, key, _, num = pid

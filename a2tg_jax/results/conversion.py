@@ -53,6 +53,13 @@ class BakeOptions:
     growth: float = MOST_GROWTH
     iterations: int = ITERATIONS
 
+    def check(self) -> None:
+        """Raise ValueError, naming the option, if one is out of range."""
+        if not 1 <= self.growth < math.inf:
+            raise ValueError(f"bake_growth must be a finite number of at least 1; got {self.growth}")
+        if self.iterations < 0:
+            raise ValueError(f"bake_iterations must be at least 0; got {self.iterations}")
+
 
 def convert(source: Path, out: Path, name: str | None = None, *, baking: BakeOptions | None = None) -> Converted:
     """Write a model in the format of another suffix.
@@ -73,6 +80,8 @@ def convert(source: Path, out: Path, name: str | None = None, *, baking: BakeOpt
     if source.resolve() == out.resolve():
         raise ValueError(f"{out} is the source: choose another name")
     check_output(out)
+    if baking is not None:
+        baking.check()
     start = time.perf_counter()
     opened = open_source(source, name)
     model, baked = (opened.model, "") if baking is None else _baked(source, opened.model, baking)
@@ -86,7 +95,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     cameras = () if model.origin is None else model.origin.cameras
     if not cameras:
         raise ValueError(f"--bake needs a model that knows its cameras; {source} has none")
-    if type(model.appearance) is Plain:
+    if type(model.appearance.base) is Plain:
         return model, "baked: nothing, for the model is plain"
     plain = bake(model, cameras, growth=options.growth, iterations=options.iterations, progress=True)
     views = cameras[:: -(-len(cameras) // MOST_VIEWS)]

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.data import Scene
+from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.io.formats import format_of
 from a2tg_jax.measure.metrics import load_lpips
-from a2tg_jax.results.folder import KEPT_CHECKPOINTS, check_free
+from a2tg_jax.results.folder import KEPT_CHECKPOINTS, RunFolder, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
 from a2tg_jax.results.output import check_output
 from a2tg_jax.results.plan import PlannedStage
@@ -33,6 +35,8 @@ def check_new_run(
     if record.scene.path != SYNTHETIC:
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=overwrite)
+    if record.init is not None:
+        check_init(Path(record.init), out)
     check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory))
     for system in record.systems.values():
@@ -44,6 +48,15 @@ def check_new_run(
     if quicker:
         print(quicker, flush=True)
     return scene
+
+
+def check_init(file: Path, out: Path) -> None:
+    """Raise ValueError unless a file of splats can take the place of the first stage of a run in a folder."""
+    if not is_regular(file):
+        raise ValueError(f"init: there is no file {file}")
+    format_of(file)
+    if RunFolder(out).is_begun:
+        raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
 
 
 def warn_of_small_budget(system: System) -> None:

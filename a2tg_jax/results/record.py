@@ -104,6 +104,8 @@ class RunRecord:
     """Preset of the other options of these systems."""
     on_nan: OnNan = "stop"
     """Action if a loss or gradient is not finite, or a loss explodes."""
+    init: str | None = None
+    """File of splats in place of the main system's first stage."""
 
     @property
     def systems(self) -> dict[str, System]:
@@ -137,12 +139,15 @@ class RunRecord:
                 if system is self.system:
                     raise
                 raise ValueError(f"compare {label}, with the options of {self.name}: {error}") from error
-        plan_run(self.systems)
+        plan = plan_run(self.systems)
+        if self.init is not None and len(plan.main) < 2:
+            raise ValueError(f"init takes the place of a first stage, and {self.name} has no second one")
 
     def leaves(self) -> dict[str, Any]:
         """Return every option by the name of its flag, without the dashes."""
         scene = {name: value for name, value in flatten_config(self.scene).items() if name != "path"}
-        return {"system": self.name, **scene, **flatten_config(self.system)}
+        init = {} if self.init is None else {"init": self.init}
+        return {"system": self.name, **scene, **init, **flatten_config(self.system)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +163,7 @@ class RunFile:
     preset: str | None = None
     compare: tuple[str, ...] = ()
     on_nan: OnNan = "stop"
+    init: str | None = None
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def chosen(self, where: str) -> System:
@@ -235,6 +241,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         **({} if record.preset is None else {"preset": record.preset}),
         "compare": list(record.compare),
         "on_nan": record.on_nan,
+        **({} if record.init is None else {"init": record.init}),
         "options": _without_none(config_to_dict(record.system), start),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n{_budget_note(record.system)}{tomli_w.dumps(table)}"
@@ -262,7 +269,7 @@ def read_record(run: RunFolder) -> RunRecord:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.validation)
     system = file.chosen(str(run.record))
-    record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan)
+    record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init)
     try:
         record.check()
     except ValueError as error:

@@ -9,6 +9,7 @@ from a2tg_jax.host.machine import this_machine
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.model_file import FORMAT, load_model, save_model
+from a2tg_jax.results.first_stage import write_first_stage
 from a2tg_jax.results.folder import RunFolder, iteration_of
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
@@ -67,6 +68,8 @@ def train_run(
     record = replaced_by or read_record(run)
     session = Session() if session is None else session
     for planned in record.plan.stages:
+        if record.init is not None and planned.name == record.plan.main[0] and not run.model(planned.name).is_file():
+            write_first_stage(run, planned, Path(record.init), scene)
         events = EventWriter(run, planned.name) if tensorboard else None
         training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch, session, events)
         if replaced_by is not None:

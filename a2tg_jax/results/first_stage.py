@@ -1,0 +1,47 @@
+"""Splats from a file in place of the first stage of a run."""
+
+import dataclasses
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.transform import transform_gaussians
+from a2tg_jax.data import Scene
+from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.io.formats import load_splats
+from a2tg_jax.io.model_file import save_model
+from a2tg_jax.io.ply import plain_gaussians
+from a2tg_jax.model import Model
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.history import write_history
+from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.training import History
+from a2tg_jax.training.fitting import BACKGROUNDS
+
+
+def write_first_stage(run: RunFolder, planned: PlannedStage, file: Path, scene: Scene) -> None:
+    """Write the splats of a file as the model of a first stage, in the scene's normalised world, without a history.
+
+    Args:
+      run: the run folder.
+      planned: the first stage of the main system.
+      file: of any format that `load_splats` reads; plain splats in the original world of the photographs, or a model.
+      scene: the scene of the run.
+    """
+    gaussians = transform_gaussians(plain_gaussians(load_splats(file)), scene.transform)
+    gaussians = _of_degree(gaussians, planned.system.initial_sh_degree)
+    origin = origin_of_scene(scene, BACKGROUNDS[planned.system.background])
+    model = Model(gaussians, appearance=planned.stage.appearance, origin=origin)
+    save_model(run.own(run.model(planned.name)), model, {"init": str(file)})
+    write_history(run.own(run.history(planned.name)), History.empty())
+
+
+def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Return Gaussians with spherical harmonics of a degree, cut off or filled with zeros."""
+    sh = np.zeros((gaussians.num, NUM_BASES[degree], 3), np.float32)
+    num = min(sh.shape[1], gaussians.sh.shape[1])
+    sh[:, :num] = np.asarray(gaussians.sh)[:, :num]
+    return dataclasses.replace(gaussians, sh=jnp.asarray(sh))

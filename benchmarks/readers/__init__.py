@@ -1,0 +1,1 @@
+"""What other programs read of the files that a2tg convert writes."""

@@ -1,0 +1,99 @@
+"""Files of `a2tg convert`, read by other programs and compared with the model.
+
+    npm install --prefix OTHERS @playcanvas/splat-transform playcanvas @sparkjsdev/spark three
+    python -m benchmarks.readers scene.npz --others OTHERS --chromium chromium
+
+Writes every format, reads each by splat-transform and prints how far 99 % of the numbers are off; draws the view of a
+camera by PlayCanvas and by Spark in a headless Chromium and prints the PSNR of their pictures beside ours.
+"""
+
+import argparse
+import subprocess
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from a2tg_jax import Gaussians, Model, load_model, load_splats, save_splats
+from a2tg_jax.finish.distilling import pictures
+from benchmarks.readers.browser import Camera, draw
+
+SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".ksplat")
+BY_PLAYCANVAS = (".ply", ".compressed.ply", ".sog")
+CLI = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+
+
+def by_splat_transform(file: Path, others: Path) -> Gaussians:
+    """Return the Gaussians of a file after splat-transform has written it as a PLY."""
+    out = file.with_name(f"{file.name}.read.ply")
+    subprocess.run(["node", str(others / CLI), "-w", "-q", str(file), str(out)], check=True)
+    return load_splats(out).gaussians
+
+
+def differences(found: Gaussians, wanted: Gaussians) -> str:
+    """Return how far 99 % of the numbers are off; rows are matched by the nearest means."""
+    apart, rows = cKDTree(np.asarray(found.means)).query(np.asarray(wanted.means))
+    found = found[rows]
+    units = [x.quats / np.linalg.norm(x.quats, axis=1, keepdims=True) for x in (found, wanted)]
+    degrees = 2 * np.degrees(np.arccos(np.clip(np.abs(np.sum(units[0] * units[1], axis=1)), 0, 1)))
+    num = min(found.sh.shape[1], wanted.sh.shape[1])
+    pairs = {
+        "means": apart,
+        "degrees": degrees,
+        "log_scales": found.log_scales - wanted.log_scales,
+        "opacities": found.opacities - wanted.opacities,
+        "sh_0": found.sh[:, 0] - wanted.sh[:, 0],
+        "sh_rest": found.sh[:, 1:num] - wanted.sh[:, 1:num],
+    }
+    told = [f"{name} {np.quantile(np.abs(x), 0.99):.1g}" if np.size(x) else f"{name} none" for name, x in pairs.items()]
+    return f"{found.num:,} splats; {', '.join(told)}"
+
+
+def psnr(image: np.ndarray, wanted: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((image / 255 - wanted) ** 2)))
+
+
+def original_camera(model: Model, index: int) -> Camera:
+    """Return a camera of a model in its original world, as browsers place it: y up, z backward."""
+    origin = model.origin
+    assert origin is not None
+    viewmat = origin.transform.inverse().apply_to_viewmat(origin.viewmats[index])
+    width, height = map(int, origin.sizes[index])
+    return Camera(width, height, origin.Ks[index].tolist(), (np.linalg.inv(viewmat) @ np.diag([1, -1, -1, 1])).tolist())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path, help="plain model (*.npz) with cameras")
+    parser.add_argument("--others", type=Path, required=True, help="folder with node_modules of the programs")
+    parser.add_argument("--chromium", help="command of Chromium; without it no pictures are drawn")
+    parser.add_argument("--camera", type=int, default=0, help="index of the camera")
+    parser.add_argument("--out", type=Path, help="folder of the files and pictures")
+    chosen = parser.parse_args()
+    warnings.simplefilter("ignore")
+    model = load_model(chosen.model)
+    out = (chosen.out or Path(tempfile.mkdtemp())).resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    for suffix in SUFFIXES:
+        save_splats(out / f"scene{suffix}", model)
+    wanted = load_splats(out / "scene.ply").gaussians
+    for suffix in SUFFIXES:
+        file = out / f"scene{suffix}"
+        read = differences(by_splat_transform(file, chosen.others), wanted)
+        print(f"{suffix}: {file.stat().st_size:,} bytes; splat-transform: {read}", flush=True)
+    if chosen.chromium is None or model.origin is None:
+        return
+    (ours,) = pictures(model, [model.origin.cameras[chosen.camera]])
+    camera = original_camera(model, chosen.camera)
+    for page, suffixes in (("playcanvas", BY_PLAYCANVAS), ("spark", SUFFIXES)):
+        for suffix in suffixes:
+            image = draw(page, out / f"scene{suffix}", camera, chosen.others, chosen.chromium)
+            Image.fromarray(image).save(out / f"{page}{suffix}.png")
+            print(f"{suffix}: {page} {psnr(image, ours):.1f} dB beside a2tg", flush=True)
+
+
+if __name__ == "__main__":
+    main()
