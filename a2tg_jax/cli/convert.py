@@ -40,6 +40,9 @@ class Convert:
     bake_iterations: int = BakeOptions.iterations
     """Iterations of training in --bake; each draws one view. 0 leaves training out."""
 
+    overwrite: bool = False
+    """Replace the output file."""
+
     def run(self) -> None:
         baking = BakeOptions(self.bake_growth, self.bake_iterations) if self.bake else None
-        print(convert(self.source, self.out, self.model, baking=baking).text)
+        print(convert(self.source, self.out, self.model, baking=baking, overwrite=self.overwrite).text)
