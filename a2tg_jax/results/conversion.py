@@ -13,7 +13,7 @@ from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
 from a2tg_jax.finish.distilling import pictures
 from a2tg_jax.io.formats import file_bytes, format_of, lost_by, save_splats
 from a2tg_jax.model import Model
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.viewing import open_source
 
 
@@ -61,7 +61,9 @@ class BakeOptions:
             raise ValueError(f"bake_iterations must be at least 0; got {self.iterations}")
 
 
-def convert(source: Path, out: Path, name: str | None = None, *, baking: BakeOptions | None = None) -> Converted:
+def convert(
+    source: Path, out: Path, name: str | None = None, *, baking: BakeOptions | None = None, overwrite: bool = False
+) -> Converted:
     """Write a model in the format of another suffix.
 
     Args:
@@ -69,6 +71,7 @@ def convert(source: Path, out: Path, name: str | None = None, *, baking: BakeOpt
       out: the file.
       name: which model of a run; None is the last of its main system.
       baking: how textures become plain splats; None leaves them as they are.
+      overwrite: whether an existing file is replaced.
 
     Raises:
       FileNotFoundError: if there is no such file, or the run's stage is not finished.
@@ -80,6 +83,7 @@ def convert(source: Path, out: Path, name: str | None = None, *, baking: BakeOpt
     if source.resolve() == out.resolve():
         raise ValueError(f"{out} is the source: choose another name")
     check_output(out)
+    check_new(out, "OUT", overwrite=overwrite)
     if baking is not None:
         baking.check()
     start = time.perf_counter()
