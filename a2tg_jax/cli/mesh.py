@@ -7,7 +7,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
-from a2tg_jax.results.meshing import MeshOptions, write_mesh
+from a2tg_jax.events import from_options
+from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
 from a2tg_jax.results.output import check_output
 from a2tg_jax.results.viewing import open_source
 
@@ -16,12 +17,14 @@ from a2tg_jax.results.viewing import open_source
 class Mesh:
     """Write the surface of a trained scene as triangles, by fusion of rendered depths.
 
-    GLB, PLY or OBJ, in the original world of the photographs. The photographs are not needed. Surfaces are best if the
+    GLB, PLY or OBJ, in the original world of the photographs. The photographs are not needed, unless a texture is
+    made of them. Surfaces are best if the
     scene was trained with --system gaussians-2d --preset surfaces.
 
     Examples:
       a2tg mesh runs/fox
       a2tg mesh runs/fox --out fox.ply --resolution 1024
+      a2tg mesh runs/fox --texture photographs
       a2tg mesh runs/street --unbounded
     """
 
@@ -39,6 +42,12 @@ class Mesh:
     """Go on beyond the radius, with voxels that grow with the distance."""
     clusters: int = MeshOptions.clusters
     """Largest number of connected parts to keep; smaller ones are floaters."""
+    faces: Annotated[int | None, defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N")] = None
+    """Largest number of faces. Needs pip install 'a2tg-jax[mesh]'."""
+    texture: TextureSource = "none"
+    """Fill a texture atlas from renders or photographs of the training views (GLB and OBJ). Needs the same."""
+    texture_size: int = MeshOptions.texture_size
+    """Side of the atlas in texels."""
     max_memory: Annotated[str | None, defaulting_to("half of the free memory", "SIZE")] = None
     """Memory budget of the voxels, such as 4GB."""
     model: LastModel = None
@@ -47,7 +56,7 @@ class Mesh:
     def run(self) -> None:
         own = self.source / "mesh.glb" if self.source.is_dir() else self.source.with_suffix(".glb")
         out = self.out or own
-        options = MeshOptions(self.resolution, self.voxel, self.radius, self.unbounded, self.clusters, self.max_memory)
+        options = from_options(MeshOptions, self)
         options.check(out)
         source = open_source(self.source, self.model)
         check_output(out)

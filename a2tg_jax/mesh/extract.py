@@ -102,7 +102,7 @@ def extract_mesh(
     """
     start = time.perf_counter()
     check_kind("model", model, Model)
-    cameras = _cameras_of(model) if cameras is None else list(cameras)
+    cameras = training_cameras(model) if cameras is None else list(cameras)
     if not model.num or not cameras:
         what = "the model has no Gaussians" if not model.num else "there are no cameras"
         raise ValueError(f"a mesh needs views of some Gaussians; {what}")
@@ -129,7 +129,7 @@ def extract_mesh(
     return MeshResult(mesh, np.asarray(center), radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
 
 
-def _cameras_of(model: Model) -> list[Camera]:
+def training_cameras(model: Model) -> list[Camera]:
     """Return the cameras that the model was trained on."""
     if model.origin is None:
         return []
