@@ -2,12 +2,15 @@
 
 import json
 import struct
+import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import surface_quality
 
 import a2tg_jax as a2tg
+from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
 from a2tg_jax.mesh.depth_maps import DepthMap
 from a2tg_jax.mesh.distance import thinned
@@ -287,3 +290,101 @@ def test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, arguments
     assert cli.main(arguments.split()) == 2
     error = capsys.readouterr().err
     assert message in error.splitlines()[-1]
+
+
+# Textures
+
+
+def painted(camera):
+    """The sphere as a camera sees it, coloured by position."""
+    return camera, np.asarray(sphere_depths(camera).color, np.float32), None
+
+
+@pytest.fixture(scope="module")
+def textured(sphere):
+    pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
+    grey = a2tg.Mesh(sphere.vertices, sphere.faces, np.full((sphere.num_vertices, 3), 9, np.uint8))
+    simple = a2tg.simplify_mesh(grey, 800)
+    assert 700 < simple.num_faces <= 800
+    views = [painted(camera_at(1.2 * each / np.linalg.norm(each))) for each in AROUND]
+    return a2tg.texture_mesh(simple, views, size=128)
+
+
+def test_texels_have_the_colors_that_the_views_see(textured):
+    middle = textured.corners.mean(axis=1)
+    places = textured.uv[textured.faces].mean(axis=1)
+    rows, columns = ((1 - places[:, 1]) * 128).astype(int), (places[:, 0] * 128).astype(int)
+    error = np.abs(textured.texture[rows, columns] / 255 - np.clip(0.5 + middle, 0, 1))
+    assert np.median(error) < 0.02 and np.quantile(error, 0.95) < 0.1
+
+
+def test_a_texture_is_filled_beyond_its_charts_and_keeps_colors_of_unseen_texels(textured):
+    assert textured.texture.shape == (128, 128, 3) and textured.texture.any(axis=-1).all()
+    assert textured.uv.min() >= 0 and textured.uv.max() <= 1
+    unseen = a2tg.texture_mesh(a2tg.Mesh(textured.vertices, textured.faces, textured.colors), [], size=64)
+    assert (unseen.texture == 9).all()
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh reads the files back: pip install trimesh")
+    files = a2tg.save_mesh(tmp_path / f"mesh{suffix}", textured)
+    read = trimesh.load(files[0], force="mesh", process=False)
+    material = read.visual.material
+    picture = material.baseColorTexture if suffix == ".glb" else material.image
+    np.testing.assert_allclose(read.visual.uv, textured.uv, atol=1e-5)
+    assert np.abs(np.asarray(picture.convert("RGB"), float) - textured.texture).mean() < (
+        2 if suffix == ".glb" else 0.01
+    )
+    assert [path.suffix for path in files] == ([".glb"] if suffix == ".glb" else [".obj", ".mtl", ".png"])
+
+
+def test_missing_libraries_are_told(sphere, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    with pytest.raises(ValueError, match=r"xatlas, which is not installed: pip install 'a2tg-jax\[mesh\]'"):
+        a2tg.texture_mesh(sphere, [], size=64)
+    with pytest.raises(ValueError, match=r"fast-simplification, which is not installed"):
+        a2tg.simplify_mesh(sphere, 10)
+
+
+# Evaluation
+
+
+def test_exact_points_lie_where_the_pictures_say():
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30, test_every=0)
+    points = exact_points(scene)
+    assert len(points) == 3 * 24 * 16
+    known = scene.transform.inverse().apply(scene.points)
+    assert a2tg.surface_distance(known, points, threshold=0.4).precision == 1
+
+
+def test_dtu_counts_what_was_observed_above_the_table():
+    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [5.0]), -1).reshape(-1, 3)
+    mask = np.ones((20, 20, 20), bool)
+    mask[10:] = False
+    plane, bounds = np.array([0, 1, 0, -9.5]), np.array([[0, 0, 0], [19, 19, 19]])
+    found = surface_quality.dtu_distance(grid + np.array([0, 0, 0.5]), grid, mask, bounds, 1.0, plane)
+    assert found.accuracy == found.completeness == found.chamfer == 0.5 and found.f_score == 1
+    wrong = grid + np.where(grid[:, :1] >= 10, 7.0, 0.0) * np.array([0, 0, 1])
+    found = surface_quality.dtu_distance(wrong, grid, mask, bounds, 1.0, plane)
+    assert found.accuracy == 0 and found.completeness > 1
+
+
+def test_the_preset_for_surfaces_has_their_losses():
+    terms = a2tg.Gaussians2d.preset("surfaces").stages()[0].losses
+    assert [term.function.__name__ for term in terms[1:]] == ["normals", "distortion"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--texture renders --out mesh.ply", "a PLY file holds no texture"),
+        ("--texture renders --texture-size 5", "--texture-size must lie in"),
+        ("--texture photographs", "the photographs of cameras are missing"),
+        ("--faces 0", "--faces must be at least 1"),
+    ],
+)
+def test_mistakes_of_textures(model, tmp_path, monkeypatch, capsys, arguments, message):
+    pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
+    test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, f"mesh cameras.npz {arguments}", message)
