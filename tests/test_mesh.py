@@ -226,6 +226,7 @@ def test_one_camera_looks_at_what_it_sees(model):
         ({"resolution": 0}, "resolution must lie in"),
         ({"resolution": 10, "voxel": 0.1}, "resolution and voxel both"),
         ({"resolution": None, "voxel": np.nan}, "voxel must be positive"),
+        ({"least_faces": 10**6}, "parts had fewer than 1000000 faces"),
         ({"cameras": []}, "there are no cameras"),
     ],
 )
@@ -278,6 +279,7 @@ def test_the_command_writes_the_original_world(model, tmp_path, capsys):
         ("mesh bare.npz --out mesh.stl", "--out must end in .glb, .ply or .obj"),
         ("mesh bare.npz --max-memory much", "--max-memory must be a number of MB"),
         ("mesh cameras.npz --resolution 0", "--resolution must lie in"),
+        ("mesh cameras.npz --radius 0.1", "give a larger --radius, or --unbounded"),
         ("mesh cameras.npz --resolution 2000 --max-memory 1MB", "lower --resolution"),
     ],
 )

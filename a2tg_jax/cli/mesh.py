@@ -17,9 +17,8 @@ from a2tg_jax.results.viewing import open_source
 class Mesh:
     """Write the surface of a trained scene as triangles, by fusion of rendered depths.
 
-    GLB, PLY or OBJ, in the original world of the photographs. The photographs are not needed, unless a texture is
-    made of them. Surfaces are best if the
-    scene was trained with --system gaussians-2d --preset surfaces.
+    GLB, PLY or OBJ, in the original world of the photographs, which are read for a texture only. Surfaces are best if
+    the scene was trained with --system gaussians-2d --preset surfaces.
 
     Examples:
       a2tg mesh runs/fox

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.mesh.blocks import BlockGrid, GridFullError
 from a2tg_jax.mesh.depth_maps import DepthMap, depth_map
@@ -28,6 +29,10 @@ GRID_BYTES = 4 * 10**9
 LEAST_WEIGHT = 0.05
 MOST_CLUSTERS, LEAST_FACES = 50, 50
 """Default of the connected parts that are kept, as in 2DGS."""
+
+
+class NoSurfaceError(ValueError):
+    """The views have no surface within the space."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,21 +117,31 @@ def extract_mesh(
         center, radius = _sphere(renderer, cameras, center, radius)
     voxel = radius / (resolution or RESOLUTION) if voxel is None else voxel
     space = Space.of(center, radius, voxel, unbounded)
+    grid = _fused(renderer, cameras, space, max_bytes, progress)
+    mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
+    if not mesh.num_faces:
+        parts = f"; {counted(num_dropped, 'part')} had fewer than {least_faces} faces" if num_dropped else ""
+        raise NoSurfaceError(
+            f"there is no surface within {radius:.3g} units of the point that the cameras look at{parts}: give a "
+            "larger radius, or unbounded"
+        )
+    seconds = time.perf_counter() - start
+    return MeshResult(mesh, np.asarray(center), radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
+
+
+def _fused(renderer: Renderer, cameras: Sequence[Camera], space: Space, max_bytes: int, progress: bool) -> BlockGrid:
+    """Return the voxels of all views."""
     grid = BlockGrid(max_bytes)
     for index, camera in enumerate(tqdm(cameras, desc="fusing", unit="view", disable=not progress)):
         try:
             fuse(grid, _depths(renderer, camera), space)
         except GridFullError:
-            raise GridFullError(_too_large(max_bytes, index + 1, len(cameras), radius / voxel)) from None
-    mesh = surface_of(grid, space, least_weight)
-    if not mesh.num_faces:
-        raise ValueError(
-            f"there is no surface within {radius:.3g} units of the centre {np.round(center, 3).tolist()}: give a "
-            "larger radius, or unbounded"
-        )
-    mesh, num_dropped = largest_clusters(mesh, most_clusters, least_faces)
-    seconds = time.perf_counter() - start
-    return MeshResult(mesh, np.asarray(center), radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
+            raise GridFullError(
+                f"a resolution of {float(space.radius / space.voxel):.0f} voxels along the radius takes more than "
+                f"{max_bytes / 1e9:.3g} GB after {index + 1} of {len(cameras)} views: lower the resolution or the "
+                "radius, or raise max_bytes"
+            ) from None
+    return grid
 
 
 def training_cameras(model: Model) -> list[Camera]:
@@ -166,13 +181,6 @@ def _sphere(
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
         own, reach = own + middle * viewmats[0, 2, :3], RADII * middle
     return (own if center is None else np.asarray(center, np.float64)), reach if radius is None else radius
-
-
-def _too_large(max_bytes: int, num_done: int, num_views: int, resolution: float) -> str:
-    return (
-        f"a resolution of {resolution:.0f} voxels along the radius takes more than {max_bytes / 1e9:.3g} GB after "
-        f"{num_done} of {num_views} views: lower the resolution or the radius, or raise max_bytes"
-    )
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from a2tg_jax.data import view_image
 from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.mesh.atlas import check_texture
 from a2tg_jax.mesh.blocks import GridFullError
-from a2tg_jax.mesh.extract import MOST_CLUSTERS, MeshResult, extract_mesh, training_cameras
+from a2tg_jax.mesh.extract import MOST_CLUSTERS, MeshResult, NoSurfaceError, extract_mesh, training_cameras
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.simplify import check_simplifying, simplify_mesh
 from a2tg_jax.mesh.texture import Picture, texture_mesh
@@ -27,6 +27,11 @@ GRID_SHARE = 0.5
 """Share of the free memory that voxels may take by default."""
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
+ADVICE = {
+    GridFullError: "lower --resolution or --radius, or raise --max-memory",
+    NoSurfaceError: "give a larger --radius, or --unbounded",
+}
+"""Advice of the command line by error."""
 TextureSource = Literal["none", "renders", "photographs"]
 
 
@@ -137,9 +142,8 @@ def _extracted(source: Source, options: MeshOptions) -> MeshResult:
             settings=source.settings,
             progress=True,
         )
-    except GridFullError as error:
-        told = str(error).partition(": ")[0]
-        raise ValueError(f"{told}: lower --resolution or --radius, or raise --max-memory") from None
+    except (GridFullError, NoSurfaceError) as error:
+        raise ValueError(f"{str(error).partition(': ')[0]}: {ADVICE[type(error)]}") from None
 
 
 def _summary(result: MeshResult, mesh: Mesh, scale: float, files: list[Path], seconds: float) -> str:
