@@ -78,7 +78,10 @@ class BlockGrid:
 
 def unique_blocks(blocks: np.ndarray) -> np.ndarray:
     """Return the different blocks [B, 3] among blocks [P, 3]; those too far out are left out."""
-    is_near = (np.abs(blocks) < OFFSET).all(axis=1)
+    if len(blocks):  # Neighbouring pixels mostly repeat a block, and sorting is slow.
+        is_new = np.r_[True, (blocks[1:] != blocks[:-1]).any(axis=1)]
+        blocks = blocks[is_new]
+    is_near = ((blocks > -OFFSET) & (blocks < OFFSET)).all(axis=1)
     keys = np.unique(_keys_of(blocks[is_near]))
     return np.stack([(keys >> shift & (2 * OFFSET - 1)) - OFFSET for shift in (42, 21, 0)], axis=-1).astype(np.int32)
 

@@ -49,8 +49,7 @@ def fuse(grid: BlockGrid, depths: DepthMap, space: Space) -> None:
 
 def blocks_near(depths: DepthMap, space: Space) -> np.ndarray:
     """Return the blocks [B, 3] within a truncation of the depths, along their rays."""
-    near = np.asarray(_jitted_near()(depths, space))
-    return unique_blocks(near[near[:, 0] > NOWHERE])
+    return unique_blocks(np.asarray(_jitted_near()(depths, space)))
 
 
 @functools.cache
