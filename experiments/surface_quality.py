@@ -31,6 +31,9 @@ WEIGHTS: Mapping[str, dict[str, float]] = {
     "no losses": {},
     "normals 0.05": {"normal_weight": 0.05},
     "normals 0.2": {"normal_weight": 0.2},
+    "normals 0.05, distortion 0.1": {"normal_weight": 0.05, "distortion_weight": 0.1},
+    "normals 0.05, distortion 1": {"normal_weight": 0.05, "distortion_weight": 1.0},
+    "normals 0.2, distortion 0.1": {"normal_weight": 0.2, "distortion_weight": 0.1},
     "normals 0.2, distortion 0.3": {"normal_weight": 0.2, "distortion_weight": 0.3},
 }
 
@@ -56,7 +59,7 @@ def main() -> None:
 
 def synthetic_table(args: argparse.Namespace) -> str:
     """Train what is missing and return a table of the built-in scene."""
-    scene = a2tg.synthetic_scene()
+    scene = a2tg.synthetic_scene(width=208, height=156)
     points = thinned(exact_points(scene), SPACING)
     rows = []
     for name, weights in WEIGHTS.items():

@@ -375,7 +375,7 @@ def test_dtu_counts_what_was_observed_above_the_table():
 
 def test_the_preset_for_surfaces_has_their_losses():
     terms = a2tg.Gaussians2d.preset("surfaces").stages()[0].losses
-    assert [term.function.__name__ for term in terms[1:]] == ["normals", "distortion"]
+    assert [term.function.__name__ for term in terms[1:]] == ["normals"]
 
 
 @pytest.mark.parametrize(

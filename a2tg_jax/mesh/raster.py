@@ -91,4 +91,4 @@ def _barycentric(corners: np.ndarray, at: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         second = (own[:, 0] * across[:, 1] - own[:, 1] * across[:, 0]) / area
         third = (along[:, 0] * own[:, 1] - along[:, 1] * own[:, 0]) / area
-    return np.stack([1 - second - third, second, third], -1)
+        return np.stack([1 - second - third, second, third], -1)

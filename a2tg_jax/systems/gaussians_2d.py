@@ -18,7 +18,7 @@ from a2tg_jax.systems.stage1 import (
 from a2tg_jax.training.options import LossConfig, Ranges, System
 from a2tg_jax.training.stage import Stage
 
-SURFACES = LossConfig(normal_weight=0.2, distortion_weight=0.3)
+SURFACES = LossConfig(normal_weight=0.2)
 """Weights for meshes (docs/meshes.md)."""
 
 
