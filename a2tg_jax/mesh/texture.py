@@ -48,36 +48,35 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
     for camera, picture, mask in pictures:
         drawn = draw_view(mesh, camera)
         for start in range(0, len(weight), CHUNK):
-            part = slice(start, start + CHUNK)
-            seen = Texels(*(rows[part] for rows in texels))
-            own, color = _seen(seen, camera, np.asarray(picture, np.float32), mask, drawn)
-            weight[part] += own
-            total[part] += own[:, None] * color
+            part = Texels(*(rows[start : start + CHUNK] for rows in texels))
+            seen, own, color = _seen(part, camera, np.asarray(picture, np.float32), mask, drawn)
+            weight[start + seen] += own
+            total[start + seen] += own[:, None] * color
     color = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-30)[:, None], texels.color)
     return Mesh(mesh.vertices, mesh.faces, mesh.colors, mesh.uv, _filled(texels.place, color, size))
 
 
 def _seen(
     texels: Texels, camera: Camera, picture: np.ndarray, mask: np.ndarray | None, drawn: Raster
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weight [T] of a view for texels, 0 where it does not see them, and its colours [T, 3]."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the texels that a view sees, as indices [S], its weights [S] for them, and its colours [S, 3]."""
     viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
     at = texels.position @ viewmat[:3, :3].T + viewmat[:3, 3]
+    toward = -np.sum(at * (texels.normal @ viewmat[:3, :3].T), axis=1)
+    seen = np.flatnonzero((at[:, 2] > 0) & (toward > 0))
+    at, toward = at[seen], toward[seen]
+    x, y = ((at / at[:, 2:]) @ K[:2].T).T
     distance = np.linalg.norm(at, axis=1)
-    facing = -np.sum(at * (texels.normal @ viewmat[:3, :3].T), axis=1) / np.maximum(distance, 1e-12)
-    z = np.where(at[:, 2] > 0, at[:, 2], np.float32(1))
-    x, y = ((at / z[:, None]) @ K[:2].T).T
-    is_inside = (at[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    row, column = (np.where(is_inside, np.floor(each), 0).astype(int) for each in (y, x))
-    is_seen = is_inside & (facing > LEAST_FACING) & (z < (1 + HIDDEN) * drawn.depth[row, column])
+    is_inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & (toward > LEAST_FACING * distance)
+    row, column = (np.where(is_inside, each, 0).astype(int) for each in (y, x))
+    is_seen = is_inside & (at[:, 2] < (1 + HIDDEN) * drawn.depth[row, column])
     if mask is not None:
         is_seen &= mask[row, column]
-    own = np.where(is_seen, (facing * K[0, 0] / camera.width / np.maximum(distance, 1e-12)) ** POWER, 0)
-    places = np.stack([y, x]) - np.float32(0.5)
-    color = np.stack(
-        [map_coordinates(picture[..., channel], places, order=1, mode="nearest") for channel in range(3)], -1
-    )
-    return own.astype(np.float32), np.where(is_seen[:, None], color, 0)
+    places = np.stack([y, x])[:, is_seen] - np.float32(0.5)
+    channels = [map_coordinates(picture[..., channel], places, order=1, mode="nearest") for channel in range(3)]
+    distance = distance[is_seen]
+    own = (toward[is_seen] * K[0, 0] / camera.width / distance**2) ** POWER
+    return seen[is_seen], own.astype(np.float32), np.stack(channels, -1)
 
 
 def _filled(place: np.ndarray, color: np.ndarray, size: int) -> np.ndarray:
