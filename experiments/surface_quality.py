@@ -89,15 +89,22 @@ def compared(mesh: a2tg.Mesh, points: np.ndarray, spacing: float, threshold: flo
 
 def dtu_text(args: argparse.Namespace) -> str:
     """Return the distances of a mesh from a scan of DTU."""
+    points = args.data / "Points" / "stl" / f"stl{args.scan:03d}_total.ply"
+    observed, table = (args.data / "ObsMask" / name for name in (f"ObsMask{args.scan}_10.mat", f"Plane{args.scan}.mat"))
+    for path in (args.mesh, points, observed, table):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file")
     mesh = read_mesh(args.mesh)
     sampled = thinned(a2tg.sample_surface(mesh, DTU_SPACING / 2), DTU_SPACING)
     if args.world is not None:
         matrix = np.loadtxt(args.world)
         sampled = sampled @ matrix[:3, :3].T + matrix[:3, 3]
-    scan = read_ply_points(args.data / "Points" / "stl" / f"stl{args.scan:03d}_total.ply").points
-    volume = loadmat(args.data / "ObsMask" / f"ObsMask{args.scan}_10.mat")
-    plane = loadmat(args.data / "ObsMask" / f"Plane{args.scan}.mat")["P"].reshape(-1)
-    found = dtu_distance(sampled, scan, volume["ObsMask"].astype(bool), volume["BB"], float(volume["Res"]), plane)
+    scan = read_ply_points(points).points
+    volume = loadmat(observed)
+    plane = loadmat(table)["P"].reshape(-1)
+    found = dtu_distance(
+        sampled, scan, volume["ObsMask"].astype(bool), volume["BB"], float(volume["Res"].item()), plane
+    )
     header = ["scan", "accuracy, mm", "completeness, mm", "Chamfer, mm", "F-score"]
     return markdown(header, [[str(args.scan), *_figures(found, 1)]])
 
