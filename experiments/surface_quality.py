@@ -10,6 +10,7 @@ world, or --world names a text file of a 4 × 4 matrix that leads there.
 """
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -95,10 +96,10 @@ def dtu_text(args: argparse.Namespace) -> str:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file")
     mesh = read_mesh(args.mesh)
-    sampled = thinned(a2tg.sample_surface(mesh, DTU_SPACING / 2), DTU_SPACING)
     if args.world is not None:
         matrix = np.loadtxt(args.world)
-        sampled = sampled @ matrix[:3, :3].T + matrix[:3, 3]
+        mesh = dataclasses.replace(mesh, vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+    sampled = thinned(a2tg.sample_surface(mesh, DTU_SPACING / 2), DTU_SPACING)
     scan = read_ply_points(points).points
     volume = loadmat(observed)
     plane = loadmat(table)["P"].reshape(-1)
