@@ -90,6 +90,15 @@ if TYPE_CHECKING:
     from a2tg_jax.measure.metrics import parameter_bytes as parameter_bytes
     from a2tg_jax.measure.metrics import psnr as psnr
     from a2tg_jax.measure.metrics import ssim as ssim
+    from a2tg_jax.mesh.distance import SurfaceDistance as SurfaceDistance
+    from a2tg_jax.mesh.distance import sample_surface as sample_surface
+    from a2tg_jax.mesh.distance import surface_distance as surface_distance
+    from a2tg_jax.mesh.extract import MeshResult as MeshResult
+    from a2tg_jax.mesh.extract import extract_mesh as extract_mesh
+    from a2tg_jax.mesh.files import save_mesh as save_mesh
+    from a2tg_jax.mesh.simplify import simplify_mesh as simplify_mesh
+    from a2tg_jax.mesh.texture import texture_mesh as texture_mesh
+    from a2tg_jax.mesh.triangles import Mesh as Mesh
     from a2tg_jax.model import Model as Model
     from a2tg_jax.model import Parameters as Parameters
     from a2tg_jax.model import concatenate as concatenate
@@ -183,6 +192,12 @@ _NAMES = {
     "a2tg_jax.measure.alignment": ("align_poses", "color_fit"),
     "a2tg_jax.measure.evaluation": ("evaluate",),
     "a2tg_jax.measure.metrics": ("load_lpips", "lpips", "parameter_bytes", "psnr", "ssim"),
+    "a2tg_jax.mesh.distance": ("SurfaceDistance", "sample_surface", "surface_distance"),
+    "a2tg_jax.mesh.extract": ("MeshResult", "extract_mesh"),
+    "a2tg_jax.mesh.files": ("save_mesh",),
+    "a2tg_jax.mesh.simplify": ("simplify_mesh",),
+    "a2tg_jax.mesh.texture": ("texture_mesh",),
+    "a2tg_jax.mesh.triangles": ("Mesh",),
     "a2tg_jax.model": ("Model", "Parameters", "concatenate"),
     "a2tg_jax.render": ("RenderOutput", "RenderSettings", "render_appearance", "render_image"),
     "a2tg_jax.renderer": ("Renderer", "plan_render"),

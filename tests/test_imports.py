@@ -23,7 +23,7 @@ LAYERS = (
     {"densify"},
     {"training"},
     {"measure", "systems", "web"},
-    {"finish"},
+    {"finish", "mesh"},
     {"results"},
     {"cli"},
 )

@@ -1,4 +1,4 @@
-"""The command line `a2tg`: demo, train, eval, finish, render, view, export, convert, compress, info, sfm,
+"""The command line `a2tg`: demo, train, eval, finish, render, mesh, view, export, convert, compress, info, sfm,
 doctor."""
 
 import dataclasses
@@ -18,6 +18,7 @@ from a2tg_jax.cli.arguments import defaulting_to, parse, with_flags
 from a2tg_jax.cli.convert import Convert
 from a2tg_jax.cli.doctor import Doctor
 from a2tg_jax.cli.finish import Finish
+from a2tg_jax.cli.mesh import Mesh
 from a2tg_jax.cli.render import Render
 from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
@@ -49,6 +50,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg eval runs/scene                 evaluate a run again
   a2tg finish runs/scene --out runs/f  shrink and polish the trained model, in a new run folder
   a2tg render runs/scene               render frames and a video of a flight, or the test views
+  a2tg mesh runs/scene                 write the surface as triangles: GLB, PLY or OBJ
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.ply, *.spz, ...
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
   a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
@@ -137,10 +139,10 @@ class Info:
         print(json_text(run_facts(run)) if self.json else describe_run(run))
 
 
-Command = Demo | Train | Eval | Finish | Render | View | Export | Convert | Compress | Info | Sfm
+Command = Demo | Train | Eval | Finish | Render | Mesh | View | Export | Convert | Compress | Info | Sfm
 COMMANDS: dict[str, type] = {
-    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "view": View, "export": Export,
-    "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm, "doctor": Doctor,
+    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "mesh": Mesh, "view": View,
+    "export": Export, "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm, "doctor": Doctor,
 }  # fmt: skip
 
 

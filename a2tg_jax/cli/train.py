@@ -104,7 +104,7 @@ class Train:
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
     preset: Annotated[str | None, defaulting_to(DEFAULT_PRESET, "NAME")] = None
     """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
-    (the conventions of the authors' program)."""
+    (the conventions of the authors' program), gaussians-2d also has surfaces (for a2tg mesh)."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8

@@ -138,6 +138,23 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
     return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
 
 
+def exact_points(scene: Scene) -> np.ndarray:
+    """Return the points [P, 3] on the exact surfaces that the pixels of the training views see, in the original world.
+
+    Args:
+      scene: a scene that `synthetic_scene` made.
+    """
+    shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]
+    inverse, found = scene.transform.inverse(), []
+    for camera in (view.camera for view in scene.train):
+        viewmat = inverse.apply_to_viewmat(np.asarray(camera.viewmat, np.float64))
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        directions = _directions(viewmat, np.asarray(camera.K, np.float64), x, y)
+        t, _ = nearest_hits(shapes, _center(viewmat), directions)
+        found.append((_center(viewmat) + t * directions).T[np.isfinite(t)])
+    return np.concatenate(found)
+
+
 def _center(viewmat: np.ndarray) -> np.ndarray:
     """Return [3, 1] float32 position of a camera."""
     center: np.ndarray = (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)

@@ -15,8 +15,11 @@ from a2tg_jax.systems.stage1 import (
     continued,
     growing_stage,
 )
-from a2tg_jax.training.options import Ranges, System
+from a2tg_jax.training.options import LossConfig, Ranges, System
 from a2tg_jax.training.stage import Stage
+
+SURFACES = LossConfig(normal_weight=0.2)
+"""Weights for meshes (docs/meshes.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,4 +46,5 @@ class Gaussians2d(System):
             "paper": cls(),
             "quick": cls(**QUICK, densify=DensityConfig(cap=QUICK_CAP)),
             "smoke": cls(**SMOKE, densify=DensityConfig(cap=SMOKE_CAP)),
+            "surfaces": cls(loss=SURFACES),
         }

@@ -128,7 +128,7 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
     """
     check_floats("depth", depth, (camera.height, camera.width))
     check_shape("is_valid", is_valid, depth.shape)
-    points = _back_project(depth, camera)
+    points = back_project(depth, camera)
     along_x = points[1:-1, 2:] - points[1:-1, :-2]
     along_y = points[2:, 1:-1] - points[:-2, 1:-1]
     is_defined = (
@@ -165,8 +165,8 @@ def _live_mean(values: Array, num_live: Array | int) -> Array:
     return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)
 
 
-def _back_project(depth: Array, camera: Camera) -> Array:
-    """World points [H, W, 3] of the pixel centres at the given depths."""
+def back_project(depth: Array, camera: Camera) -> Array:
+    """Return the world points [H, W, 3] of the pixel centres at depths [H, W] along the camera's z axis."""
     height, width = depth.shape
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T

@@ -175,7 +175,7 @@ class System:
             A2tg.preset("quick", stage1_iterations=10, texture={"cap": 8})
 
         Args:
-          name: "paper", "quick" or "smoke".
+          name: "paper", "quick", "smoke", or another that the system has.
           **options: other values of options; those of a group as a dictionary.
 
         Raises:

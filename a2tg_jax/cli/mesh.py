@@ -1,0 +1,62 @@
+"""The command `a2tg mesh`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from a2tg_jax.cli.arguments import LastModel, defaulting_to
+from a2tg_jax.events import from_options
+from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
+from a2tg_jax.results.output import check_output
+from a2tg_jax.results.viewing import open_source
+
+
+@dataclasses.dataclass(frozen=True)
+class Mesh:
+    """Write the surface of a trained scene as triangles, by fusion of rendered depths.
+
+    GLB, PLY or OBJ, in the original world of the photographs, which are read for a texture only. Surfaces are best if
+    the scene was trained with --system gaussians-2d --preset surfaces.
+
+    Examples:
+      a2tg mesh runs/fox
+      a2tg mesh runs/fox --out fox.ply --resolution 1024
+      a2tg mesh runs/fox --texture photographs
+      a2tg mesh runs/street --unbounded
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    """Run folder, or model with cameras (*.npz or *.a2tgz)."""
+    out: Annotated[Path | None, defaulting_to("RUN/mesh.glb, or NAME.glb beside the model", "FILE")] = None
+    """Output file, *.glb, *.ply or *.obj."""
+    resolution: Annotated[int | None, defaulting_to("512, unless --voxel is given", "N")] = None
+    """Voxels along the radius."""
+    voxel: Annotated[float | None, defaulting_to("radius / resolution", "LENGTH")] = None
+    """Side of a voxel in units of the original world."""
+    radius: Annotated[float | None, defaulting_to("twice the cameras' median distance from it", "LENGTH")] = None
+    """Radius around the point that the cameras look at, in units of the original world."""
+    unbounded: bool = False
+    """Go on beyond the radius, with voxels that grow with the distance."""
+    clusters: int = MeshOptions.clusters
+    """Largest number of connected parts to keep; smaller ones are floaters."""
+    faces: Annotated[int | None, defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N")] = None
+    """Largest number of faces. Needs pip install 'a2tg-jax[mesh]'."""
+    texture: TextureSource = "none"
+    """Fill a texture atlas from renders or photographs of the training views (GLB and OBJ). Needs the same."""
+    texture_size: int = MeshOptions.texture_size
+    """Side of the atlas in texels."""
+    max_memory: Annotated[str | None, defaulting_to("half of the free memory", "SIZE")] = None
+    """Memory budget of the voxels, such as 4GB."""
+    model: LastModel = None
+    """Name of a run's model, as a2tg info prints it."""
+
+    def run(self) -> None:
+        own = self.source / "mesh.glb" if self.source.is_dir() else self.source.with_suffix(".glb")
+        out = self.out or own
+        options = from_options(MeshOptions, self)
+        options.check(out)
+        source = open_source(self.source, self.model)
+        check_output(out)
+        print(write_mesh(source, out, options))

@@ -1,0 +1,80 @@
+"""Distances between surfaces: accuracy, completeness, Chamfer distance and F-score of point samples (host)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from a2tg_jax.mesh.triangles import Mesh
+
+
+class SurfaceDistance(NamedTuple):
+    """Distances of a surface from its reference, in units of their world."""
+
+    accuracy: float
+    """Mean distance of the surface's points from the reference."""
+    completeness: float
+    """Mean distance of the reference's points from the surface."""
+    precision: float
+    """Share of the surface's points that lie within the threshold of the reference."""
+    recall: float
+    """Share of the reference's points that lie within the threshold of the surface."""
+
+    @property
+    def chamfer(self) -> float:
+        """Mean of accuracy and completeness, as DTU's evaluation of splats reports it."""
+        return (self.accuracy + self.completeness) / 2
+
+    @property
+    def f_score(self) -> float:
+        """Harmonic mean of precision and recall; 0 if both are 0."""
+        total = self.precision + self.recall
+        return 2 * self.precision * self.recall / total if total else 0.0
+
+
+def surface_distance(
+    points: np.ndarray, reference: np.ndarray, *, threshold: float, most: float = np.inf
+) -> SurfaceDistance:
+    """Compare the points of a surface with those of its reference.
+
+    Args:
+      points: [P, 3] points on the surface, such as `sample_surface` gives.
+      reference: [R, 3] points on the true surface.
+      threshold: largest distance that counts as met, for precision, recall and F-score.
+      most: distances beyond it are left out of the means, as DTU's evaluation does with 20 mm.
+
+    Returns:
+      The distances; infinite means and shares of 0 if one of the two has no points.
+    """
+    if not len(points) or not len(reference):
+        return SurfaceDistance(np.inf, np.inf, 0.0, 0.0)
+    forth, _ = cKDTree(reference).query(points, workers=-1)
+    back, _ = cKDTree(points).query(reference, workers=-1)
+    accuracy, completeness = (
+        float(each[each < most].mean()) if (each < most).any() else np.inf for each in (forth, back)
+    )
+    return SurfaceDistance(accuracy, completeness, float((forth < threshold).mean()), float((back < threshold).mean()))
+
+
+def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
+    """Return random points [P, 3] on a mesh, evenly by area, one for each square of side `spacing`."""
+    areas = np.linalg.norm(mesh.face_normals, axis=1) / 2
+    num = int(np.ceil(areas.sum() / spacing**2)) if len(areas) else 0
+    if not num:
+        return np.zeros((0, 3))
+    rng = np.random.default_rng(seed)
+    ends = np.cumsum(areas)
+    chosen = np.searchsorted(ends, (np.arange(num) + rng.uniform(size=num)) * (ends[-1] / num))
+    a, b = np.sqrt(rng.uniform(size=num)), rng.uniform(size=num)
+    weights = np.stack([1 - a, a * (1 - b), a * b], -1)
+    points: np.ndarray = np.einsum("pk,pkc->pc", weights, mesh.corners[np.minimum(chosen, len(areas) - 1)])
+    return points
+
+
+def thinned(points: np.ndarray, spacing: float, seed: int = 0) -> np.ndarray:
+    """Return points [P, 3] such that no two lie in one cube of side `spacing`."""
+    order = np.random.default_rng(seed).permutation(len(points))
+    cubes = np.floor(points[order] / spacing).astype(np.int64)
+    _, first = np.unique(cubes, axis=0, return_index=True)
+    kept: np.ndarray = points[order[np.sort(first)]]
+    return kept

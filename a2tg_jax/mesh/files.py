@@ -1,0 +1,103 @@
+"""Files of meshes: PLY, OBJ and GLB (host)."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.mesh.gltf import glb_of
+from a2tg_jax.mesh.triangles import Mesh
+
+SUFFIXES = (".glb", ".ply", ".obj")
+
+
+def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
+    """Raise ValueError unless a path ends in a suffix of meshes."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{name} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}; got {path}")
+
+
+def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | None = None) -> list[Path]:
+    """Write a mesh as GLB, PLY or OBJ, by the suffix of the path.
+
+    GLB holds the texture or linear colours of vertices, unlit, as the photographs show them. PLY holds colours of
+    vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl beside it.
+
+    Args:
+      path: the file; an older one is replaced once the new one is whole.
+      mesh: a mesh.
+      transform: transform from the original world to that of the mesh, such as `model.origin.transform`; the mesh is
+        brought back to the original world. None writes it as it is.
+
+    Returns:
+      The files written, the given one first.
+
+    Raises:
+      ValueError: if the path has another suffix.
+    """
+    check_mesh_suffix(path)
+    path = Path(path)
+    mesh = mesh if transform is None else mesh.transform(transform.inverse())
+    suffix = path.suffix.lower()
+    if suffix == ".obj":
+        return _save_obj(path, mesh)
+    content = glb_of(mesh) if suffix == ".glb" else _ply_of(mesh)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+    return [path]
+
+
+def _ply_of(mesh: Mesh) -> bytes:
+    """Return a PLY file, binary, little-endian."""
+    kind = "<f8" if needs_doubles(mesh.vertices) else "<f4"
+    columns: list[tuple[str, str, np.ndarray]] = [(n, kind, c) for n, c in zip("xyz", mesh.vertices.T, strict=True)]
+    if mesh.colors is not None:
+        columns += [(n, "u1", c) for n, c in zip(("red", "green", "blue"), mesh.colors.T, strict=True)]
+    rows = np.empty(mesh.num_vertices, [(name, dtype) for name, dtype, _ in columns])
+    for name, _, values in columns:
+        rows[name] = values
+    faces = np.empty(mesh.num_faces, [("number", "u1"), ("corners", "<i4", 3)])
+    faces["number"], faces["corners"] = 3, mesh.faces
+    words = {"<f4": "float", "<f8": "double", "u1": "uchar"}
+    header = [
+        "ply", "format binary_little_endian 1.0", f"element vertex {mesh.num_vertices}",
+        *(f"property {words[dtype]} {name}" for name, dtype, _ in columns),
+        f"element face {mesh.num_faces}", "property list uchar int vertex_indices", "end_header", "",
+    ]  # fmt: skip
+    return "\n".join(header).encode() + rows.tobytes() + faces.tobytes()
+
+
+def needs_doubles(vertices: np.ndarray) -> bool:
+    """Return whether float32 would round positions by more than 1e-5 of their extent, as far from the origin."""
+    if not len(vertices):
+        return False
+    extent = np.ptp(vertices, axis=0).max()
+    return bool(np.abs(vertices).max() * np.finfo(np.float32).eps > 1e-5 * extent)
+
+
+def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
+    """Write an OBJ file, with a material and a picture if there is a texture."""
+    lines, written = ["# triangles"], [path]
+    if mesh.texture is not None:
+        material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
+        lines += [f"mtllib {material.name}", "usemtl texture"]
+        with replacing(picture) as temporary:
+            Image.fromarray(mesh.texture).save(temporary, "PNG")
+        with replacing(material) as temporary:
+            temporary.write_text(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n")
+        written += [material, picture]
+    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(lines) + "\n")
+        rows = mesh.vertices
+        if mesh.colors is not None and mesh.texture is None:
+            rows = np.hstack([rows, mesh.colors / 255])
+        np.savetxt(file, rows, "v" + " %.9g" * 3 + " %.4g" * (rows.shape[1] - 3))
+        if mesh.uv is not None:
+            np.savetxt(file, mesh.uv, "vt %.6f %.6f")
+            np.savetxt(file, np.repeat(mesh.faces + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
+        else:
+            np.savetxt(file, mesh.faces + 1, "f %d %d %d")
+    return written

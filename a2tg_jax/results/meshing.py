@@ -1,0 +1,161 @@
+"""A mesh of a run or a model, written as a file."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.display import counted, in_bytes
+from a2tg_jax.data import view_image
+from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.mesh.atlas import check_texture
+from a2tg_jax.mesh.blocks import GridFullError
+from a2tg_jax.mesh.extract import MOST_CLUSTERS, MeshResult, NoSurfaceError, extract_mesh, training_cameras
+from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
+from a2tg_jax.mesh.simplify import check_simplifying, simplify_mesh
+from a2tg_jax.mesh.texture import Picture, texture_mesh
+from a2tg_jax.mesh.triangles import Mesh
+from a2tg_jax.renderer import Renderer
+from a2tg_jax.results.viewing import Source
+
+GRID_SHARE = 0.5
+"""Share of the free memory that voxels may take by default."""
+TEXTURED_FACES = 100_000
+"""Default number of faces of a mesh with a texture."""
+ADVICE = {
+    GridFullError: "lower --resolution or --radius, or raise --max-memory",
+    NoSurfaceError: "give a larger --radius, or --unbounded",
+}
+"""Advice of the command line by error."""
+TextureSource = Literal["none", "renders", "photographs"]
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshOptions:
+    """Options of a mesh; lengths are in units of the original world."""
+
+    resolution: int | None = None
+    """Voxels along the radius; None is that of `extract_mesh`."""
+    voxel: float | None = None
+    """Side of a voxel, in place of the resolution."""
+    radius: float | None = None
+    """Radius of the space; None is that of `extract_mesh`."""
+    unbounded: bool = False
+    """Whether the space goes on beyond the radius."""
+    clusters: int = MOST_CLUSTERS
+    """Largest number of connected parts."""
+    faces: int | None = None
+    """Largest number of faces; None is no limit, or `TEXTURED_FACES` with a texture."""
+    texture: TextureSource = "none"
+    """Pictures that fill a texture atlas."""
+    texture_size: int = 2048
+    """Side of the atlas in texels."""
+    max_memory: str | float | None = None
+    """Memory budget of the voxels; None is half of the free memory."""
+
+    @property
+    def most_faces(self) -> int | None:
+        """Largest number of faces, None without a limit."""
+        return TEXTURED_FACES if self.faces is None and self.texture != "none" else self.faces
+
+    def check(self, out: Path) -> None:
+        """Raise ValueError before anything is computed if an option is invalid or a library is missing."""
+        check_mesh_suffix(out, "--out")
+        megabytes_of(self.max_memory, "max_memory")
+        if self.texture != "none":
+            if out.suffix.lower() == ".ply":
+                raise ValueError("a PLY file holds no texture: choose --out NAME.glb or NAME.obj, or --texture none")
+            check_texture(self.texture_size)
+        if self.most_faces is not None:
+            check_simplifying(self.most_faces)
+
+
+def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
+    """Extract the mesh of a model, write it in the original world, and return a summary.
+
+    Raises:
+      ValueError: if the model has no cameras or no surface, the photographs are missing, or the voxels need too much
+        memory.
+    """
+    start = time.perf_counter()
+    origin = source.model.origin
+    if origin is None:
+        raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
+    pictures = _pictures(source, options.texture)
+    result = _extracted(source, options)
+    mesh = result.mesh if options.most_faces is None else simplify_mesh(result.mesh, options.most_faces)
+    if options.texture != "none":
+        print(f"unwrapping {counted(mesh.num_faces, 'face')}", flush=True)
+        mesh = texture_mesh(mesh, pictures, size=options.texture_size)
+    files = save_mesh(out, mesh, origin.transform)
+    return _summary(result, mesh, origin.transform.scale, files, time.perf_counter() - start)
+
+
+def _pictures(source: Source, kind: TextureSource) -> Iterator[Picture]:
+    """Return an iterator over the pictures of the training views. Photographs are looked for at once.
+
+    Raises:
+      ValueError: if photographs are wanted and missing.
+    """
+    origin = source.model.origin
+    if kind != "photographs" or origin is None:
+        return _renders(source)
+    scene = source.load_scene()
+    if scene is None:
+        raise ValueError(
+            f"the photographs of {source.title} are missing; choose --texture renders, or give the run folder while "
+            "its scene is in place"
+        )
+    cameras = dict(zip(origin.names, origin.cameras, strict=True))
+    views = [view for view in scene.train if view.name in cameras]
+    background = source.model.background
+    return (
+        (cameras[view.name], view_image(view, background), None if view.mask is None else view.mask.read())
+        for view in tqdm(views, desc="texture", unit="view")
+    )
+
+
+def _renders(source: Source) -> Iterator[Picture]:
+    cameras = training_cameras(source.model)
+    renderer = Renderer(source.model, cameras=cameras, settings=source.settings, has_geometry=False)
+    for camera in tqdm(cameras, desc="texture", unit="view"):
+        yield camera, np.asarray(renderer(camera).color), None
+
+
+def _extracted(source: Source, options: MeshOptions) -> MeshResult:
+    scale = 1.0 if source.model.origin is None else source.model.origin.transform.scale
+    megabytes = megabytes_of(options.max_memory, "max_memory")
+    try:
+        return extract_mesh(
+            source.model,
+            resolution=options.resolution,
+            voxel=None if options.voxel is None else options.voxel * scale,
+            radius=None if options.radius is None else options.radius * scale,
+            unbounded=options.unbounded,
+            most_clusters=options.clusters,
+            max_bytes=int(GRID_SHARE * memory_limit()) if megabytes is None else bytes_of(megabytes),
+            settings=source.settings,
+            progress=True,
+        )
+    except (GridFullError, NoSurfaceError) as error:
+        raise ValueError(f"{str(error).partition(': ')[0]}: {ADVICE[type(error)]}") from None
+
+
+def _summary(result: MeshResult, mesh: Mesh, scale: float, files: list[Path], seconds: float) -> str:
+    """Return what was made, in lines."""
+    size = in_bytes(sum(file.stat().st_size for file in files))
+    texture = "" if mesh.texture is None else f", a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]}"
+    return "\n".join(
+        [
+            f"fused {counted(result.num_views, 'view')} at voxels of {result.voxel / scale:.3g}, within "
+            f"{result.radius / scale:.3g} of the centre ({in_bytes(result.num_bytes)} of voxels)",
+            f"left out {counted(result.num_dropped, 'small part')}",
+            f"mesh: {mesh.num_vertices:,} vertices, {mesh.num_faces:,} faces{texture}, {size}, {seconds:.0f} s",
+            f"file: {', '.join(map(str, files))}",
+        ]
+    )

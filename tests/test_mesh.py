@@ -1,0 +1,392 @@
+"""Meshes: fusion of exact depths, marching cubes over bricks, cleaning, files, distances, and the command."""
+
+import json
+import struct
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import surface_quality
+
+import a2tg_jax as a2tg
+from a2tg_jax.data.synthetic import exact_points
+from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
+from a2tg_jax.mesh.depth_maps import DepthMap
+from a2tg_jax.mesh.distance import thinned
+from a2tg_jax.mesh.fusion import fuse
+from a2tg_jax.mesh.marching import surface_of
+from a2tg_jax.mesh.raster import draw_view
+from a2tg_jax.mesh.space import Space, common_sphere
+from a2tg_jax.mesh.triangles import largest_clusters
+
+SIDE = 48
+RADIUS = 0.5
+AROUND = np.array([direction for direction in np.ndindex(3, 3, 3) if direction != (1, 1, 1)]) - 1
+"""Directions from the middle of a cube to its faces, edges and corners."""
+
+
+def camera_at(center):
+    """A camera that looks at 0."""
+    up = (0, 0, 1) if abs(center[2]) < np.hypot(*center[:2]) else (0, 1, 0)
+    return a2tg.look_at(center, (0, 0, 0), up=up, width=SIDE, height=SIDE, fov=70)
+
+
+def rays_of(camera):
+    """Origin [3] and directions [H, W, 3] of unit depth."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(np.asarray(camera.K, np.float64)).T
+    return np.asarray(camera.center, np.float64), rays @ np.asarray(camera.viewmat, np.float64)[:3, :3]
+
+
+def sphere_depths(camera, radius=RADIUS):
+    """Exact depths of a sphere around 0, coloured by its positions."""
+    center, rays = rays_of(camera)
+    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - radius**2
+    root = b * b - a * c
+    depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    color = np.clip(0.5 + (center + rays * depth[..., None]), 0, 1)
+    slant = np.abs(np.sum(rays * (center + rays * depth[..., None]), axis=-1)) / radius
+    facing = np.maximum(slant / np.linalg.norm(rays, axis=-1), 0.1)
+    arrays = (depth, np.zeros_like(depth), np.clip(slant, 0.1, 1), facing, color)
+    return DepthMap(camera, *(jnp.asarray(each, jnp.float32) for each in arrays))
+
+
+def fused_sphere(space, distance=1.2, radius=RADIUS, directions=AROUND):
+    grid = BlockGrid(200_000_000)
+    for direction in directions:
+        fuse(grid, sphere_depths(camera_at(distance * direction / np.linalg.norm(direction)), radius), space)
+    return surface_of(grid, space)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    """The sphere, across the corner of eight bricks."""
+    return fused_sphere(Space.of(np.array([0.01, 0.02, 0.03]), 1.0, 1 / 60, False))
+
+
+def edges_of(mesh):
+    pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    return np.unique(pairs, axis=0, return_counts=True)
+
+
+def test_a_sphere_is_fused_from_exact_depths(sphere):
+    error = np.linalg.norm(sphere.vertices, axis=1) - RADIUS
+    assert np.abs(error).mean() < 0.1 / 60 and np.abs(error).max() < 1 / 60
+    assert sphere.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.02)
+    centers = sphere.corners.mean(axis=1)
+    assert (np.sum(sphere.face_normals * centers, axis=1) > 0).mean() > 0.999
+    np.testing.assert_allclose(sphere.colors / 255, np.clip(0.5 + sphere.vertices, 0, 1), atol=0.05)
+
+
+def test_bricks_are_welded_without_cracks(sphere):
+    _, counts = edges_of(sphere)
+    assert (counts == 2).all()
+
+
+def test_an_unbounded_space_is_even_within_the_radius_and_grows_beyond():
+    space = Space.of(np.zeros(3), 1.0, 0.1, True)
+    points = jnp.asarray([[0.3, 0, 0], [0, 3.0, 0], [0, 0, 200.0]], jnp.float32)
+    np.testing.assert_allclose(space.positions(space.indices(points)), points, rtol=1e-4)
+    np.testing.assert_allclose(space.scale(points), [1, 3, 200], rtol=1e-5)
+    np.testing.assert_allclose(jnp.linalg.norm(space.indices(points), axis=-1)[0], 3.0, rtol=1e-5)
+    assert list(np.asarray(space.contains(2e3 * points))) == [True, False, False]
+
+
+def test_far_surfaces_are_meshed_in_an_unbounded_space_only():
+    far = {"distance": 60.0, "radius": 20.0, "directions": np.eye(3)}
+    found = fused_sphere(Space.of(np.zeros(3), 1.0, 0.1, True), **far)
+    assert np.median(np.abs(np.linalg.norm(found.vertices, axis=1) - 20)) < 0.2
+    assert not fused_sphere(Space.of(np.zeros(3), 1.0, 0.1, False), **far).num_faces
+
+
+def test_blocks_are_named_and_found():
+    blocks = np.array([[0, 0, 0], [-1, 5, 7], [0, 0, 0], [-(1 << 21), 0, 0]])
+    different = unique_blocks(blocks)
+    assert sorted(map(tuple, different.tolist())) == [(-1, 5, 7), (0, 0, 0)]
+    grid = BlockGrid(10**6)
+    assert sorted(grid.allocate(different)) == [0, 1] == sorted(grid.allocate(different))
+    assert grid.find(np.array([[9, 9, 9]]))[0] == -1 and grid.num == 2
+
+
+def test_small_parts_are_dropped_and_counted(sphere):
+    small = a2tg.Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32))
+    both = a2tg.Mesh(
+        np.concatenate([sphere.vertices, small.vertices]),
+        np.concatenate([sphere.faces, small.faces + sphere.num_vertices]),
+    )
+    kept, dropped = largest_clusters(both, 50, 50)
+    assert dropped == 1 and kept.num_faces == sphere.num_faces and kept.num_vertices == sphere.num_vertices
+    kept, dropped = largest_clusters(both, 1, 0)
+    assert dropped == 1 and kept.num_faces == sphere.num_faces
+
+
+def test_a_drawn_mesh_has_the_depths_that_it_was_fused_from(sphere):
+    camera = camera_at(np.array([0.9, -0.6, 0.4]))
+    drawn, exact = draw_view(sphere, camera), np.asarray(sphere_depths(camera).depth)
+    both = (drawn.face >= 0) & (exact > 0)
+    assert both.sum() > 0.98 * (exact > 0).sum() > 300
+    assert np.abs(drawn.depth - exact)[both].mean() < 0.1 / 60
+    np.testing.assert_allclose(drawn.weights[both].sum(axis=-1), 1, rtol=1e-5)
+
+
+# Distances
+
+
+def test_distances_of_two_planes():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    lower, upper = a2tg.Mesh(square, faces), a2tg.Mesh(square + np.array([0, 0, 0.1]), faces)
+    points = [thinned(a2tg.sample_surface(mesh, 0.01), 0.005) for mesh in (lower, upper)]
+    found = a2tg.surface_distance(*points, threshold=0.15)
+    assert found.accuracy == pytest.approx(0.1, rel=0.01) and found.completeness == pytest.approx(0.1, rel=0.01)
+    assert found.chamfer == pytest.approx(0.1, rel=0.01) and found.f_score == 1
+    assert a2tg.surface_distance(*points, threshold=0.05).f_score == 0
+    half = points[0][points[0][:, 0] < 0.5]
+    found = a2tg.surface_distance(half, points[0], threshold=0.01)
+    assert found.precision == 1 and found.recall == pytest.approx(0.51, abs=0.02)
+    assert a2tg.surface_distance(half, points[0], threshold=0.01, most=0.02).completeness < 0.001 < found.completeness
+    assert a2tg.surface_distance(np.zeros((0, 3)), half, threshold=1.0).chamfer == np.inf
+
+
+# Files
+
+
+def glb_parts(content):
+    """JSON and binary of a GLB file."""
+    length = struct.unpack("<I", content[12:16])[0]
+    return json.loads(content[20 : 20 + length]), content[28 + length :]
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".ply", ".obj"])
+def test_files_are_read_back_by_another_library(sphere, tmp_path, suffix):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh reads the files back: pip install trimesh")
+    similarity = a2tg.Similarity(2.0, np.eye(3)[[1, 2, 0]], np.array([1.0, 2, 3]))
+    (path,) = a2tg.save_mesh(tmp_path / f"mesh{suffix}", sphere, similarity)
+    read = trimesh.load(path, force="mesh", process=False)
+    np.testing.assert_array_equal(read.faces, sphere.faces)
+    np.testing.assert_allclose(read.vertices, similarity.inverse().apply(sphere.vertices), atol=1e-5)
+    if suffix == ".ply":
+        np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], sphere.colors)
+
+
+def test_colors_of_glb_are_linear_and_far_positions_exact(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.125]]) + np.array([4e6, -5e6, 10])
+    mesh = a2tg.Mesh(corners, np.array([[0, 1, 2]], np.int32), np.array([[0, 188, 255]] * 3, np.uint8))
+    root, data = glb_parts(a2tg.save_mesh(tmp_path / "far.glb", mesh)[0].read_bytes())
+    at = root["bufferViews"][0]["byteOffset"]
+    positions = np.frombuffer(data, "<f4", 9, at).reshape(3, 3) + np.array(root["nodes"][0]["translation"])
+    np.testing.assert_allclose(positions, corners, rtol=0, atol=1e-6)
+    colors = np.frombuffer(data, "<u2", 4, root["bufferViews"][1]["byteOffset"])
+    assert list(colors) == [0, round(65535 * ((188 / 255 + 0.055) / 1.055) ** 2.4), 65535, 65535]
+    assert b"property double x" in a2tg.save_mesh(tmp_path / "far.ply", mesh)[0].read_bytes()
+
+
+# From a model
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Opaque splats on the sphere, seen from around."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(1500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    axis = np.cross((0, 0, 1), normals)
+    half = np.stack([1 + normals[:, 2], *axis.T], -1)
+    gaussians = a2tg.init_from_points(RADIUS * normals, 0.5 + 0.4 * normals, sh_degree=0)
+    gaussians = gaussians.__class__(
+        gaussians.means,
+        jnp.asarray(half / np.linalg.norm(half, axis=1, keepdims=True), jnp.float32),
+        jnp.full((1500, 2), np.log(0.03), jnp.float32),
+        jnp.full((1500,), 3.0, jnp.float32),
+        gaussians.sh,
+    )
+    cameras = [camera_at(1.2 * each / np.linalg.norm(each)) for each in AROUND if (each == 0).sum() != 1]
+    similarity = a2tg.Similarity(0.1, np.eye(3), np.zeros(3))
+    return a2tg.Model(gaussians, origin=a2tg.Origin.of_cameras(cameras, transform=similarity))
+
+
+def test_a_model_becomes_a_mesh(model):
+    result = a2tg.extract_mesh(model, resolution=80)
+    assert result.num_views == 14 and result.radius == pytest.approx(2.4, rel=1e-3)
+    assert np.median(np.abs(np.linalg.norm(result.mesh.vertices, axis=1) - RADIUS)) < result.voxel
+
+
+def test_one_camera_looks_at_what_it_sees(model):
+    result = a2tg.extract_mesh(model, model.origin.cameras[:1], resolution=60)
+    assert 0.3 < np.linalg.norm(result.center) < 0.6
+    assert result.mesh.num_faces > 100
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_bytes": 200_000}, "takes more than 0.0002 GB after . of 14 views: lower the resolution"),
+        ({"radius": 0.05, "center": np.array([3.0, 0, 0])}, "there is no surface within 0.05"),
+        ({"resolution": 0}, "resolution must lie in"),
+        ({"resolution": 10, "voxel": 0.1}, "resolution and voxel both"),
+        ({"resolution": None, "voxel": np.nan}, "voxel must be positive"),
+        ({"least_faces": 10**6}, "parts had fewer than 1000000 faces"),
+        ({"cameras": []}, "there are no cameras"),
+    ],
+)
+def test_mistakes_are_told(model, options, message):
+    with pytest.raises(ValueError, match=message):
+        a2tg.extract_mesh(model, **{"resolution": 20, **options})
+
+
+def test_an_empty_model_is_refused(model):
+    with pytest.raises(ValueError, match="has no Gaussians"):
+        a2tg.extract_mesh(model[:0])
+
+
+def test_far_splats_do_not_matter_within_the_radius(model):
+    means = model.gaussians.means.at[:50].multiply(1e6)
+    far = a2tg.Model(model.gaussians.__class__(means, *[getattr(model.gaussians, name) for name in (
+        "quats", "log_scales", "logit_opacities", "sh")]), origin=model.origin)  # fmt: skip
+    assert np.abs(a2tg.extract_mesh(far, resolution=40).mesh.vertices).max() < 2.4
+
+
+def test_the_common_sphere_of_cameras_around(model):
+    center, radius = common_sphere(model.origin.viewmats)
+    np.testing.assert_allclose(center, 0, atol=1e-6)
+    assert radius == pytest.approx(2.4, rel=1e-3)
+
+
+# The command
+
+
+def test_the_command_writes_the_original_world(model, tmp_path, capsys):
+    from a2tg_jax.cli import main as cli
+
+    a2tg.save_model(tmp_path / "model.npz", model)
+    arguments = ["mesh", str(tmp_path / "model.npz"), "--voxel", "0.4", "--out", str(tmp_path / "made.ply")]
+    assert cli.main(arguments) == 0
+    told = capsys.readouterr().out
+    assert "fused 14 views at voxels of 0.4, within 24 of the centre" in told and "faces" in told
+    content = (tmp_path / "made.ply").read_bytes()
+    start, num = content.index(b"end_header\n") + 11, int(content.split(b"vertex ")[1].split()[0])
+    kind = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
+    positions = np.frombuffer(content, kind, num, start)["position"]
+    assert np.median(np.linalg.norm(positions, axis=1)) == pytest.approx(RADIUS / 0.1, abs=0.4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("mesh nowhere", "nowhere: no such file or folder"),
+        ("mesh bare.npz", "bare has no cameras to fuse depths from"),
+        ("mesh bare.npz --out mesh.stl", "--out must end in .glb, .ply or .obj"),
+        ("mesh bare.npz --max-memory much", "--max-memory must be a number of MB"),
+        ("mesh cameras.npz --resolution 0", "--resolution must lie in"),
+        ("mesh cameras.npz --radius 0.1", "give a larger --radius, or --unbounded"),
+        ("mesh cameras.npz --resolution 2000 --max-memory 1MB", "lower --resolution"),
+    ],
+)
+def test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, arguments, message):
+    from a2tg_jax.cli import main as cli
+
+    monkeypatch.chdir(tmp_path)
+    a2tg.save_model("cameras.npz", model)
+    a2tg.save_model("bare.npz", a2tg.Model(model.gaussians))
+    assert cli.main(arguments.split()) == 2
+    error = capsys.readouterr().err
+    assert message in error.splitlines()[-1]
+
+
+# Textures
+
+
+def painted(camera):
+    """The sphere as a camera sees it, coloured by position."""
+    return camera, np.asarray(sphere_depths(camera).color, np.float32), None
+
+
+@pytest.fixture(scope="module")
+def textured(sphere):
+    pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
+    grey = a2tg.Mesh(sphere.vertices, sphere.faces, np.full((sphere.num_vertices, 3), 9, np.uint8))
+    simple = a2tg.simplify_mesh(grey, 800)
+    assert 700 < simple.num_faces <= 800
+    views = [painted(camera_at(1.2 * each / np.linalg.norm(each))) for each in AROUND]
+    return a2tg.texture_mesh(simple, views, size=128)
+
+
+def test_texels_have_the_colors_that_the_views_see(textured):
+    middle = textured.corners.mean(axis=1)
+    places = textured.uv[textured.faces].mean(axis=1)
+    rows, columns = ((1 - places[:, 1]) * 128).astype(int), (places[:, 0] * 128).astype(int)
+    error = np.abs(textured.texture[rows, columns] / 255 - np.clip(0.5 + middle, 0, 1))
+    assert np.median(error) < 0.02 and np.quantile(error, 0.95) < 0.1
+
+
+def test_a_texture_is_filled_beyond_its_charts_and_keeps_colors_of_unseen_texels(textured):
+    assert textured.texture.shape == (128, 128, 3) and textured.texture.any(axis=-1).all()
+    assert textured.uv.min() >= 0 and textured.uv.max() <= 1
+    unseen = a2tg.texture_mesh(a2tg.Mesh(textured.vertices, textured.faces, textured.colors), [], size=64)
+    assert (unseen.texture == 9).all()
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh reads the files back: pip install trimesh")
+    files = a2tg.save_mesh(tmp_path / f"mesh{suffix}", textured)
+    read = trimesh.load(files[0], force="mesh", process=False)
+    material = read.visual.material
+    picture = material.baseColorTexture if suffix == ".glb" else material.image
+    np.testing.assert_allclose(read.visual.uv, textured.uv, atol=1e-5)
+    assert np.abs(np.asarray(picture.convert("RGB"), float) - textured.texture).mean() < (
+        2 if suffix == ".glb" else 0.01
+    )
+    assert [path.suffix for path in files] == ([".glb"] if suffix == ".glb" else [".obj", ".mtl", ".png"])
+
+
+def test_missing_libraries_are_told(sphere, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    with pytest.raises(ValueError, match=r"xatlas, which is not installed: pip install 'a2tg-jax\[mesh\]'"):
+        a2tg.texture_mesh(sphere, [], size=64)
+    with pytest.raises(ValueError, match=r"fast-simplification, which is not installed"):
+        a2tg.simplify_mesh(sphere, 10)
+
+
+# Evaluation
+
+
+def test_exact_points_lie_where_the_pictures_say():
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30, test_every=0)
+    points = exact_points(scene)
+    assert len(points) == 3 * 24 * 16
+    known = scene.transform.inverse().apply(scene.points)
+    assert a2tg.surface_distance(known, points, threshold=0.4).precision == 1
+
+
+def test_dtu_counts_what_was_observed_above_the_table():
+    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [5.0]), -1).reshape(-1, 3)
+    mask = np.ones((20, 20, 20), bool)
+    mask[10:] = False
+    plane, bounds = np.array([0, 1, 0, -9.5]), np.array([[0, 0, 0], [19, 19, 19]])
+    found = surface_quality.dtu_distance(grid + np.array([0, 0, 0.5]), grid, mask, bounds, 1.0, plane)
+    assert found.accuracy == found.completeness == found.chamfer == 0.5 and found.f_score == 1
+    wrong = grid + np.where(grid[:, :1] >= 10, 7.0, 0.0) * np.array([0, 0, 1])
+    found = surface_quality.dtu_distance(wrong, grid, mask, bounds, 1.0, plane)
+    assert found.accuracy == 0 and found.completeness > 1
+
+
+def test_the_preset_for_surfaces_has_their_losses():
+    terms = a2tg.Gaussians2d.preset("surfaces").stages()[0].losses
+    assert [term.function.__name__ for term in terms[1:]] == ["normals"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--texture renders --out mesh.ply", "a PLY file holds no texture"),
+        ("--texture renders --texture-size 5", "--texture-size must lie in"),
+        ("--texture photographs", "the photographs of cameras are missing"),
+        ("--faces 0", "--faces must be at least 1"),
+    ],
+)
+def test_mistakes_of_textures(model, tmp_path, monkeypatch, capsys, arguments, message):
+    pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
+    test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, f"mesh cameras.npz {arguments}", message)
