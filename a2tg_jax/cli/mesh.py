@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.events import from_options
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.viewing import open_source
 
 
@@ -51,6 +51,8 @@ class Mesh:
     """Memory budget of the voxels, such as 4GB."""
     model: LastModel = None
     """Name of a run's model, as a2tg info prints it."""
+    overwrite: bool = False
+    """Replace the file that --out names."""
 
     def run(self) -> None:
         own = self.source / "mesh.glb" if self.source.is_dir() else self.source.with_suffix(".glb")
@@ -59,4 +61,6 @@ class Mesh:
         options.check(out)
         source = open_source(self.source, self.model)
         check_output(out)
+        if self.out is not None:
+            check_new(out, "--out", overwrite=self.overwrite)
         print(write_mesh(source, out, options))
