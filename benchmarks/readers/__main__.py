@@ -1,10 +1,12 @@
 """Files of `a2tg convert`, read by other programs and compared with the model.
 
-    npm install --prefix OTHERS @playcanvas/splat-transform playcanvas @sparkjsdev/spark three
+    npm install --prefix OTHERS @playcanvas/splat-transform playcanvas @sparkjsdev/spark three \
+        babylonjs babylonjs-loaders
     python -m benchmarks.readers scene.npz --others OTHERS --chromium chromium
 
 Writes every format, reads each by splat-transform and prints how far 99 % of the numbers are off; draws the view of a
-camera by PlayCanvas and by Spark in a headless Chromium and prints the PSNR of their pictures beside ours.
+camera by PlayCanvas, by Spark and, from glTF, by Babylon.js in a headless Chromium and prints the PSNR of their
+pictures beside ours.
 """
 
 import argparse
@@ -17,8 +19,9 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from a2tg_jax import Gaussians, Model, load_model, load_splats, save_splats
+from a2tg_jax import Gaussians, Origin, Similarity, load_model, load_splats, save_splats
 from a2tg_jax.finish.distilling import pictures
+from a2tg_jax.io.exchange import upright
 from benchmarks.readers.browser import Camera, draw
 
 SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".ksplat")
@@ -56,11 +59,9 @@ def psnr(image: np.ndarray, wanted: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((image / 255 - wanted) ** 2)))
 
 
-def original_camera(model: Model, index: int) -> Camera:
-    """Return a camera of a model in its original world, as browsers place it: y up, z backward."""
-    origin = model.origin
-    assert origin is not None
-    viewmat = origin.transform.inverse().apply_to_viewmat(origin.viewmats[index])
+def camera_in(world: Similarity, origin: Origin, index: int) -> Camera:
+    """Return a camera of a model in another world, as browsers place it: y up, z backward."""
+    viewmat = world.apply_to_viewmat(origin.viewmats[index])
     width, height = map(int, origin.sizes[index])
     return Camera(width, height, origin.Ks[index].tolist(), (np.linalg.inv(viewmat) @ np.diag([1, -1, -1, 1])).tolist())
 
@@ -87,8 +88,11 @@ def main() -> None:
     if chosen.chromium is None or model.origin is None:
         return
     (ours,) = pictures(model, [model.origin.cameras[chosen.camera]])
-    camera = original_camera(model, chosen.camera)
-    for page, suffixes in (("playcanvas", BY_PLAYCANVAS), ("spark", SUFFIXES)):
+    save_splats(out / "scene.glb", model)
+    original, standing = model.origin.transform.inverse(), upright(model.origin, "y")
+    drawn = [("playcanvas", BY_PLAYCANVAS, original), ("spark", SUFFIXES, original), ("babylon", (".glb",), standing)]
+    for page, suffixes, world in drawn:
+        camera = camera_in(world, model.origin, chosen.camera)
         for suffix in suffixes:
             image = draw(page, out / f"scene{suffix}", camera, chosen.others, chosen.chromium)
             Image.fromarray(image).save(out / f"{page}{suffix}.png")

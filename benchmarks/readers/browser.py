@@ -39,7 +39,7 @@ def draw(page: str, file: Path, camera: Camera, others: Path, chromium: str) -> 
     """Return the picture [H, W, 3] uint8 that a page draws of a file.
 
     Args:
-      page: "playcanvas" or "spark".
+      page: "playcanvas", "spark" or "babylon".
       file: the splats.
       camera: in the world of the file.
       others: folder with the node_modules of the programs.
