@@ -3,8 +3,8 @@
     python experiments/few_views.py --scenes SCENES --out OUT
 
 Of scenes with many training views 24 are kept, evenly spaced, and 12 to 23 of the others are scored. Scenes with fewer
-than 30 are cut into five folds: every fifth view is scored. Test views are not used. The preset is `quick`, the budget 0.6
-MB, the photographs are downscaled by 2.
+than 30 are cut into five folds: every fifth view is scored. Test views are not used. The preset is `quick`, the budget
+0.6 MB, the photographs are downscaled by 2.
 
 Each training is kept in OUT/few_views.json as soon as it is measured, so that a second call goes on. The table is
 OUT/few_views.md.
