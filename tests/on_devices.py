@@ -101,7 +101,9 @@ def psnr_of(result):
 
 
 def fit(own, count, **options):
-    return a2tg.fit(scene(), own, progress=False, session=Session(devices=jax.devices()[:count]), **options)
+    return a2tg.fit(
+        scene(), own, progress=False, session=Session(devices=jax.devices()[:count] if count > 1 else None), **options
+    )
 
 
 def training(folder):
@@ -125,7 +127,7 @@ def training(folder):
     try:
         fit(own, 3, resume=a2tg.load_checkpoint(path))
     except ValueError as error:
-        assert "152 rows, which 3 devices cannot share evenly: resume on 1 or 2" in str(error)
+        assert "152 rows, which 3 devices cannot share evenly: resume with --devices 1 or 2" in str(error)
     else:
         raise AssertionError("152 rows were spread over 3 devices")
 

@@ -14,6 +14,7 @@ from a2tg_jax import (
     A2tg,
     Gaussians2d,
     Model,
+    init_from_points,
     load_model,
     load_ply,
     load_splats,
@@ -31,6 +32,7 @@ from a2tg_jax.io.formats import FORMATS, format_of, lost_by
 from a2tg_jax.io.gaussforge_files import SUFFIXES
 from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.preflight import check_init
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 
 OTHERS = [".ply", *SUFFIXES]
@@ -180,3 +182,14 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
         dataclasses.replace(record, name="gaussians-2d", system=Gaussians2d()).check()
     command = ["train", "synthetic", "--out", str(tmp_path / "new"), "--init", str(tmp_path / "no.ply")]
     assert main(command) == 2 and "there is no file" in capsys.readouterr().err
+
+
+def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
+    save_model(tmp_path / "a.npz", textured())
+    with pytest.warns(UserWarning, match="leaves out what its splats show beside Gaussians"):
+        check_init(tmp_path / "a.npz", tmp_path / "run", A2tg(sh_degree=3))
+    save_ply(tmp_path / "a.ply", init_from_points(np.eye(3), np.eye(3), sh_degree=2))
+    with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):
+        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=1))
+    with pytest.raises(ValueError, match="3 Gaussians, 444 bytes at degree 2, which is more than the memory_budget"):
+        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=2, memory_budget="400B"))

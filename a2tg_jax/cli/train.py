@@ -166,7 +166,7 @@ class Train:
         with opened(self.out) as run:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
-            tell_forecast(scene, record.plan, most)
+            tell_forecast(scene, record.plan, most, session.num_devices)
             result = go_on(
                 run,
                 scene,
@@ -285,19 +285,19 @@ def tidy_session(devices: Sequence[jax.Device] | None = None) -> Session:
     return Session(after_compiling=tidy_memory, devices=devices)
 
 
-def devices_named(text: str) -> list[jax.Device]:
-    """Return the first N devices of this machine, or all.
+def devices_named(text: str) -> list[jax.Device] | None:
+    """Return the first N devices of this machine, or all; None for one.
 
     Raises:
       ValueError: if the text is neither "all" nor a number from 1 to that of the devices.
     """
     devices: list[jax.Device] = jax.local_devices()
     if text == "all":
-        return devices
+        return devices if len(devices) > 1 else None
     if not text.isdecimal() or not 1 <= int(text) <= len(devices):
         found = f"this machine has {counted(len(devices), f'{devices[0].platform.upper()} device')}"
         raise ValueError(f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: {found}")
-    return devices[: int(text)]
+    return devices[: int(text)] if int(text) > 1 else None
 
 
 def tell_result(result: RunResult, folder: Path) -> None:

@@ -194,13 +194,13 @@ def bytes_allowed(max_memory: float | str | None) -> int | None:
     return None if megabytes is None else bytes_of(megabytes)
 
 
-def allowed_memory(max_memory: int | None) -> int:
-    """Return the bytes a run may use: the limit asked for, or what the machine or its accelerator has available
-    (host)."""
+def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
+    """Return the bytes a run may use: the limit asked for, or what the machine or so many of its accelerators have
+    available (host)."""
     if max_memory is not None:
         return max_memory
     stats = jax.local_devices()[0].memory_stats() or {}
-    return stats.get("bytes_limit", 0) or memory_limit()
+    return num_devices * stats.get("bytes_limit", 0) or memory_limit()
 
 
 def room_for_photographs(max_memory: int | None) -> int | None:
@@ -208,13 +208,13 @@ def room_for_photographs(max_memory: int | None) -> int | None:
     return None if max_memory is None else int(SHARE_OF_MEMORY * max_memory)
 
 
-def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None) -> None:
-    """Print the forecast of a run.
+def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None, num_devices: int = 1) -> None:
+    """Print the forecast of a run, on so many devices together.
 
     Raises:
       ValueError: if that cannot fit, naming the options to change.
     """
-    found, limit = forecast_run(scene, plan), allowed_memory(max_memory)
+    found, limit = forecast_run(scene, plan), allowed_memory(max_memory, num_devices)
     found.check(limit)
     print(found.told(limit), flush=True)
 

@@ -6,9 +6,11 @@ import warnings
 from pathlib import Path
 
 from a2tg_jax.core.budget import bytes_per_gaussian
+from a2tg_jax.core.display import in_bytes
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.formats import format_of
+from a2tg_jax.io.formats import format_of, load_splats
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, RunFolder, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
@@ -23,7 +25,13 @@ STATE_SIZE = 3
 
 
 def check_new_run(
-    record: RunRecord, out: Path, *, overwrite: bool, lpips_weights: Path | None, max_memory: int | None = None
+    record: RunRecord,
+    out: Path,
+    *,
+    overwrite: bool,
+    lpips_weights: Path | None,
+    max_memory: int | None = None,
+    num_devices: int = 1,
 ) -> Scene:
     """Return the scene of a run that can be trained in a folder. What the run will need is printed.
 
@@ -36,27 +44,39 @@ def check_new_run(
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=overwrite)
     if record.init is not None:
-        check_init(Path(record.init), out)
+        check_init(Path(record.init), out, record.system)
     check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory))
     for system in record.systems.values():
         check_start(scene, system)
     check_room(record, scene, out)
     warn_of_small_budget(record.system)
-    tell_forecast(scene, record.plan, max_memory)
+    tell_forecast(scene, record.plan, max_memory, num_devices)
     quicker = quicker_text(scene, record)
     if quicker:
         print(quicker, flush=True)
     return scene
 
 
-def check_init(file: Path, out: Path) -> None:
-    """Raise ValueError unless a file of splats can take the place of the first stage of a run in a folder."""
+def check_init(file: Path, out: Path, system: System) -> None:
+    """Raise ValueError unless a file of splats can take the place of the first stage of a run in a folder. What the
+    stage cannot take of it is warned of."""
     if not is_regular(file):
         raise ValueError(f"init: there is no file {file}")
     format_of(file)
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
+    splats, degree = load_splats(file), system.initial_sh_degree
+    needed, budget = splats.num * bytes_per_gaussian(degree), system.budget_bytes
+    if budget is not None and needed > budget:
+        raise ValueError(
+            f"init: {file} holds {splats.num:,} Gaussians, {in_bytes(needed)} at degree {degree}, which is more than "
+            f"the memory_budget of {in_bytes(budget)}: raise it, or leave it out"
+        )
+    lost = [] if type(splats.appearance.base).__name__ == "Plain" else ["what its splats show beside Gaussians"]
+    lost += [f"its spherical harmonics above degree {degree}"] if splats.sh.shape[1] > NUM_BASES[degree] else []
+    if lost:
+        warnings.warn(f"--init {file} leaves out {' and '.join(lost)}", stacklevel=2)
 
 
 def warn_of_small_budget(system: System) -> None:

@@ -58,7 +58,7 @@ def train_run(
       progress: show a progress bar.
       is_stopped: asked between steps. Once it says True, there is a checkpoint and a KeyboardInterrupt.
       watch: called between steps with the stage under way (`training.loop.Watch`).
-      session: shapes that trainings of this process share; None: a new one.
+      session: what trainings of this process share, compiled shapes and devices; None: a new one.
       tensorboard: write the histories as files of TensorBoard too, at each checkpoint.
 
     Raises:

@@ -49,7 +49,7 @@ def begin_run(
       lpips_weights: a weights file for LPIPS; None leaves it out.
       max_memory: bytes that the process may take (`forecast.allowed_memory`).
       watched: who looks at the training of a scene meanwhile.
-      session: shapes that trainings of this process share; None: a new one.
+      session: what trainings of this process share, compiled shapes and devices; None: a new one.
       progress: show the progress of training.
       tensorboard: write files of TensorBoard.
 
@@ -57,7 +57,14 @@ def begin_run(
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
       Stopped: if the process is asked to end; its `advice` tells how to go on.
     """
-    scene = check_new_run(record, out, overwrite=overwrite, lpips_weights=lpips_weights, max_memory=max_memory)
+    scene = check_new_run(
+        record,
+        out,
+        overwrite=overwrite,
+        lpips_weights=lpips_weights,
+        max_memory=max_memory,
+        num_devices=1 if session is None else session.num_devices,
+    )
     run = RunFolder(out)
     with claimed(run):
         check_free(out, overwrite=overwrite)  # Another process may have been here meanwhile.

@@ -108,7 +108,7 @@ def fit(
       progress: show a progress bar.
       is_stopped: asked between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
-      session: shapes that trainings of this process share; None: a new one.
+      session: what trainings of this process share, compiled shapes and devices; None: a new one.
 
     Raises:
       Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to go on from.

@@ -386,7 +386,7 @@ class StageRun:
         model, rows = self.state.model, self.state.model.gaussians.num // exchange.num
         settings = RenderSettings(tile_size=self.system.tile_size, exchange=exchange)
         most = max(rows_of_view(model.gaussians, one, model.rule, settings, model.num_live) for one in cameras)
-        share = min(1.0, GROWTH_ROOM * most / max(1, min(model.num, rows)))
+        share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
         return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity)
 
     def _capacity(self, size: tuple[int, int], pairs: float) -> int:
@@ -418,7 +418,7 @@ def check_devices(resume: Checkpoint, num_devices: int) -> None:
     if rows % num_devices:
         fitting = [number for number in range(1, num_devices) if rows % number == 0]
         raise ValueError(
-            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: resume on "
+            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: resume with --devices "
             f"{' or '.join(map(str, fitting))}"
         )
 

@@ -22,12 +22,18 @@ class Session:
     def __init__(self, after_compiling: Callable[[], object] = _nothing, devices: Sequence[jax.Device] | None = None):
         """Args:
         after_compiling: called after a step was compiled, such as `host.memory.tidy_memory`.
-        devices: devices of this process that train one scene together, each with a share of the Gaussians and of the
-          pixels, such as `jax.devices()`; None: JAX's default device.
+        devices: two or more devices of this process that train one scene together, each with a share of the Gaussians
+          and of the pixels, such as `jax.devices()`; None: JAX's default device.
+
+        Raises:
+          ValueError: if there is one device or none.
         """
+        if devices is not None and len(devices) < 2:
+            raise ValueError(f"devices must be two or more; got {len(devices)}: for one say jax.default_device(device)")
         self.after_compiling = after_compiling
-        self.exchange = exchange_among(devices) if devices is not None and len(devices) > 1 else None
+        self.exchange = None if devices is None else exchange_among(devices)
         """Devices among which rows are spread; None: one."""
+        self.num_devices = 1 if self.exchange is None else self.exchange.num
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
         self.capacities: dict[Hashable, set[int]] = {}
