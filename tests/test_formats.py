@@ -192,4 +192,4 @@ def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):
         check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=1))
     with pytest.raises(ValueError, match="3 Gaussians, 444 bytes at degree 2, which is more than the memory_budget"):
-        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=2, memory_budget="400B"))
+        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0004))
