@@ -25,6 +25,7 @@ from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.tiles import TileGrid
 from a2tg_jax.render import rule_of
 from benchmarks.workload import random_scene
+from experiments.lab.markdown import table as markdown
 
 NUMS, DEVICES = (100_000, 1_000_000, 4_000_000), (1, 2, 4, 8, 16, 64)
 WIDTH, HEIGHT = 1600, 1060
@@ -75,14 +76,13 @@ def main() -> None:
 
 def table(found: Sequence[Mapping[str, float]]) -> str:
     """Return a row for each case."""
-    header = ["Gaussians", "devices", "state on a device", "rows received", "sent by all", "least"]
-    lines = [header, ["---"] * len(header)]
+    rows = []
     for row in found:
-        sizes = [f"{row[name] / 1e6:,.0f} MB" for name in ("state_bytes_per_device", "sent_bytes", "least_bytes")]
-        lines.append(
-            [f"{row['gaussians']:,}", f"{row['devices']}", sizes[0], f"{row['rows_received']:,.0f}", *sizes[1:]]
-        )
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        names = "state_bytes_per_device", "sent_bytes", "least_bytes"
+        state, sent, least = (f"{row[name] / 1e6:,.0f} MB" for name in names)
+        rows.append([f"{row['gaussians']:,}", f"{row['devices']}", state, f"{row['rows_received']:,.0f}", sent, least])
+    header = ["Gaussians", "devices", "state on a device", "rows received", "sent by all", "least"]
+    return markdown(header, rows)
 
 
 if __name__ == "__main__":

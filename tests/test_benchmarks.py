@@ -1,11 +1,15 @@
 """The benchmarks run, and bounds count what they say."""
 
 import dataclasses
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
+sys.path.append(str(Path(__file__).parents[1]))  # Last, so that the installed package comes first.
 
 from benchmarks import bounds, stages
 from benchmarks.tables import bounds as bounds_table

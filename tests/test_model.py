@@ -324,5 +324,5 @@ def test_reprs_are_short():
     assert repr(camera) == "Camera(viewmat=float32[4, 4], K=float32[3, 3], width=43, height=30)"
     assert "float32[2, 1, 1, 4]" in repr(model.params) and "int32[7]" in repr(model.layout)
     assert repr(model) == (
-        "Model(7 Gaussians, SH degree 3, Textured, 2.3 kB, Origin(3 cameras, 1 of them for testing))"
+        "Model(7 Gaussians, SH degree 3, Textured, 2.28 kB, Origin(3 cameras, 1 of them for testing))"
     )

@@ -61,9 +61,9 @@ LINES = {
     "Evaluation(3 views, PSNR 21.00 dB, SSIM 0.500, 42 frames/s)": lambda: dataclasses.replace(
         EVALUATION, lpips_network=None
     ),
-    "Model(5 Gaussians, SH degree 3, Plain, 1.2 kB)": small_model,
-    "FitResult(A2tg, 2 stages, 5 Gaussians, 1.2 kB, 25 s)": fit_result,
-    "StageResult('texture', 5 Gaussians, 1.2 kB, 12 s)": lambda: fit_result().stages[0],
+    "Model(5 Gaussians, SH degree 3, Plain, 1.16 kB)": small_model,
+    "FitResult(A2tg, 2 stages, 5 Gaussians, 1.16 kB, 25 s)": fit_result,
+    "StageResult('texture', 5 Gaussians, 1.16 kB, 12 s)": lambda: fit_result().stages[0],
     "History(2 rows to iteration 1,200 of stage 2, 21.25 dB)": some_history,
     "History(0 rows)": History.empty,
 }
