@@ -1,5 +1,6 @@
 """Formats of other programs: what is read back after writing, what each keeps, and the conversion of files."""
 
+import base64
 import dataclasses
 import json
 import zipfile
@@ -28,15 +29,17 @@ from a2tg_jax.appearance import Textured
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.formats import FORMATS, format_of, lost_by
+from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by
 from a2tg_jax.io.gaussforge_files import SUFFIXES
 from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.preflight import check_init
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
+from a2tg_jax.results.viewing import open_source
 
 OTHERS = [".ply", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"
+CUT = "colours of 1 Gaussian beyond the format's range (cut)"
 RNG = np.random.default_rng(0)
 
 
@@ -116,13 +119,55 @@ def test_a_missing_library_is_told_with_its_command(tmp_path, monkeypatch):
         save_splats(tmp_path / "a.spz", small_scene())
 
 
+def test_positions_beyond_a_format_are_refused_or_told(tmp_path):
+    needs_gaussforge()
+    path, near = tmp_path / "a.spz", small_scene()
+    far = dataclasses.replace(near, gaussians=dataclasses.replace(near.gaussians, means=near.gaussians.means + 2050))
+    with pytest.raises(ValueError, match=r"holds positions up to 2048 units.*write \*\.ply or"):
+        save_splats(path, far)
+    assert not path.exists()
+    shrunk = transform_gaussians(near.gaussians, Similarity(1e-2, np.eye(3), np.zeros(3)))
+    with pytest.warns(UserWarning, match=r"a\.spz: positions are rounded by .* or enlarge the scene"):
+        save_splats(path, Model(shrunk))
+    remote = dataclasses.replace(near.gaussians, means=near.gaussians.means + 500_000)
+    with pytest.warns(UserWarning, match=r"a\.sog: positions are rounded by .* or recentre the scene"):
+        save_splats(tmp_path / "a.sog", Model(remote))
+
+
+@pytest.mark.parametrize(("suffix", "num"), [(".spz", 5), (".splat", 3), (".ksplat", 3), (".compressed.ply", 2)])
+def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
+    """As many as come back changed."""
+    needs_gaussforge()
+    g = small_scene().gaussians
+    sh = g.sh.at[:3, 0, 0].set(4).at[3:5, 15, 2].set(-5)
+    g = dataclasses.replace(g, log_scales=g.log_scales.at[:2].set(-10.5), sh=sh)
+    save_splats(tmp_path / f"a{suffix}", Model(g))
+    found = matched(load_splats(tmp_path / f"a{suffix}"), Model(g)).gaussians
+    changed = np.abs(np.asarray(found.sh) - np.asarray(sh)[:, : found.sh.shape[1]]) > 0.3
+    lost = lost_by(Model(g), f"a{suffix}")
+    assert np.count_nonzero(changed.any(axis=(1, 2))) == num
+    assert f"colours of {num} Gaussians beyond the format's range (cut)" in lost
+    told = "scales of 2 Gaussians beyond the format's range (cut)"
+    assert (told in lost) == (suffix == ".spz") == bool(np.abs(found.log_scales - g.log_scales).max() > 0.4)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_without_gaussians_is_refused(tmp_path, suffix):
+    with pytest.raises(ValueError, match="has no Gaussians"):
+        save_splats(tmp_path / f"a{suffix}", Model(some_gaussians(3)[:0]))
+
+
 def test_what_a_format_does_not_keep():
     world = Similarity(2.0, np.eye(3), np.zeros(3))
     model = dataclasses.replace(textured(), origin=Origin.of_cameras([], transform=world))
     assert lost_by(model, "a.npz") == []
     assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
-    assert lost_by(model, "a.SPZ") == [TEXTURES, "cameras and background", "last digits"]
+    assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]
     assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
+    learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
+    model = Model(some_gaussians(), origin=dataclasses.replace(model.origin, corrections=learned))
+    assert lost_by(model, "a.npz") == []
+    assert lost_by(model, "a.glb") == ["learned exposures", "learned motions of cameras", "last digits"]
     assert format_of("a.compressed.ply").name != format_of("a.ply").name
     with pytest.raises(ValueError, match=r"known are \.npz"):
         format_of("a.xyz")
@@ -154,6 +199,32 @@ def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
     found = load_model(tmp_path / "c.npz")
     assert found.origin == model.origin and found.appearance == model.appearance
     np.testing.assert_array_equal(found.gaussians.means, model.gaussians.means)
+
+
+def test_files_beside_the_output_are_kept(tmp_path, capsys):
+    save_model(tmp_path / "a.npz", Model(some_gaussians()))
+    (tmp_path / "b.bin").write_bytes(b"of another")
+    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.gltf")]) == 2
+    assert "b.bin exists; add --overwrite" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "c.gltf")]) == 0
+    (tmp_path / "c.bin").rename(tmp_path / "b.bin")
+    (tmp_path / "c.gltf").write_text((tmp_path / "c.gltf").read_text().replace("c.bin", "b.bin"))
+    sizes = [file.stat().st_size for file in (tmp_path / "c.gltf", tmp_path / "b.bin")]
+    assert files_of(tmp_path / "c.gltf") == [tmp_path / "c.gltf", tmp_path / "b.bin"]
+    assert file_bytes(tmp_path / "c.gltf") == open_source(tmp_path / "c.gltf").num_bytes == sum(sizes)
+    assert main(["convert", str(tmp_path / "c.gltf"), str(tmp_path / "b.gltf"), "--overwrite"]) == 2
+    assert "b.bin is part of the source" in capsys.readouterr().err
+
+
+def test_bytes_of_an_embedded_buffer_are_those_of_its_file(tmp_path):
+    save_splats(tmp_path / "a.gltf", Model(some_gaussians()))
+    described = json.loads((tmp_path / "a.gltf").read_text())
+    data = base64.b64encode((tmp_path / "a.bin").read_bytes()).decode()
+    described["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+    (tmp_path / "a.gltf").write_text(json.dumps(described))
+    assert open_source(tmp_path / "a.gltf").num_bytes == (tmp_path / "a.gltf").stat().st_size
+    (tmp_path / "a.gltf").write_text("{}")
+    assert files_of(tmp_path / "a.gltf") == [tmp_path / "a.gltf"]
 
 
 def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsys, monkeypatch):

@@ -4,6 +4,7 @@ import io
 import os
 import pickle
 import sys
+import tracemalloc
 import types
 import zipfile
 from collections import OrderedDict
@@ -14,6 +15,7 @@ from small_values import assert_same, some_gaussians
 
 from a2tg_jax import Model, load_splats
 from a2tg_jax.io.formats import save_splats
+from a2tg_jax.io.torch_checkpoint import STORAGES
 
 UTILS, TORCH = types.ModuleType("torch._utils"), types.ModuleType("torch")
 
@@ -35,11 +37,13 @@ REBUILD, PARAMETER, FLOATS = (
 class Tensor:
     """A tensor as PyTorch pickles it; `lie` changes what it says of itself."""
 
+    dtype = "<f4"
+
     def __init__(self, array, lie=lambda *told: told):
-        self.array, self.lie = np.ascontiguousarray(array, "<f4"), lie
+        self.array, self.lie = np.ascontiguousarray(array, self.dtype), lie
 
     def __reduce__(self):
-        strides = tuple(stride // 4 for stride in self.array.strides)
+        strides = tuple(stride // self.array.itemsize for stride in self.array.strides)
         data = _Call(REBUILD, self.lie(_Storage(self.array), 0, self.array.shape, strides), (False, OrderedDict()))
         return PARAMETER, (data, True, OrderedDict())
 
@@ -139,6 +143,51 @@ def test_anything_else_is_refused_in_one_line(tmp_path, monkeypatch, message):
     with pytest.raises(ValueError, match=message) as raised:
         load_splats(tmp_path / "a.pt")
     assert "a.pt" in str(raised.value) and "\n" not in str(raised.value) and not (tmp_path / "harmed").exists()
+
+
+def write_pickle(path, data, byteorder=b"little"):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", data)
+        archive.writestr("archive/byteorder", byteorder)
+
+
+def nested_dictionaries(num: int = 12, depth: int = 5) -> dict:
+    """Dictionaries that refer to one another many times."""
+    value: dict = {}
+    for _ in range(depth):
+        value = dict.fromkeys(map(str, range(num)), value)
+    return value
+
+
+RAW = {
+    "memo": b"\x80\x02}r\xff\xff\xff\x7f.",
+    "big-endian": b"\x80\x02}.",
+    "more than 10,000 values": pickle.dumps(nested_dictionaries(), 2),
+    "type ComplexFloatStorage": b"\x80\x02ctorch\nComplexFloatStorage\n.",
+    "type UntypedStorage": b"\x80\x02ctorch.storage\nUntypedStorage\n.",
+    "no means": b"\x80\x02}q\x00X\x01\x00\x00\x00ah\x00s.",  # A dictionary in itself.
+}
+
+
+@pytest.mark.parametrize("message", RAW)
+def test_pickles_that_ask_for_too_much_are_refused(tmp_path, message):
+    write_pickle(tmp_path / "a.pt", RAW[message], bytes(1 << 26) if message == "big-endian" else b"little")
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=message):
+            load_splats(tmp_path / "a.pt")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24
+    finally:
+        tracemalloc.stop()
+
+
+def test_numbers_of_16_bits(tmp_path, monkeypatch):
+    """Upper halves of floats, as PyTorch calls bfloat16."""
+    monkeypatch.setitem(STORAGES, "FloatStorage", STORAGES["BFloat16Storage"])
+    monkeypatch.setattr(Tensor, "dtype", STORAGES["BFloat16Storage"])
+    write_checkpoint(tmp_path / "a.pt", {"splats": tensors()})
+    found = load_splats(tmp_path / "a.pt").gaussians
+    np.testing.assert_allclose(found.means, some_gaussians().means, rtol=2**-8)
 
 
 def test_checkpoints_are_not_written(tmp_path):

@@ -10,12 +10,16 @@ from typing import Any
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.compact import load_compact, save_compact
-from a2tg_jax.io.gaussforge_files import load_by_gaussforge, save_by_gaussforge
+from a2tg_jax.io.gaussforge_files import kind_of, load_by_gaussforge, save_by_gaussforge
+from a2tg_jax.io.gltf_reader import buffer_files
 from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.ply import load_ply, save_ply
+from a2tg_jax.io.number_ranges import cut_numbers
+from a2tg_jax.io.ply import load_ply, plain_gaussians, save_ply
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
 from a2tg_jax.model import Model
 
+LEARNED = {"exposure": "learned exposures", "pose": "learned motions of cameras"}
+"""Corrections of photographs in words, by name."""
 Reader = Callable[[Path], Model | Gaussians]
 Writer = Callable[[Path, Model], None]
 
@@ -31,6 +35,8 @@ class FileFormat:
     """Whether textures, and whatever else splats show, are kept."""
     keeps_origin: bool = False
     """Whether cameras, background and the normalised world are kept; other formats hold the original world."""
+    keeps_corrections: bool = False
+    """Whether learned exposures and poses of photographs are kept."""
     highest_degree: int = 3
     """Highest degree of spherical harmonics."""
     is_exact: bool = True
@@ -54,7 +60,7 @@ _GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_glt
 _USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"), keeps_origin=True, is_exact=False)
 _CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
 FORMATS = {
-    ".npz": FileFormat("model", load_model, save_model, True, True),
+    ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
     ".compressed.ply": FileFormat("compressed PLY", load_ply, save_by_gaussforge, is_exact=False),
     ".ply": FileFormat("PLY", load_ply, save_ply),
@@ -116,10 +122,19 @@ def save_splats(path: str | os.PathLike[str], model: Model) -> None:
     found.save(Path(path), model)
 
 
+def files_written(path: Path) -> list[Path]:
+    """Return the files that a model is written as: its own first, and the buffer beside a *.gltf."""
+    return [path, path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else [path]
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files that hold a written model: its own first, and the buffers that a *.gltf names."""
+    return [path, *(buffer_files(path) if path.suffix.lower() == ".gltf" else [])]
+
+
 def file_bytes(path: Path) -> int:
-    """Return the bytes of a file, with those of the buffer beside a *.gltf."""
-    files = [path, path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else [path]
-    return sum(file.stat().st_size for file in files)
+    """Return the bytes of all files that hold a written model."""
+    return sum(file.stat().st_size for file in files_of(path))
 
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
@@ -132,8 +147,12 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     degree = model.gaussians.sh_degree if model.bands is None else 3
     if degree > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
+    if into.save is save_by_gaussforge:
+        lost += cut_numbers(kind_of(path), plain_gaussians(model))
     if model.origin is not None and not into.keeps_origin:
         lost.append("cameras and background")
+    if model.origin is not None and not into.keeps_corrections:
+        lost += [LEARNED.get(name, f"learned {name}") for name in sorted(model.origin.corrections)]
     if not into.is_exact:
         lost.append("last digits")
     return lost

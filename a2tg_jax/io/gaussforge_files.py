@@ -25,6 +25,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.flattening import third_log_scales
+from a2tg_jax.io.number_ranges import check_positions
 from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, plain_gaussians
 from a2tg_jax.io.quantise import morton
 from a2tg_jax.model import Model
@@ -46,10 +47,17 @@ MOST_HEADER_BYTES = 1 << 24
 def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     """Write the Gaussians of a model, in its original world, in the format of the suffix.
 
+    Positions that the format rounds by a tenth of a typical scale or more are told with a warning.
+
     Raises:
-      ValueError: if gaussforge is not installed or cannot write them.
+      ValueError: if gaussforge is not installed or cannot write them, there are none, or the format cannot hold their
+        positions.
     """
-    kind, gaussians = _kind(path), _along_curve(plain_gaussians(model))
+    kind, gaussians = kind_of(path), plain_gaussians(model)
+    if not gaussians.num:
+        raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
+    check_positions(kind, gaussians, str(path))
+    gaussians = _along_curve(gaussians)
     third = third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
     source = _with_sh_order(gaussians, np.argsort(_order(kind, gaussians.sh_degree)))
     ply = encode_ply(source, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
@@ -65,7 +73,7 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
       FileNotFoundError: if there is no such file.
       ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
     """
-    kind, path = _kind(path), Path(path)
+    kind, path = kind_of(path), Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such file")
     with open_regular(path) as file:
@@ -76,8 +84,8 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
     return _with_sh_order(gaussians, _order(kind, gaussians.sh_degree)) if kind == "ksplat" else gaussians
 
 
-def _kind(path: str | os.PathLike[str]) -> str:
-    """Return gaussforge's name of the format of a file."""
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """Return gaussforge's name of the format of a file. Raises ValueError if it writes none of this suffix."""
     name = Path(path).name.lower()
     for suffix, kind in SUFFIXES.items():
         if name.endswith(suffix):

@@ -124,18 +124,34 @@ class Document:
                 return base64.b64decode(text, validate=True) if mark else urllib.parse.unquote_to_bytes(head[5:])
             except binascii.Error as error:
                 raise ValueError(f"its embedded buffer is damaged ({error})") from error
-        if len(uri.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
-            raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
-        folder = self.path.parent.resolve()
-        file = (folder / urllib.parse.unquote(uri, errors="strict")).resolve() if "://" not in uri else None
-        if file is None or not file.is_relative_to(folder):
-            raise ValueError(f"its buffer {shortened(uri)} does not lie in the folder of the file")
-        if not is_regular(file):
-            raise ValueError(f"its buffer {shortened(uri)} is missing")
+        file = _named_file(self.path, uri)
         if file not in self._files:
             self._files[file] = read_regular(file, MOST_ARRAY_BYTES)
             self._room += LARGEST_RATIO * len(self._files[file])
         return self._files[file]
+
+
+def buffer_files(path: Path) -> list[Path]:
+    """Return the files beside a *.gltf that its buffers name; none if it cannot be read."""
+    try:
+        buffers = Document(path).json["buffers"]
+        uris = {buffer["uri"]: None for buffer in buffers if not buffer.get("uri", "data:").startswith("data:")}
+        return list({_named_file(path, uri): None for uri in uris})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return []
+
+
+def _named_file(path: Path, uri: str) -> Path:
+    """Return the file of a buffer. Raises ValueError if it is missing or does not lie in the folder of the glTF."""
+    if len(uri.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
+        raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
+    folder = path.parent.resolve()
+    file = (folder / urllib.parse.unquote(uri, errors="strict")).resolve() if "://" not in uri else None
+    if file is None or not file.is_relative_to(folder):
+        raise ValueError(f"its buffer {shortened(uri)} does not lie in the folder of the file")
+    if not is_regular(file):
+        raise ValueError(f"its buffer {shortened(uri)} is missing")
+    return file
 
 
 def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:

@@ -10,11 +10,13 @@ programs of 3DGS and 2DGS ((parameters, iteration)).
 import collections
 import functools
 import io
+import itertools
 import math
 import os
 import pickle
+import pickletools
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,10 +32,16 @@ from a2tg_jax.model import Model
 
 STORAGES = {
     "DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "LongStorage": "<i8", "IntStorage": "<i4",
-    "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
+    "BFloat16Storage": "bfloat16", "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
 }  # fmt: skip
 MOST_PICKLE_BYTES = 1 << 20
 MOST_ENTRIES = 10_000
+MOST_NODES = 10_000
+"""Largest number of values in the dictionaries of a checkpoint; one that is referred to twice counts twice."""
+DEEPEST = 5
+"""Largest depth of dictionaries that are searched for tensors."""
+MOST_SIDES = 4
+BYTE_ORDER = b"little"
 GSPLAT = ("means", "quats", "scales", "opacities", "sh0", "shN")
 NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacities": 6}
@@ -128,6 +136,8 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if module == "torch" and name in STORAGES:
             return STORAGES[name]
+        if module in ("torch", "torch.storage") and name.endswith("Storage"):
+            raise _Refused(f"has numbers of the type {shortened(name)}, which this program does not read; save floats")
         if (module, name) not in KNOWN:
             raise _Refused(
                 f"pickles {shortened(f'{module}.{name}')}, which could run any code; save a dictionary of tensors "
@@ -149,12 +159,27 @@ def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
     if pickled is None or len(names) > MOST_ENTRIES:
         raise _Refused("is not a checkpoint of PyTorch: it has no data.pkl")
     folder = pickled.removesuffix("data.pkl")
-    if folder + "byteorder" in names and archive.read(folder + "byteorder") != b"little":
+    if folder + "byteorder" in names and _start(archive, folder + "byteorder", len(BYTE_ORDER) + 1) != BYTE_ORDER:
         raise _Refused("is a checkpoint of a big-endian machine")
-    if archive.getinfo(pickled).file_size > MOST_PICKLE_BYTES:
+    data = _start(archive, pickled, MOST_PICKLE_BYTES + 1)
+    if len(data) > MOST_PICKLE_BYTES:
         raise _Refused(f"has a pickle of more than {MOST_PICKLE_BYTES:,} bytes")
-    value = _Unpickler(io.BytesIO(archive.read(pickled))).load()
+    _check_memo(data)
+    value = _Unpickler(io.BytesIO(data)).load()
     return {name: _array(tensor, archive, folder) for name, tensor in _tensors_of(value).items()}
+
+
+def _start(archive: zipfile.ZipFile, name: str, num_bytes: int) -> bytes:
+    """Return the first bytes of an entry, without unpacking more."""
+    with archive.open(name) as entry:
+        return entry.read(num_bytes)
+
+
+def _check_memo(data: bytes) -> None:
+    """Refuse a pickle that asks for a memo longer than itself, for which the unpickler would make room."""
+    for opcode, argument, _ in pickletools.genops(data):
+        if opcode.name.endswith("PUT") and isinstance(argument, int) and argument > len(data):
+            raise _Refused("has a damaged pickle: its memo is longer than the pickle")
 
 
 def _tensors_of(value: Any) -> dict[str, _Tensor]:
@@ -163,10 +188,12 @@ def _tensors_of(value: Any) -> dict[str, _Tensor]:
         parts = value[0]
         found = {name: parts[place] for name, place in TUPLE_2DGS.items()} if len(parts) >= TUPLE_LENGTH - 1 else {}
     else:
-        flat = _flat(value)
-        wanted = GSPLAT if any(name.endswith("sh0") for name in flat) else NERFSTUDIO
-        pairs = zip(GSPLAT, wanted, strict=True)
-        found = {name: flat[key] for name, own in pairs for key in flat if key.rpartition(".")[2] == own}
+        nodes = list(itertools.islice(_nodes(value), MOST_NODES + 1))
+        if len(nodes) > MOST_NODES:
+            raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
+        own = {name: node for name, node in nodes if isinstance(node, _Tensor)}
+        wanted = GSPLAT if any(name.endswith("sh0") for name in own) else NERFSTUDIO
+        found = {name: own[key] for name, key in zip(GSPLAT, wanted, strict=True) if key in own}
     tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, _Tensor)}
     missing = [name for name in GSPLAT[:-1] if name not in tensors]
     if missing:
@@ -174,23 +201,26 @@ def _tensors_of(value: Any) -> dict[str, _Tensor]:
     return tensors
 
 
-def _flat(value: Any, prefix: str = "", depth: int = 0) -> dict[str, Any]:
-    """Return the leaves of nested dictionaries by dotted names."""
-    if not isinstance(value, Mapping) or depth > 4:
-        return {prefix: value}
-    return {name: leaf for key, own in value.items() for name, leaf in _flat(own, f"{prefix}.{key}", depth + 1).items()}
+def _nodes(value: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield a value and all those in its nested dictionaries, with the last parts of their dotted names."""
+    yield name, value
+    if isinstance(value, Mapping) and depth < DEEPEST:
+        for key, own in value.items():
+            yield from _nodes(own, key.rpartition(".")[2] if isinstance(key, str) else "", depth + 1)
 
 
 def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray:
     """Return the numbers of a tensor, which must lie within its storage."""
     storage, size = tensor.storage, tensor.size
-    num = math.prod(list(size))
+    numbers = (tensor.offset, *size, *tensor.stride)
+    if len(size) > MOST_SIDES or any(type(number) is not int or number < 0 for number in numbers):
+        raise _Refused("has a tensor of negative sizes, or of too many")
+    num = math.prod(size)
     dtype, entry = np.dtype(storage.dtype), archive.getinfo(f"{folder}data/{storage.key}")
     steps = [stride * (side - 1) for side, stride in zip(size, tensor.stride, strict=True)]
-    numbers = (tensor.offset, *size, *tensor.stride)
-    if any(type(number) is not int or number < 0 for number in numbers) or entry.compress_type != zipfile.ZIP_STORED:
-        raise _Refused("has a tensor of negative sizes, or compressed storages")
-    if entry.file_size != storage.num * dtype.itemsize or len(size) > 4:
+    if entry.compress_type != zipfile.ZIP_STORED:
+        raise _Refused("has compressed storages")
+    if entry.file_size != storage.num * dtype.itemsize:
         raise _Refused("has a storage of another size than its tensor says")
     if num > storage.num or (num and tensor.offset + sum(steps) >= storage.num):
         raise _Refused("has a tensor that reaches beyond its storage")

@@ -11,7 +11,7 @@ from a2tg_jax.appearance import Plain
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
 from a2tg_jax.finish.distilling import pictures
-from a2tg_jax.io.formats import file_bytes, format_of, lost_by, save_splats
+from a2tg_jax.io.formats import file_bytes, files_of, files_written, format_of, lost_by, save_splats
 from a2tg_jax.model import Model
 from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.viewing import open_source
@@ -78,12 +78,8 @@ def convert(
       ValueError: if a format is unknown, or the source cannot be read or written.
     """
     format_of(out)
-    if out.is_dir():
-        raise ValueError(f"{out} is a folder; give the path of a file")
-    if source.resolve() == out.resolve():
-        raise ValueError(f"{out} is the source: choose another name")
+    _check_files(source, out, overwrite=overwrite)
     check_output(out)
-    check_new(out, "OUT", overwrite=overwrite)
     if baking is not None:
         baking.check()
     start = time.perf_counter()
@@ -92,6 +88,18 @@ def convert(
     save_splats(out, model)
     lost, seconds = tuple(lost_by(model, out)), time.perf_counter() - start
     return Converted(source, out, model, opened.num_bytes, file_bytes(out), lost, seconds, baked)
+
+
+def _check_files(source: Path, out: Path, *, overwrite: bool) -> None:
+    """Raise unless all files of the output may be written."""
+    sources = {file.resolve() for file in files_of(source)}
+    for file in files_written(out):
+        if file.is_dir():
+            raise ValueError(f"{file} is a folder; give the path of a file")
+        if file.resolve() in sources:
+            whole = "the source" if file == out else f"part of the source and would be written beside {out}"
+            raise ValueError(f"{file} is {whole}: choose another name")
+        check_new(file, "OUT", overwrite=overwrite)
 
 
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:

@@ -17,7 +17,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.formats import FORMATS, load_splats
+from a2tg_jax.io.formats import FORMATS, file_bytes, load_splats
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
@@ -124,7 +124,7 @@ def _source_of_file(path: Path) -> Source:
     notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
     for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=3)
-    return Source(model, path.stem, ". ".join(notes), num_bytes=path.stat().st_size)
+    return Source(model, path.stem, ". ".join(notes), num_bytes=file_bytes(path))
 
 
 # Photographs
