@@ -1,20 +1,25 @@
 """Baking: plain Gaussians in place of textured ones look like them."""
 
 import dataclasses
+import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_values import some_gaussians
 
 from a2tg_jax import Camera, Model, TextureOptions, load_splats, save_model, textures_from_arrays
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Banded, Textured
+from a2tg_jax.appearance.sh_bands import split_sh
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.origin import WHITE, Origin
+from a2tg_jax.finish import baking
 from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
 from a2tg_jax.finish.distilling import distill, pictures
 from a2tg_jax.finish.texel_choice import fewest_texels
+from a2tg_jax.results import conversion
 from a2tg_jax.texture import Textures
 
 CAMERA = Camera(jnp.eye(4).at[2, 3].set(4), jnp.asarray([[60.0, 0, 24], [0, 60, 18], [0, 0, 1]]), 48, 36)
@@ -33,6 +38,18 @@ def textured(num: int = 3, side: int = 4, seed: int = 0) -> Model:
         sh=jnp.zeros((num, 1, 3)),
     )
     return Model(gaussians, textures, layout, appearance=Textured(), origin=Origin.of_cameras([CAMERA]))
+
+
+def banded(inner: Model) -> Model:
+    """The same model with one splat of degree 3 and the others of degree 0."""
+    model = dataclasses.replace(inner, appearance=Banded(inner.appearance))
+    params, layout = model.appearance.allocate(jax.random.key(0), inner.gaussians)
+    model = dataclasses.replace(
+        model,
+        params=params._replace(inner=inner.params),
+        layout=layout._replace(inner=inner.layout),
+    )
+    return model.with_bands(*split_sh(np.ones((inner.num, 16, 3), np.float32), 3 * (np.arange(inner.num) == 0), 0))
 
 
 def psnr(model: Model, other: Model) -> float:
@@ -85,6 +102,31 @@ def test_training_on_pictures_brings_a_plain_model_nearer(split):
     assert psnr(trained, model) > psnr(split, model) + 0.5
 
 
+def test_training_draws_over_the_background_of_the_model(split):
+    over_white = dataclasses.replace(textured(), origin=Origin.of_cameras([CAMERA], background=WHITE))
+    start = dataclasses.replace(split, origin=over_white.origin)
+    trained = distill(start, over_white, [CAMERA], iterations=30)
+    assert psnr(trained, over_white) > psnr(start, over_white) + 0.5
+
+
+def test_growth_is_kept_where_degrees_differ(monkeypatch):
+    monkeypatch.setattr(baking, "least_degree", lambda *_: 3)
+    monkeypatch.setattr(baking, "texel_weights_of", lambda model, *_: model.textures[0])
+    inner = textured(30, side=1)
+    for model in (banded(inner), banded(Model(inner.gaussians))):
+        baked = split_splats(model, [CAMERA], 1.6)
+        assert baked.gaussians.sh_degree == 1 and baked.num_bytes <= 1.6 * model.num_bytes
+        assert split_splats(model, [CAMERA], 9.0).gaussians.sh_degree == 3
+
+
+def test_held_out_cameras_do_not_train():
+    cameras = [CAMERA] * 3
+    training, held_out = conversion.cameras_apart(Origin.of_cameras(cameras, is_test=[False, True, False]))
+    assert (len(training), len(held_out)) == (2, 1)
+    training, held_out = conversion.cameras_apart(Origin.of_cameras(cameras, is_test=[True] * 3))
+    assert (len(training), len(held_out)) == (3, 0)
+
+
 def test_other_appearances_give_their_gaussians():
     model = dataclasses.replace(Model(some_gaussians(5)), origin=Origin.of_cameras([CAMERA]))
     np.testing.assert_array_equal(bake(model, [CAMERA], iterations=0).gaussians.means, model.gaussians.means)
@@ -98,7 +140,15 @@ def test_convert_bakes(tmp_path, capsys):
     arguments = ["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply"), "--bake", "--bake-iterations", "0"]
     assert main(arguments) == 0
     told = capsys.readouterr().out
-    assert "baked: 3 splats into" in told and "textures" not in told
+    assert "baked: 3 splats into" in told and "beside the model in 1 training view" in told and "textures" not in told
     assert load_splats(tmp_path / "b.ply").num > 3
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--bake"]) == 2
     assert "knows its cameras" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "reason"), [("b.sog", "pip install"), ("b.pt", "can be read, but not written")])
+def test_a_file_that_cannot_be_written_is_refused_before_baking(tmp_path, monkeypatch, capsys, name, reason):
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    monkeypatch.setattr(conversion, "open_source", lambda *_: pytest.fail("the model was read"))
+    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / name), "--bake"]) == 2
+    assert reason in capsys.readouterr().err

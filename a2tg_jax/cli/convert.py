@@ -19,7 +19,7 @@ class Convert:
     3DGS are flattened along their thinnest axis. Files of other programs hold the original world.
 
     Other programs know no textures. --bake turns a textured splat into plain ones, as many as its texels or fewer, and
-    trains them on pictures of the model. The photographs are not needed.
+    trains them on pictures of the model from its training cameras. The photographs are not needed.
 
     Examples:
       a2tg convert runs/fox fox.sog --bake

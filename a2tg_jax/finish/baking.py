@@ -19,6 +19,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Plain
 from a2tg_jax.appearance.textured import shown_textures, texel_coordinates
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
@@ -60,7 +61,8 @@ def bake(
       model: of any appearance. `Textured`, and `Banded` around it, becomes a splat per texel or fewer; of others the
         Gaussians are taken.
       cameras: views that the new model is trained on.
-      growth: largest ratio of the bytes of all floats to those of the model.
+      growth: largest ratio of the bytes of all floats to those of the model. If the Gaussians differ in their degree,
+        the common one is lowered until one splat for each fits.
       iterations: of training on pictures of the model; 0: none.
       progress: show a progress bar.
 
@@ -78,12 +80,13 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     """Return a plain model with a splat per texel or fewer, without training. Arguments as in `bake`."""
     options = model.appearance.texture_options if model.appearance.is_portable else None
     if options is None or model.textures is None:
-        return as_plain(plain_gaussians(dataclasses.replace(model, origin=None)), model)
-    degree = least_degree(model, cameras)
-    most = int(growth * model.num_bytes / (4 * floats_per_gaussian(degree)))
+        whole = plain_gaussians(dataclasses.replace(model, origin=None))
+        degree = fitting_degree(model, whole.sh_degree, growth)
+        return as_plain(dataclasses.replace(whole, sh=whole.sh[:, : NUM_BASES[degree]]), model)
+    degree = fitting_degree(model, least_degree(model, cameras), growth)
     shown = shown_textures(*model.textures, options)
     weights = texel_weights_of(model, cameras, model.background)
-    tables = fewest_texels(shown, model.textures[1], weights, max(most, model.num))
+    tables = fewest_texels(shown, model.textures[1], weights, most_splats(model, degree, growth))
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
     return as_plain(_split(whole, tables, options.uv), model)
 
@@ -91,6 +94,19 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
 def as_plain(gaussians: Gaussians, model: Model) -> Model:
     """Return a plain model of Gaussians with the origin of another."""
     return Model(gaussians, appearance=Plain(), origin=model.origin)
+
+
+def most_splats(model: Model, degree: int, growth: float) -> int:
+    """Return how many plain splats of a degree take at most `growth` times the bytes of a model (host)."""
+    return int(growth * model.num_bytes / (BYTES_PER_FLOAT * floats_per_gaussian(degree)))
+
+
+def fitting_degree(model: Model, highest: int, growth: float) -> int:
+    """Return the highest degree, at most `highest`, in which a splat for each Gaussian stays within the growth (host).
+
+    Degree 0 always does: no Gaussian of the model takes less.
+    """
+    return max((d for d in range(highest + 1) if most_splats(model, d, growth) >= model.num), default=0)
 
 
 def least_degree(model: Model, cameras: Sequence[Camera]) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.origin import Color
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.world import scene_scale
@@ -13,12 +14,16 @@ from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
 from a2tg_jax.training import fit_stage
+from a2tg_jax.training.fitting import BACKGROUNDS
+from a2tg_jax.training.stage import Background
 
 
 def distill(
     model: Model, wanted: Model, cameras: Sequence[Camera], *, iterations: int, progress: bool = False
 ) -> Model:
     """Return a plain model after training on pictures of another one; the number of Gaussians stays.
+
+    Both are drawn over black or white, whichever is nearer to the other model's background.
 
     Args:
       model: of `Plain`, in the world of the other.
@@ -28,21 +33,22 @@ def distill(
       progress: show a progress bar.
     """
     highest = model.gaussians.sh_degree
-    system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest)
-    start = dataclasses.replace(model, origin=None)
-    trained = fit_stage(drawn_scene(wanted, cameras), system, 1, start, progress=progress, title="bake").model
+    behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
+    system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
+    scene, start = drawn_scene(wanted, cameras, BACKGROUNDS[behind]), dataclasses.replace(model, origin=None)
+    trained = fit_stage(scene, system, 1, start, progress=progress, title="bake").model
     return dataclasses.replace(trained, origin=wanted.origin)
 
 
-def pictures(model: Model, cameras: Sequence[Camera]) -> list[np.ndarray]:
-    """Return the pictures [H, W, 3] of a model, clipped to [0, 1] (host)."""
-    renderer = Renderer(model, cameras=cameras, has_geometry=False)
+def pictures(model: Model, cameras: Sequence[Camera], background: Color | None = None) -> list[np.ndarray]:
+    """Return the pictures [H, W, 3] of a model over its own background or another, clipped to [0, 1] (host)."""
+    renderer = Renderer(model, cameras=cameras, background=background, has_geometry=False)
     return [np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras]
 
 
-def drawn_scene(model: Model, cameras: Sequence[Camera]) -> Scene:
-    """Return a scene whose photographs are pictures of a model (host)."""
-    drawn = (np.rint(255 * image).astype(np.uint8) for image in pictures(model, cameras))
+def drawn_scene(model: Model, cameras: Sequence[Camera], background: Color) -> Scene:
+    """Return a scene whose photographs are pictures of a model over a background (host)."""
+    drawn = (np.rint(255 * image).astype(np.uint8) for image in pictures(model, cameras, background))
     views = tuple(
         View(str(index), camera, image) for index, (camera, image) in enumerate(zip(cameras, drawn, strict=True))
     )

@@ -10,7 +10,7 @@ from typing import Any
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.compact import load_compact, save_compact
-from a2tg_jax.io.gaussforge_files import kind_of, load_by_gaussforge, save_by_gaussforge
+from a2tg_jax.io.gaussforge_files import import_gaussforge, kind_of, load_by_gaussforge, save_by_gaussforge
 from a2tg_jax.io.gltf_reader import buffer_files
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.number_ranges import cut_numbers
@@ -41,6 +41,8 @@ class FileFormat:
     """Highest degree of spherical harmonics."""
     is_exact: bool = True
     """Whether numbers come back unrounded."""
+    import_library: Callable[[Path], object] | None = None
+    """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
 
 def _later(module: str, function: str) -> Callable[..., Any]:
@@ -53,16 +55,32 @@ def _later(module: str, function: str) -> Callable[..., Any]:
 
 
 def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
-    return FileFormat(name, load_by_gaussforge, save_by_gaussforge, highest_degree=degree, is_exact=False)
+    return FileFormat(
+        name,
+        load_by_gaussforge,
+        save_by_gaussforge,
+        highest_degree=degree,
+        is_exact=False,
+        import_library=import_gaussforge,
+    )
 
 
 _GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), True, True, is_exact=False)
-_USD = FileFormat("OpenUSD", _later("usd", "load_usd"), _later("usd", "save_usd"), keeps_origin=True, is_exact=False)
+_USD = FileFormat(
+    "OpenUSD",
+    _later("usd", "load_usd"),
+    _later("usd", "save_usd"),
+    keeps_origin=True,
+    is_exact=False,
+    import_library=lambda path: _later("usd", "import_usd")(),
+)
 _CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
-    ".compressed.ply": FileFormat("compressed PLY", load_ply, save_by_gaussforge, is_exact=False),
+    ".compressed.ply": FileFormat(
+        "compressed PLY", load_ply, save_by_gaussforge, is_exact=False, import_library=import_gaussforge
+    ),
     ".ply": FileFormat("PLY", load_ply, save_ply),
     ".spz": _by_gaussforge("SPZ"),
     ".sog": _by_gaussforge("SOG"),
@@ -94,6 +112,20 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
     raise ValueError(f"{shortened(os.fspath(path))}: no format is known by this suffix; known are {', '.join(FORMATS)}")
 
 
+def writer_of(path: str | os.PathLike[str]) -> Writer:
+    """Return the function that writes a file, chosen by its suffix, once it is sure to have what it needs.
+
+    Raises:
+      ValueError: if the suffix is unknown, an optional library is missing, or the format can only be read.
+    """
+    found = format_of(path)
+    if found.save is None:
+        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
+    if found.import_library is not None:
+        found.import_library(Path(path))
+    return found.save
+
+
 def load_splats(path: str | os.PathLike[str]) -> Model:
     """Read a model from a file of any format that is known by its suffix, such as *.npz, *.ply, *.spz or *.sog.
 
@@ -116,10 +148,7 @@ def save_splats(path: str | os.PathLike[str], model: Model) -> None:
     Raises:
       ValueError: if the suffix is unknown, an optional library is missing, or the format cannot hold the model.
     """
-    found = format_of(path)
-    if found.save is None:
-        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
-    found.save(Path(path), model)
+    writer_of(path)(Path(path), model)
 
 
 def files_written(path: Path) -> list[Path]:

@@ -84,6 +84,18 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
     return _with_sh_order(gaussians, _order(kind, gaussians.sh_degree)) if kind == "ksplat" else gaussians
 
 
+def import_gaussforge(path: Path) -> Any:
+    """Return the library for a file.
+
+    Raises:
+      ValueError: if it is not installed.
+    """
+    try:
+        return importlib.import_module("gaussforge")
+    except ImportError as error:
+        raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
+
+
 def kind_of(path: str | os.PathLike[str]) -> str:
     """Return gaussforge's name of the format of a file. Raises ValueError if it writes none of this suffix."""
     name = Path(path).name.lower()
@@ -125,11 +137,7 @@ def _with_sh_order(gaussians: Gaussians, order: np.ndarray) -> Gaussians:
 
 def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
     """Return the bytes of one format as another's."""
-    try:
-        gaussforge: Any = importlib.import_module("gaussforge")
-    except ImportError as error:
-        raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
-    result = gaussforge.GaussForge().convert(data, before, after)
+    result = import_gaussforge(path).GaussForge().convert(data, before, after)
     converted: bytes = result.get("data", b"")
     if not converted:
         reason = shortened(str(result.get("error", "no splats in it")), 200)

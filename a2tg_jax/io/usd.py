@@ -69,13 +69,13 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
         layer = Path(folder, f"splats{'.usdc' if suffix == '.usdz' else suffix}")
         written = stage.GetRootLayer().Export(str(layer))
         if written and suffix == ".usdz":
-            written = _library().UsdUtils.CreateNewUsdzPackage(str(layer), str(layer.with_suffix(suffix)))
+            written = import_usd().UsdUtils.CreateNewUsdzPackage(str(layer), str(layer.with_suffix(suffix)))
         if not written:
             raise ValueError(f"{path}: usd-core could not write the file")
         shutil.move(layer.with_suffix(suffix), temporary)
 
 
-def _library() -> Any:
+def import_usd() -> Any:
     """Return the modules of usd-core. ValueError, with what to install, if it is missing or too old."""
     try:
         import pxr
@@ -90,7 +90,7 @@ def _library() -> Any:
 
 def _stage_of(model: Model, ellipsoids: bool) -> Any:
     """Return a stage of one particle field."""
-    usd, splats = _library(), splats_of(model)
+    usd, splats = import_usd(), splats_of(model)
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.z)
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -147,7 +147,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
       ValueError: if usd-core is missing, or it is no USD file, is damaged, or holds no splats.
     """
     check_suffix(path, "load_usd")
-    usd, path = _library(), Path(path)
+    usd, path = import_usd(), Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such USD file")
     open_regular(path, MOST_ARRAY_BYTES).close()

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.appearance import Plain
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.display import counted, in_bytes
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
 from a2tg_jax.finish.distilling import pictures
-from a2tg_jax.io.formats import file_bytes, files_of, files_written, format_of, lost_by, save_splats
+from a2tg_jax.io.formats import file_bytes, files_of, files_written, format_of, lost_by, save_splats, writer_of
 from a2tg_jax.model import Model
 from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.viewing import open_source
@@ -77,7 +79,7 @@ def convert(
       FileNotFoundError: if there is no such file, or the run's stage is not finished.
       ValueError: if a format is unknown, or the source cannot be read or written.
     """
-    format_of(out)
+    writer_of(out)  # Baking takes minutes.
     _check_files(source, out, overwrite=overwrite)
     check_output(out)
     if baking is not None:
@@ -104,15 +106,27 @@ def _check_files(source: Path, out: Path, *, overwrite: bool) -> None:
 
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:
     """Return a plain model, and what was done in words."""
-    cameras = () if model.origin is None else model.origin.cameras
-    if not cameras:
+    if model.origin is None or not model.origin.cameras:
         raise ValueError(f"--bake needs a model that knows its cameras; {source} has none")
     if type(model.appearance.base) is Plain:
         return model, "baked: nothing, for the model is plain"
-    plain = bake(model, cameras, growth=options.growth, iterations=options.iterations, progress=True)
-    views = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    training, held_out = cameras_apart(model.origin)
+    plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
+    views = held_out or training
+    views = views[:: -(-len(views) // MOST_VIEWS)]
     pairs = zip(pictures(plain, views), pictures(model, views), strict=True)
     likeness = -10 * math.log10(max(float(np.mean([np.mean((x - y) ** 2) for x, y in pairs])), 1e-10))
     degree, ratio = plain.gaussians.sh_degree, plain.num_bytes / model.num_bytes
     numbers = f"{counted(model.num, 'splat')} into {plain.num:,} plain ones of SH degree {degree}"
-    return plain, f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness:.1f} dB beside the model"
+    judged = counted(len(views), f"{'held-out' if held_out else 'training'} view")
+    return (
+        plain,
+        f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness:.1f} dB beside the model in {judged}",
+    )
+
+
+def cameras_apart(origin: Origin) -> tuple[list[Camera], list[Camera]]:
+    """Return the cameras of training and those held out. If all are held out, all of them train, and none are left."""
+    training = [camera for camera, is_test in zip(origin.cameras, origin.is_test, strict=True) if not is_test]
+    held_out = [camera for camera, is_test in zip(origin.cameras, origin.is_test, strict=True) if is_test]
+    return (training, held_out) if training else (held_out, [])
