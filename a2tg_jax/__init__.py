@@ -97,7 +97,7 @@ if TYPE_CHECKING:
     from a2tg_jax.mesh.extract import extract_mesh as extract_mesh
     from a2tg_jax.mesh.files import save_mesh as save_mesh
     from a2tg_jax.mesh.simplify import simplify_mesh as simplify_mesh
-    from a2tg_jax.mesh.texture import texture_mesh as texture_mesh
+    from a2tg_jax.mesh.texturing import texture_mesh as texture_mesh
     from a2tg_jax.mesh.triangles import Mesh as Mesh
     from a2tg_jax.model import Model as Model
     from a2tg_jax.model import Parameters as Parameters
@@ -196,7 +196,7 @@ _NAMES = {
     "a2tg_jax.mesh.extract": ("MeshResult", "extract_mesh"),
     "a2tg_jax.mesh.files": ("save_mesh",),
     "a2tg_jax.mesh.simplify": ("simplify_mesh",),
-    "a2tg_jax.mesh.texture": ("texture_mesh",),
+    "a2tg_jax.mesh.texturing": ("texture_mesh",),
     "a2tg_jax.mesh.triangles": ("Mesh",),
     "a2tg_jax.model": ("Model", "Parameters", "concatenate"),
     "a2tg_jax.render": ("RenderOutput", "RenderSettings", "render_appearance", "render_image"),

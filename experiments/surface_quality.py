@@ -3,10 +3,11 @@
     python experiments/surface_quality.py synthetic --work runs/surfaces
     python experiments/surface_quality.py dtu scan24.ply --scan 24 --data DTU --world scan24.txt
 
-`synthetic` trains plain 2D Gaussians with and without the losses of surfaces, and prints a table. `dtu` follows the
+`synthetic` trains plain 2D Gaussians with and without the losses of surfaces, and prints a table. `dtu` is near the
 evaluation of DTU: the mesh is sampled every 0.2 mm, only points within the observed volume and above the table count,
-and distances beyond 20 mm are left out. DATA has Points/stl and ObsMask of DTU. The mesh is in millimetres of DTU's
-world, or --world names a text file of a 4 × 4 matrix that leads there.
+and distances beyond 20 mm are left out. Unlike there, no object masks cull the mesh, and cubes thin the points, so that
+figures are not to be put beside published ones. DATA has Points/stl and ObsMask of DTU. The mesh is in millimetres of
+DTU's world, or --world names a text file of a 4 × 4 matrix that leads there.
 """
 
 import argparse
@@ -97,7 +98,7 @@ def dtu_text(args: argparse.Namespace) -> str:
             raise FileNotFoundError(f"{path}: no such file")
     mesh = read_mesh(args.mesh)
     if args.world is not None:
-        matrix = np.loadtxt(args.world)
+        matrix = read_matrix(args.world)
         mesh = dataclasses.replace(mesh, vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3])
     sampled = thinned(a2tg.sample_surface(mesh, DTU_SPACING / 2), DTU_SPACING)
     scan = read_ply_points(points).points
@@ -112,16 +113,29 @@ def dtu_text(args: argparse.Namespace) -> str:
 
 def read_mesh(path: Path) -> a2tg.Mesh:
     """Return the mesh of a file, by trimesh."""
-    import trimesh
-
+    try:
+        import trimesh
+    except ImportError:
+        raise ValueError("meshes are read by trimesh: pip install 'a2tg-jax[experiments]'") from None
     read = trimesh.load(path, force="mesh", process=False)
     return a2tg.Mesh(np.asarray(read.vertices), np.asarray(read.faces, np.int32))
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """Return the 4 × 4 matrix of a text file."""
+    try:
+        matrix = np.loadtxt(path)
+    except ValueError as error:
+        raise ValueError(f"{path}: must hold the numbers of a 4 × 4 matrix ({error})") from None
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"{path}: must hold a finite 4 × 4 matrix; got the shape {matrix.shape}")
+    return matrix
 
 
 def dtu_distance(
     sampled: np.ndarray, scan: np.ndarray, mask: np.ndarray, bounds: np.ndarray, step: float, plane: np.ndarray
 ) -> a2tg.SurfaceDistance:
-    """Compare points as DTU's evaluation does.
+    """Compare points within the observed volume and above the table, as DTU's evaluation does.
 
     Args:
       sampled: [P, 3] points of the mesh in millimetres.

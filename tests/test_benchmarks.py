@@ -9,9 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+<<<<<<< HEAD
 sys.path.append(str(Path(__file__).parents[1]))  # Last, so that the installed package comes first.
 
 from benchmarks import bounds, stages
+=======
+from a2tg_jax.data.synthetic import still_life
+from benchmarks import bounds, meshes, stages
+>>>>>>> meshfix
 from benchmarks.tables import bounds as bounds_table
 
 
@@ -60,3 +65,9 @@ def test_bounds_add_up(counted):
     assert [one.flops > found[one.name].flops for one in twice] == ["compositing" in name for name in found]
     case = {"num": 300, "textures": "mixed", "stages": [stage.told for stage in found.values()]}
     assert "| 300, textured |" in bounds_table({"bounds": [case]})
+
+
+def test_normals_of_splats_on_the_built_in_scene_are_those_of_its_shapes():
+    for shape, _ in still_life(np.random.default_rng(0)):
+        points, normals = shape.place(*np.random.default_rng(1).uniform(0.2, 0.8, (2, 50)).astype(np.float32))
+        np.testing.assert_allclose(meshes.normals_at(points.T), normals.T, atol=1e-3)

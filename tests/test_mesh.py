@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,14 +12,18 @@ import surface_quality
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
+from a2tg_jax.io.exchange import upright_from
+from a2tg_jax.mesh import distance
 from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
 from a2tg_jax.mesh.depth_maps import DepthMap
 from a2tg_jax.mesh.distance import thinned
+from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.mesh.fusion import fuse
 from a2tg_jax.mesh.marching import surface_of
 from a2tg_jax.mesh.raster import draw_view
 from a2tg_jax.mesh.space import Space, common_sphere
 from a2tg_jax.mesh.triangles import largest_clusters
+from a2tg_jax.results import meshing
 
 SIDE = 48
 RADIUS = 0.5
@@ -149,6 +154,15 @@ def test_distances_of_two_planes():
     assert a2tg.surface_distance(np.zeros((0, 3)), half, threshold=1.0).chamfer == np.inf
 
 
+def test_points_are_drawn_in_parts_and_bounded(sphere, monkeypatch):
+    whole = a2tg.sample_surface(sphere, 0.05)
+    monkeypatch.setattr(distance, "CHUNK", 100)
+    np.testing.assert_array_equal(a2tg.sample_surface(sphere, 0.05), whole)
+    assert len(whole) > 1000
+    with pytest.raises(ValueError, match=r"spacing 1e-06 takes 3\.\d+e\+12 points"):
+        a2tg.sample_surface(sphere, 1e-6)
+
+
 # Files
 
 
@@ -165,7 +179,9 @@ def test_files_are_read_back_by_another_library(sphere, tmp_path, suffix):
     (path,) = a2tg.save_mesh(tmp_path / f"mesh{suffix}", sphere, similarity)
     read = trimesh.load(path, force="mesh", process=False)
     np.testing.assert_array_equal(read.faces, sphere.faces)
-    np.testing.assert_allclose(read.vertices, similarity.inverse().apply(sphere.vertices), atol=1e-5)
+    placed = upright_from(2.0, "y").apply(sphere.vertices)
+    wanted = placed if suffix == ".glb" else similarity.inverse().apply(sphere.vertices)
+    np.testing.assert_allclose(read.vertices, wanted, atol=1e-5)
     if suffix == ".ply":
         np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], sphere.colors)
 
@@ -180,6 +196,30 @@ def test_colors_of_glb_are_linear_and_far_positions_exact(tmp_path):
     colors = np.frombuffer(data, "<u2", 4, root["bufferViews"][1]["byteOffset"])
     assert list(colors) == [0, round(65535 * ((188 / 255 + 0.055) / 1.055) ** 2.4), 65535, 65535]
     assert b"property double x" in a2tg.save_mesh(tmp_path / "far.ply", mesh)[0].read_bytes()
+
+
+def test_the_mesh_and_the_splats_of_a_model_lie_on_each_other(model, tmp_path):
+    """Their nodes are equal, and both keep the positions of the model's world."""
+    transform = model.origin.transform
+    a2tg.save_gltf(tmp_path / "splats.glb", model)
+    corners = a2tg.Mesh(np.asarray(model.gaussians.means), np.array([[0, 1, 2]], np.int32))
+    a2tg.save_mesh(tmp_path / "mesh.glb", corners, transform)
+    (splats, means), (mesh, positions) = (
+        glb_parts((tmp_path / name).read_bytes()) for name in ("splats.glb", "mesh.glb")
+    )
+    assert splats["nodes"][0]["matrix"] == mesh["nodes"][0]["matrix"]
+    size = 12 * model.num
+    assert splats["bufferViews"][0] == mesh["bufferViews"][0] and means[:size] == positions[:size]
+
+
+def test_all_files_of_a_mesh_are_told_beforehand(tmp_path):
+    corners, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)
+    mesh = a2tg.Mesh(corners, faces, uv=np.eye(3)[:, :2], texture=np.zeros((4, 4, 3), np.uint8))
+    for suffix in (".glb", ".ply", ".obj"):
+        path = tmp_path / suffix[1:] / f"mesh{suffix}"
+        path.parent.mkdir()
+        written = a2tg.save_mesh(path, mesh)
+        assert written == mesh_files(path, has_texture=True) and set(path.parent.iterdir()) == set(written)
 
 
 # From a model
@@ -226,7 +266,9 @@ def test_one_camera_looks_at_what_it_sees(model):
         ({"resolution": 0}, "resolution must lie in"),
         ({"resolution": 10, "voxel": 0.1}, "resolution and voxel both"),
         ({"resolution": None, "voxel": np.nan}, "voxel must be positive"),
-        ({"least_faces": 10**6}, "parts had fewer than 1000000 faces"),
+        ({"least_faces": 10**6}, "parts? had fewer than 1000000 faces: raise the resolution, or lower least_faces"),
+        ({"most_clusters": 0}, "most_clusters must be at least 1"),
+        ({"max_bytes": 0}, "max_bytes must be positive"),
         ({"cameras": []}, "there are no cameras"),
     ],
 )
@@ -279,7 +321,15 @@ def test_the_command_writes_the_original_world(model, tmp_path, capsys):
         ("mesh bare.npz --out mesh.stl", "--out must end in .glb, .ply or .obj"),
         ("mesh bare.npz --max-memory much", "--max-memory must be a number of MB"),
         ("mesh cameras.npz --resolution 0", "--resolution must lie in"),
-        ("mesh cameras.npz --radius 0.1", "give a larger --radius, or --unbounded"),
+        ("mesh nowhere --voxel -1", "--voxel must be positive and finite; got -1"),
+        ("mesh nowhere --radius nan", "--radius must be positive"),
+        ("mesh nowhere --clusters 0", "--clusters must be at least 1; got 0"),
+        ("mesh nowhere --max-memory 1000000GB", "--max-memory must be at most"),
+        ("mesh cameras.npz --radius 0.1", "within 0.1 units of the point that the cameras look at: give a larger"),
+        ("mesh cameras.npz --voxel 2", "parts had fewer than 50 faces: raise --resolution or lower --voxel"),
+        ("mesh cameras.npz --out taken.ply", "taken.ply exists; add --overwrite"),
+        ("mesh taken.npz", "taken-mesh.glb exists; add --overwrite"),
+        ("mesh taken.ply --out taken.ply --overwrite", "taken.ply is the model itself; choose another --out"),
         ("mesh cameras.npz --resolution 2000 --max-memory 1MB", "lower --resolution"),
     ],
 )
@@ -289,9 +339,29 @@ def test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, arguments
     monkeypatch.chdir(tmp_path)
     a2tg.save_model("cameras.npz", model)
     a2tg.save_model("bare.npz", a2tg.Model(model.gaussians))
+    a2tg.save_model("taken.npz", model)
+    for name in ("taken.ply", "taken-mesh.glb", "taken.png"):
+        (tmp_path / name).touch()
     assert cli.main(arguments.split()) == 2
     error = capsys.readouterr().err
     assert message in error.splitlines()[-1]
+
+
+def test_a_lack_of_memory_is_one_line(model, tmp_path, monkeypatch, capsys):
+    def without_memory(*arguments, **options):
+        raise MemoryError
+
+    monkeypatch.setattr(meshing, "extract_mesh", without_memory)
+    message = "the memory does not suffice: lower --resolution, --radius or --max-memory"
+    test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, "mesh cameras.npz", message)
+
+
+def test_a_simplified_mesh_is_not_empty(sphere, monkeypatch):
+    empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    library = types.SimpleNamespace(simplify=lambda *arguments, **options: empty)
+    monkeypatch.setitem(sys.modules, "fast_simplification", library)
+    with pytest.raises(ValueError, match=r"no faces are left of [0-9,]*: ask for more faces than 4"):
+        a2tg.simplify_mesh(sphere, 4)
 
 
 # Textures
@@ -373,6 +443,19 @@ def test_dtu_counts_what_was_observed_above_the_table():
     assert found.accuracy == 0 and found.completeness > 1
 
 
+def test_a_matrix_of_another_shape_and_a_missing_reader_are_told(tmp_path, monkeypatch):
+    path = tmp_path / "world.txt"
+    for text in ("1 2 3", "1 2\n3", "one"):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"world.txt: must hold .* 4 × 4 matrix"):
+            surface_quality.read_matrix(path)
+    np.savetxt(path, np.eye(4))
+    np.testing.assert_array_equal(surface_quality.read_matrix(path), np.eye(4))
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(ValueError, match=r"trimesh: pip install 'a2tg-jax\[experiments\]'"):
+        surface_quality.read_mesh(tmp_path / "mesh.ply")
+
+
 def test_the_preset_for_surfaces_has_their_losses():
     terms = a2tg.Gaussians2d.preset("surfaces").stages()[0].losses
     assert [term.function.__name__ for term in terms[1:]] == ["normals"]
@@ -384,7 +467,9 @@ def test_the_preset_for_surfaces_has_their_losses():
         ("--texture renders --out mesh.ply", "a PLY file holds no texture"),
         ("--texture renders --texture-size 5", "--texture-size must lie in"),
         ("--texture photographs", "the photographs of cameras are missing"),
-        ("--faces 0", "--faces must be at least 1"),
+        ("--texture renders --texture-size 8193", "--texture-size must lie in 16..8192 texels"),
+        ("--texture renders --out taken.obj", "taken.png exists; add --overwrite"),
+        ("--faces 3", "--faces must be at least 4"),
     ],
 )
 def test_mistakes_of_textures(model, tmp_path, monkeypatch, capsys, arguments, message):

@@ -8,8 +8,9 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.events import from_options
+from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
-from a2tg_jax.results.output import check_new, check_output
+from a2tg_jax.results.output import check_new, check_not_source, check_output
 from a2tg_jax.results.viewing import open_source
 
 
@@ -17,8 +18,8 @@ from a2tg_jax.results.viewing import open_source
 class Mesh:
     """Write the surface of a trained scene as triangles, by fusion of rendered depths.
 
-    GLB, PLY or OBJ, in the original world of the photographs, which are read for a texture only. Surfaces are best if
-    the scene was trained with --system gaussians-2d --preset surfaces.
+    GLB stands upright with the lengths of the original world, PLY and OBJ are in the original world. Photographs are
+    read for a texture only. Surfaces are best if the scene was trained with --system gaussians-2d --preset surfaces.
 
     Examples:
       a2tg mesh runs/fox
@@ -29,7 +30,7 @@ class Mesh:
 
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
     """Run folder, or model with cameras (*.npz or *.a2tgz)."""
-    out: Annotated[Path | None, defaulting_to("RUN/mesh.glb, or NAME.glb beside the model", "FILE")] = None
+    out: Annotated[Path | None, defaulting_to("RUN/mesh.glb, or NAME-mesh.glb beside the model", "FILE")] = None
     """Output file, *.glb, *.ply or *.obj."""
     resolution: Annotated[int | None, defaulting_to("512, unless --voxel is given", "N")] = None
     """Voxels along the radius."""
@@ -52,15 +53,20 @@ class Mesh:
     model: LastModel = None
     """Name of a run's model, as a2tg info prints it."""
     overwrite: bool = False
-    """Replace the file that --out names."""
+    """Replace files that exist. RUN/mesh.glb, the default of a run, is always replaced."""
 
     def run(self) -> None:
-        own = self.source / "mesh.glb" if self.source.is_dir() else self.source.with_suffix(".glb")
-        out = self.out or own
+        is_run = self.source.is_dir()
+        out = self.out or self.source / "mesh.glb"
+        if self.out is None and not is_run:
+            out = self.source.with_name(f"{self.source.stem}-mesh.glb")
         options = from_options(MeshOptions, self)
         options.check(out)
+        files = mesh_files(out, has_texture=options.texture != "none")
+        check_not_source(files, self.source, "--out")
         source = open_source(self.source, self.model)
         check_output(out)
-        if self.out is not None:
-            check_new(out, "--out", overwrite=self.overwrite)
+        if self.out is not None or not is_run:
+            for file in files:
+                check_new(file, "--out", overwrite=self.overwrite)
         print(write_mesh(source, out, options))

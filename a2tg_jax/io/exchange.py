@@ -89,13 +89,22 @@ def gaussians_of(splats: Splats, path: str | os.PathLike[str], *, is_flat: bool)
     return Gaussians(*(jnp.asarray(values, jnp.float32) for values in numbers))
 
 
+def linear_colors(colors: np.ndarray) -> np.ndarray:
+    """Return linear colours of sRGB colours in [0, 1]."""
+    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+
+
 # Worlds
 
 
 def upright(origin: Origin | None, up: Up) -> Similarity:
     """Return the similarity from a model's world to that of a file with this axis up."""
-    scale = 1.0 if origin is None else 1.0 / float(origin.transform.scale)
-    return Similarity(scale, UPRIGHT[up], np.zeros(3))
+    return upright_from(1.0 if origin is None else float(origin.transform.scale), up)
+
+
+def upright_from(scale: float, up: Up) -> Similarity:
+    """Return the same, given the factor of lengths from the original world to the model's."""
+    return Similarity(1.0 / scale, UPRIGHT[up], np.zeros(3))
 
 
 def matrix_of(similarity: Similarity) -> np.ndarray:

@@ -21,6 +21,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.exchange import (
     Splats,
     gaussians_of,
+    linear_colors,
     matrix_of,
     origin_from_json,
     origin_to_json,
@@ -131,8 +132,7 @@ def _primitive(builder: Builder, model: Model, texels: TexelKind | None) -> dict
 def _point_colors(splats: Splats) -> np.ndarray:
     """Return linear RGB and opacity [N, 4] as bytes, for programs that show points."""
     shown = np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0)
-    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
-    colors = np.concatenate([linear, splats.opacities[:, None]], axis=1)
+    colors = np.concatenate([linear_colors(shown), splats.opacities[:, None]], axis=1)
     rounded: np.ndarray = np.rint(255 * colors).astype(np.uint8)
     return rounded
 

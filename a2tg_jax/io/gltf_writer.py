@@ -50,12 +50,16 @@ class Builder:
         if has_bounds:
             accessor |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
         data = np.ascontiguousarray(columns, np.dtype(COMPONENTS[code])).tobytes()
-        view = {"buffer": 0, "byteOffset": self._num_bytes, "byteLength": len(data)}
-        self._views.append(view | ({"target": ARRAY_BUFFER} if is_attribute else {}))
-        self._pieces.append(data + bytes(-len(data) % 4))
-        self._num_bytes += len(self._pieces[-1])
+        self.add_bytes(data, **({"target": ARRAY_BUFFER} if is_attribute else {}))
         self.accessors.append(accessor)
         return len(self.accessors) - 1
+
+    def add_bytes(self, data: bytes, **options: Any) -> int:
+        """Add bytes, such as an image, and return the index of their buffer view, which has these options."""
+        self._views.append({"buffer": 0, "byteOffset": self._num_bytes, "byteLength": len(data), **options})
+        self._pieces.append(data + bytes(-len(data) % 4))
+        self._num_bytes += len(self._pieces[-1])
+        return len(self._views) - 1
 
     def save(self, path: Path, described: Mapping[str, Any]) -> None:
         """Write the file, *.gltf with a *.bin beside it, any other name as one *.glb.

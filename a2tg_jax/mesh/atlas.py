@@ -10,7 +10,7 @@ from a2tg_jax.mesh.triangles import Mesh
 
 PADDING = 2
 """Texels between charts."""
-SMALLEST_SIDE, LARGEST_SIDE = 16, 16_384
+SMALLEST_SIDE, LARGEST_SIDE = 16, 8_192
 
 
 class Texels(NamedTuple):

@@ -7,6 +7,11 @@ from scipy.spatial import cKDTree
 
 from a2tg_jax.mesh.triangles import Mesh
 
+MOST_POINTS = 200_000_000
+"""Largest number of points of a sample, of 24 bytes each and as much again while they are drawn."""
+CHUNK = 1 << 20
+"""Points that are placed at a time."""
+
 
 class SurfaceDistance(NamedTuple):
     """Distances of a surface from its reference, in units of their world."""
@@ -57,17 +62,27 @@ def surface_distance(
 
 
 def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
-    """Return random points [P, 3] on a mesh, evenly by area, one for each square of side `spacing`."""
+    """Return random points [P, 3] on a mesh, evenly by area, one for each square of side `spacing`.
+
+    Raises:
+      ValueError: if these are more than 200,000,000.
+    """
     areas = np.linalg.norm(mesh.face_normals, axis=1) / 2
-    num = int(np.ceil(areas.sum() / spacing**2)) if len(areas) else 0
+    wanted = np.ceil(areas.sum() / spacing**2) if len(areas) else 0
+    if not wanted <= MOST_POINTS:
+        raise ValueError(f"spacing {spacing:g} takes {wanted:.3g} points; give one for up to {MOST_POINTS:,}")
+    num = int(wanted)
+    points = np.zeros((num, 3))
     if not num:
-        return np.zeros((0, 3))
+        return points
     rng = np.random.default_rng(seed)
     ends = np.cumsum(areas)
     chosen = np.searchsorted(ends, (np.arange(num) + rng.uniform(size=num)) * (ends[-1] / num))
     a, b = np.sqrt(rng.uniform(size=num)), rng.uniform(size=num)
-    weights = np.stack([1 - a, a * (1 - b), a * b], -1)
-    points: np.ndarray = np.einsum("pk,pkc->pc", weights, mesh.corners[np.minimum(chosen, len(areas) - 1)])
+    chosen = np.minimum(chosen, len(areas) - 1)
+    for part in (slice(start, start + CHUNK) for start in range(0, num, CHUNK)):
+        weights = np.stack([1 - a[part], a[part] * (1 - b[part]), a[part] * b[part]], -1)
+        points[part] = np.einsum("pk,pkc->pc", weights, mesh.vertices[mesh.faces[chosen[part]]])
     return points
 
 

@@ -32,7 +32,22 @@ MOST_CLUSTERS, LEAST_FACES = 50, 50
 
 
 class NoSurfaceError(ValueError):
-    """The views have no surface within the space."""
+    """The views have no surface within the space, or all its parts are small."""
+
+    def __init__(self, radius: float, num_dropped: int, least_faces: int):
+        """Keep the radius in units of the model's world, and how many parts had fewer than the least faces."""
+        self.radius, self.num_dropped, self.least_faces = radius, num_dropped, least_faces
+        what, advice = self.told(), "give a larger radius, or unbounded"
+        if num_dropped:
+            advice = "raise the resolution, or lower least_faces"
+        super().__init__(f"{what}: {advice}")
+
+    def told(self, scale: float = 1.0) -> str:
+        """Return what happened, with lengths divided by `scale`."""
+        if self.num_dropped:
+            parts = counted(self.num_dropped, "part")
+            return f"there are only small parts of a surface; {parts} had fewer than {self.least_faces} faces"
+        return f"there is no surface within {self.radius / scale:.3g} units of the point that the cameras look at"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,7 +126,11 @@ def extract_mesh(
     if not model.num or not cameras:
         what = "the model has no Gaussians" if not model.num else "there are no cameras"
         raise ValueError(f"a mesh needs views of some Gaussians; {what}")
-    _check_numbers(resolution, voxel, radius, max_bytes)
+    check_lengths(resolution, voxel, radius)
+    if not 0 < max_bytes < np.inf:
+        raise ValueError(f"max_bytes must be positive and finite; got {max_bytes}")
+    if most_clusters < 1:
+        raise ValueError(f"most_clusters must be at least 1; got {most_clusters}")
     renderer = Renderer(model, cameras=cameras, settings=settings)
     if center is None or radius is None:
         center, radius = _sphere(renderer, cameras, center, radius)
@@ -120,11 +139,7 @@ def extract_mesh(
     grid = _fused(renderer, cameras, space, max_bytes, progress)
     mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
     if not mesh.num_faces:
-        parts = f"; {counted(num_dropped, 'part')} had fewer than {least_faces} faces" if num_dropped else ""
-        raise NoSurfaceError(
-            f"there is no surface within {radius:.3g} units of the point that the cameras look at{parts}: give a "
-            "larger radius, or unbounded"
-        )
+        raise NoSurfaceError(radius, num_dropped, least_faces)
     seconds = time.perf_counter() - start
     return MeshResult(mesh, np.asarray(center), radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
 
@@ -152,13 +167,13 @@ def training_cameras(model: Model) -> list[Camera]:
     return [camera for camera, is_test in pairs if not is_test] or [camera for camera, _ in pairs]
 
 
-def _check_numbers(resolution: int | None, voxel: float | None, radius: float | None, max_bytes: int) -> None:
-    """Raise ValueError unless numbers of the voxels are positive, and at most one says their size."""
+def check_lengths(resolution: int | None, voxel: float | None, radius: float | None) -> None:
+    """Raise ValueError unless numbers of the space are positive, and at most one says their size."""
     if resolution is not None and voxel is not None:
         raise ValueError("resolution and voxel both say the size of voxels; give one of them")
     if resolution is not None and not 1 <= resolution <= 100_000:
         raise ValueError(f"resolution must lie in 1..100000 voxels along the radius; got {resolution}")
-    for name, value in (("voxel", voxel), ("radius", radius), ("max_bytes", max_bytes)):
+    for name, value in (("voxel", voxel), ("radius", radius)):
         if value is not None and not 0 < value < np.inf:
             raise ValueError(f"{name} must be positive and finite; got {value}")
 

@@ -8,7 +8,7 @@ from PIL import Image
 
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.mesh.gltf import glb_of
+from a2tg_jax.mesh.gltf import save_glb
 from a2tg_jax.mesh.triangles import Mesh
 
 SUFFIXES = (".glb", ".ply", ".obj")
@@ -20,17 +20,25 @@ def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
         raise ValueError(f"{name} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}; got {path}")
 
 
+def mesh_files(path: str | os.PathLike[str], *, has_texture: bool) -> list[Path]:
+    """Return the files that `save_mesh` writes for a path, that one first."""
+    path = Path(path)
+    beside = (".mtl", ".png") if has_texture and path.suffix.lower() == ".obj" else ()
+    return [path, *(path.with_suffix(suffix) for suffix in beside)]
+
+
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | None = None) -> list[Path]:
     """Write a mesh as GLB, PLY or OBJ, by the suffix of the path.
 
     GLB holds the texture or linear colours of vertices, unlit, as the photographs show them. PLY holds colours of
-    vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl beside it.
+    vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl beside it. PLY and OBJ are in
+    the original world. GLB stands upright, with +y up and the original lengths, as the splats of `save_gltf` do.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
       mesh: a mesh.
-      transform: transform from the original world to that of the mesh, such as `model.origin.transform`; the mesh is
-        brought back to the original world. None writes it as it is.
+      transform: transform from the original world to that of the mesh, such as `model.origin.transform`. None writes
+        the mesh as it is, in each format.
 
     Returns:
       The files written, the given one first.
@@ -40,13 +48,15 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     """
     check_mesh_suffix(path)
     path = Path(path)
-    mesh = mesh if transform is None else mesh.transform(transform.inverse())
     suffix = path.suffix.lower()
+    if suffix == ".glb":
+        save_glb(path, mesh, None if transform is None else float(transform.scale))
+        return [path]
+    mesh = mesh if transform is None else mesh.transform(transform.inverse())
     if suffix == ".obj":
         return _save_obj(path, mesh)
-    content = glb_of(mesh) if suffix == ".glb" else _ply_of(mesh)
     with replacing(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(_ply_of(mesh))
     return [path]
 
 
@@ -80,15 +90,14 @@ def needs_doubles(vertices: np.ndarray) -> bool:
 
 def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
     """Write an OBJ file, with a material and a picture if there is a texture."""
-    lines, written = ["# triangles"], [path]
+    lines, written = ["# triangles"], mesh_files(path, has_texture=mesh.texture is not None)
     if mesh.texture is not None:
-        material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
+        _, material, picture = written
         lines += [f"mtllib {material.name}", "usemtl texture"]
         with replacing(picture) as temporary:
             Image.fromarray(mesh.texture).save(temporary, "PNG")
         with replacing(material) as temporary:
             temporary.write_text(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n")
-        written += [material, picture]
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         rows = mesh.vertices

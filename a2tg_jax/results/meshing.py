@@ -15,10 +15,17 @@ from a2tg_jax.data import view_image
 from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.mesh.atlas import check_texture
 from a2tg_jax.mesh.blocks import GridFullError
-from a2tg_jax.mesh.extract import MOST_CLUSTERS, MeshResult, NoSurfaceError, extract_mesh, training_cameras
+from a2tg_jax.mesh.extract import (
+    MOST_CLUSTERS,
+    MeshResult,
+    NoSurfaceError,
+    check_lengths,
+    extract_mesh,
+    training_cameras,
+)
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.simplify import check_simplifying, simplify_mesh
-from a2tg_jax.mesh.texture import Picture, texture_mesh
+from a2tg_jax.mesh.texturing import Picture, texture_mesh
 from a2tg_jax.mesh.triangles import Mesh
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.viewing import Source
@@ -27,11 +34,11 @@ GRID_SHARE = 0.5
 """Share of the free memory that voxels may take by default."""
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
-ADVICE = {
-    GridFullError: "lower --resolution or --radius, or raise --max-memory",
-    NoSurfaceError: "give a larger --radius, or --unbounded",
-}
-"""Advice of the command line by error."""
+GRID_FULL = "lower --resolution or --radius, or raise --max-memory"
+NO_MEMORY = "lower --resolution, --radius or --max-memory"
+NO_SURFACE = "give a larger --radius, or --unbounded"
+SMALL_PARTS = "raise --resolution or lower --voxel, or train longer or from more views"
+"""Advice of the command line, by what went wrong."""
 TextureSource = Literal["none", "renders", "photographs"]
 
 
@@ -66,7 +73,12 @@ class MeshOptions:
     def check(self, out: Path) -> None:
         """Raise ValueError before anything is computed if an option is invalid or a library is missing."""
         check_mesh_suffix(out, "--out")
-        megabytes_of(self.max_memory, "max_memory")
+        check_lengths(self.resolution, self.voxel, self.radius)
+        if self.clusters < 1:
+            raise ValueError(f"clusters must be at least 1; got {self.clusters}")
+        megabytes, most = megabytes_of(self.max_memory, "max_memory"), memory_limit()
+        if megabytes is not None and bytes_of(megabytes) > most:
+            raise ValueError(f"max_memory must be at most {in_bytes(most)}, the free memory; got {self.max_memory}")
         if self.texture != "none":
             if out.suffix.lower() == ".ply":
                 raise ValueError("a PLY file holds no texture: choose --out NAME.glb or NAME.obj, or --texture none")
@@ -76,7 +88,7 @@ class MeshOptions:
 
 
 def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
-    """Extract the mesh of a model, write it in the original world, and return a summary.
+    """Extract the mesh of a model, write it as `save_mesh` does, and return a summary.
 
     Raises:
       ValueError: if the model has no cameras or no surface, the photographs are missing, or the voxels need too much
@@ -142,8 +154,12 @@ def _extracted(source: Source, options: MeshOptions) -> MeshResult:
             settings=source.settings,
             progress=True,
         )
-    except (GridFullError, NoSurfaceError) as error:
-        raise ValueError(f"{str(error).partition(': ')[0]}: {ADVICE[type(error)]}") from None
+    except GridFullError as error:
+        raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
+    except NoSurfaceError as error:
+        raise ValueError(f"{error.told(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
+    except MemoryError:
+        raise ValueError(f"the memory does not suffice: {NO_MEMORY}") from None
 
 
 def _summary(result: MeshResult, mesh: Mesh, scale: float, files: list[Path], seconds: float) -> str:

@@ -3,6 +3,7 @@
 import os
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -36,3 +37,10 @@ def check_new(path: Path, flag: str, *, overwrite: bool) -> None:
     """Raise FileExistsError if a file would be replaced without --overwrite, naming it and the flag it comes from."""
     if path.is_file() and not overwrite:
         raise FileExistsError(f"{path} exists; add --overwrite to replace it, or choose another {flag}")
+
+
+def check_not_source(files: Iterable[Path], source: Path, flag: str) -> None:
+    """Raise ValueError if one of the files to write is the file that is read, naming it and its flag."""
+    for file in files:
+        if file.exists() and source.exists() and file.samefile(source):
+            raise ValueError(f"{file} is the model itself; choose another {flag}")
