@@ -9,14 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-<<<<<<< HEAD
 sys.path.append(str(Path(__file__).parents[1]))  # Last, so that the installed package comes first.
 
-from benchmarks import bounds, stages
-=======
 from a2tg_jax.data.synthetic import still_life
 from benchmarks import bounds, meshes, stages
->>>>>>> meshfix
 from benchmarks.tables import bounds as bounds_table
 
 
