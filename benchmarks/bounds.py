@@ -46,7 +46,7 @@ SAMPLE = 1_024
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """What a view makes the kernels do."""
+    """Counts of the kernels' work in a view."""
 
     num: int
     num_pixels: int
@@ -59,7 +59,7 @@ class Work:
     composited: float
     """Pairs of a splat and a pixel that are composited."""
     textured: float
-    """Those of splats with more than one texel."""
+    """Pairs of splats with more than one texel."""
     num_texels: int
 
 

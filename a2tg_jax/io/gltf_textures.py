@@ -29,7 +29,7 @@ RANGES = {"rgb": slice(0, 3), "alpha": slice(3, 4)}
 
 
 class Shown(NamedTuple):
-    """What splats show besides their own colours."""
+    """Textures and degrees of splats, beside their own colours."""
 
     appearance: Appearance
     sizes: np.ndarray | None

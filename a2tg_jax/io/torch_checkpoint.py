@@ -127,7 +127,7 @@ KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
     ("_codecs", "encode"): _Ignored,
     ("torch", "device"): _Ignored,
 }
-"""What a pickle may name, and what is called in its place."""
+"""Names that a pickle may hold, and the functions called in their place."""
 
 
 class _Unpickler(pickle.Unpickler):

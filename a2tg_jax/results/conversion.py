@@ -31,7 +31,7 @@ class Converted:
     lost: tuple[str, ...]
     seconds: float
     baked: str = ""
-    """What baking did, in words."""
+    """Result of baking, in words."""
 
     @property
     def text(self) -> str:

@@ -1,1 +1,1 @@
-"""What other programs read of the files that a2tg convert writes."""
+"""Files of `a2tg convert`, read by other programs."""

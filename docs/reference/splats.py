@@ -1,4 +1,4 @@
-"""What the readers of all formats share."""
+"""Functions that the readers of all formats share."""
 
 import numpy as np
 
