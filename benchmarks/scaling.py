@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import RenderSettings
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
@@ -32,13 +33,12 @@ WIDTH, HEIGHT = 1600, 1060
 PROBE, CUTOFF = 4, 1
 STATES = 4
 """Parameters, their gradients, and the two moments of Adam."""
-BYTES = 4
 
 
 def row_bytes() -> tuple[int, int]:
     """Return the bytes of a travelling row, and of its gradient."""
     splat = num_numbers(True, 3) + PROBE
-    return BYTES * (splat + CUTOFF), BYTES * splat
+    return BYTES_PER_FLOAT * (splat + CUTOFF), BYTES_PER_FLOAT * splat
 
 
 def counted(num: int, devices: int) -> dict[str, float]:
@@ -56,7 +56,7 @@ def counted(num: int, devices: int) -> dict[str, float]:
     return {
         "gaussians": num,
         "devices": devices,
-        "state_bytes_per_device": BYTES * STATES * floats_per_gaussian(3) * num / devices,
+        "state_bytes_per_device": BYTES_PER_FLOAT * STATES * floats_per_gaussian(3) * num / devices,
         "rows_received": float(per_pair.sum(axis=1).max()),
         "least_bytes": float(least * (forward + back)),
         "sent_bytes": float(sent * (forward + back)),

@@ -59,7 +59,7 @@ def load(path: Path) -> Model:
 
 
 def numbers(model: Model) -> dict[str, np.ndarray]:
-    """What a reader must find, in the order of the file."""
+    """Numbers that a reader must find, in the order of the file."""
     arrays = model.appearance.arrays(model.params, model.layout)
     fields = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales", "opacities")}
     fields |= {"degrees": arrays["degrees"], "sh": model.sh}

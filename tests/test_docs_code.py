@@ -18,7 +18,7 @@ REAL_FIT = inspect.signature(a2tg.fit)
 
 
 def run(page: str, names: dict, replaced: dict[str, str] | None = None) -> dict:
-    """What the names stand for after the last block of Python of a page."""
+    """Values of the names after the last block of Python of a page."""
     text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
     for number, block in enumerate(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)):
         for old, new in (replaced or {}).items():
@@ -28,7 +28,7 @@ def run(page: str, names: dict, replaced: dict[str, str] | None = None) -> dict:
 
 
 def untrained(*args, **kwargs):
-    """In place of `fit`: the model that the last stage of a system begins with, at once."""
+    """Stand-in for `fit`: the untrained model with which the last stage of a system begins."""
     given = REAL_FIT.bind(*args, **kwargs).arguments
     scene, system = given["scene"], given["system"]
     system.check()

@@ -136,7 +136,7 @@ def test_positions_beyond_a_format_are_refused_or_told(tmp_path):
 
 @pytest.mark.parametrize(("suffix", "num"), [(".spz", 5), (".splat", 3), (".ksplat", 3), (".compressed.ply", 2)])
 def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
-    """As many as come back changed."""
+    """The count is that of the Gaussians that come back changed."""
     needs_gaussforge()
     g = small_scene().gaussians
     sh = g.sh.at[:3, 0, 0].set(4).at[3:5, 15, 2].set(-5)

@@ -49,7 +49,7 @@ def test_the_reference_reader_finds_what_this_library_finds(reference, name):
 
 
 def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path):
-    """By the rules of the page alone."""
+    """It follows the rules of the page alone."""
     read_model, draw = reference
     model, options = reference_model(), {"outside": "identity"}
     appearance = Banded(Textured(options=TextureOptions(**options)))

@@ -72,8 +72,8 @@ def texels_of(mesh: Mesh, size: int) -> Texels:
     corners = (mesh.uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
     drawn = draw(corners, np.ones(mesh.faces.shape, np.float32), size, size)
     place = np.flatnonzero(drawn.face >= 0)
-    faces, weights = mesh.faces[drawn.face.reshape(-1)[place]], drawn.weights.reshape(-1, 3)[place]
-    normals = mesh.face_normals[drawn.face.reshape(-1)[place]]
+    hit, weights = drawn.face.reshape(-1)[place], drawn.weights.reshape(-1, 3)[place]
+    faces, normals = mesh.faces[hit], mesh.face_normals[hit]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     colors = np.full((mesh.num_vertices, 3), 128, np.uint8) if mesh.colors is None else mesh.colors
     position, color = (

@@ -54,9 +54,9 @@ class Mesh:
     @property
     def vertex_normals(self) -> np.ndarray:
         """[V, 3] unit normals of the vertices, the means of their faces' by area; zero at vertices without faces."""
-        normals = np.zeros((self.num_vertices, 3))
+        normals, of_faces = np.zeros((self.num_vertices, 3)), self.face_normals
         for corner in range(3):
-            np.add.at(normals, self.faces[:, corner], self.face_normals)
+            np.add.at(normals, self.faces[:, corner], of_faces)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.where(length > 0, length, 1.0), np.float32)
 

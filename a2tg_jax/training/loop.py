@@ -384,8 +384,8 @@ class StageRun:
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
         """Return the exchange with room for the rows that travel in some views once all rows exist."""
         model, rows = self.state.model, self.state.model.gaussians.num // exchange.num
-        settings = RenderSettings(tile_size=self.system.tile_size, exchange=exchange)
-        most = max(rows_of_view(model.gaussians, one, model.rule, settings, model.num_live) for one in cameras)
+        settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
+        most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)
         share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
         return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity)
 
