@@ -20,7 +20,7 @@ from a2tg_jax.densify.pruning import Prune, blending_weights
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
-from a2tg_jax.systems.bytewise import PruneConfig
+from a2tg_jax.systems.stage1 import PruneConfig
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 

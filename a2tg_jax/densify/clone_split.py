@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.appearance.copies import shared_opacities
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.events import (
@@ -66,6 +67,8 @@ class CloneSplitPrune(StepEvent):
     """Smallest opacity; fainter Gaussians are pruned."""
     largest_share: float = 0.1
     """Largest size as a share of scene_scale; larger Gaussians are pruned after the first reset of opacities."""
+    shares_opacity: bool = static(default=False)
+    """Whether a Gaussian and its clone share the opacity, 1 − √(1 − o) each (Rota Bulò et al., 2024)."""
 
     impossible: ClassVar[str] = "adaptive density control would prune every Gaussian: lower {least_opacity}"
     refused: ClassVar[str] = "raise {cap}"
@@ -92,6 +95,8 @@ class CloneSplitPrune(StepEvent):
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         edit, num_refused = self.plan(now, model, state.average())
+        if self.shares_opacity:
+            model = with_shared_opacities(model, edit.is_cloned)
         model, moments = apply_edit(now.keys[0], edit, model, moments)
         return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
 
@@ -193,6 +198,15 @@ def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tupl
     model = gather_rows(model, rows)
     gaussians = halved(key, model.gaussians, is_half)
     return dataclasses.replace(model, gaussians=gaussians, num_live=num_kept + num_copies), moments
+
+
+def with_shared_opacities(model: Model, is_cloned: Array) -> Model:
+    """Return the model whose marked rows [N] are as opaque as before once there are two of them."""
+    logits = model.gaussians.logit_opacities
+    shared = logit(shared_opacities(logits, jnp.full_like(logits, 2.0)))
+    # What is below the least opacity of a copy keeps its own.
+    logits = jnp.where(is_cloned, jnp.minimum(shared, logits), logits)
+    return dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, logit_opacities=logits))
 
 
 def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:

@@ -14,14 +14,22 @@ from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import Event, from_options, iterations_at
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
-from a2tg_jax.systems.stage1 import LOOKUP_RANGES, MCMC_OPTIONS, QUICK, SMOKE, growing_stage, later_stage
+from a2tg_jax.systems.stage1 import (
+    LOOKUP_RANGES,
+    MCMC_OPTIONS,
+    PRUNE_OPTIONS,
+    PRUNE_RANGES,
+    QUICK,
+    SMOKE,
+    PruneConfig,
+    growing_stage,
+    later_stage,
+)
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
-LAST_PRUNING = 0.8
-"""Latest fraction of the first stage at which Gaussians are pruned; growth ends at 5/6."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,16 +38,6 @@ class CapConfig:
 
     cap: int = 2_000_000
     """Size of the model, as a number of Gaussians without view dependence and textures."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PruneConfig:
-    """Pruning of the Gaussians that show least; others grow in their place."""
-
-    share: float = Prune.share
-    """Share of the Gaussians to prune each time; 0: none before the end of the stage."""
-    at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-    """Fractions of the first stage, up to 0.8. Short stages leave out those after the last growth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,11 +87,10 @@ class Bytewise(System):
 
     name: ClassVar[str] = "bytewise"
     version: ClassVar[int] = 2
-    ranges: ClassVar[Ranges] = LOOKUP_RANGES
+    ranges: ClassVar[Ranges] = {**LOOKUP_RANGES, **PRUNE_RANGES}
     event_options: ClassVar[Mapping[str, str]] = {
         **MCMC_OPTIONS,
-        "Prune.share": "prune.share",
-        "Prune.at": "prune.at",
+        **PRUNE_OPTIONS,
         "AdaptDegrees.at": "view_dependence.at",
         "AdaptDegrees.idle": "view_dependence.idle",
         "AdaptDegrees.highest": "sh_degree",
@@ -115,15 +112,7 @@ class Bytewise(System):
         """Return the events that fill all bytes, prune during growth, and finally make room for details."""
         grow = SplitByGradient(self._num_gaussians())
         last = (Prune(keep=self._num_kept()),) if self._share else ()
-        return Noise(), grow, *self._pruning(), *last
-
-    def _pruning(self) -> tuple[Event, ...]:
-        """Prune while others grow; never if the share is 0."""
-        if not self.prune.share:
-            return ()
-        num, last_growth = self.stage1_iterations, densify_times(self.stage1_iterations).last_time
-        at = tuple(fraction for fraction in self.prune.at if round(fraction * num) < last_growth)
-        return (from_options(Prune, self.prune, at=at),) if at else ()
+        return Noise(), grow, *self.prune.events(self.stage1_iterations, densify_times), *last
 
     @property
     def _share(self) -> float:
@@ -176,7 +165,6 @@ class Bytewise(System):
         view, texture = self.view_dependence, self.texture
         ranges = {
             "base_degree": (self.base_degree, 0, self.sh_degree),
-            "prune.share": (self.prune.share, 0, 0.9),
             "view_dependence.share": (view.share, 0, 1),
             "view_dependence.rate": (view.rate, 0, math.inf),
             "view_dependence.idle": (view.idle, 0, math.inf),
@@ -213,13 +201,6 @@ class Bytewise(System):
         for name, found in times.items():
             if not found:
                 raise ValueError(f"{name} must say when its share of the bytes is spent; it is empty")
-        if self.prune.share:
-            iterations_at(self.prune.at, self.stage1_iterations, "prune.at")
-            if not self.prune.at or self.prune.at[-1] > LAST_PRUNING:
-                raise ValueError(
-                    f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
-                    f"what is pruned; got {shortened(self.prune.at)}: lower the last, or set prune.share to 0"
-                )
         if len(times) == 2 and times["view_dependence.at"][-1] > times["texture.at"][0]:
             raise ValueError(
                 "view_dependence.at must be over when textures begin to take the rest of the bytes, at "

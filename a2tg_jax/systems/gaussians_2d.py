@@ -4,14 +4,19 @@ import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar, Self
 
+from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.systems.stage1 import (
     DENSITY_OPTIONS,
     DENSITY_RANGES,
+    NO_PRUNING,
+    PRUNE_OPTIONS,
+    PRUNE_RANGES,
     QUICK,
     QUICK_CAP,
     SMOKE,
     SMOKE_CAP,
     DensityConfig,
+    PruneConfig,
     continued,
     growing_stage,
 )
@@ -31,13 +36,15 @@ class Gaussians2d(System):
     stage2_iterations: int = 0
     """Further iterations without densification; 0: none."""
     densify: DensityConfig = dataclasses.field(default_factory=DensityConfig)
+    prune: PruneConfig = NO_PRUNING
 
     name: ClassVar[str] = "gaussians-2d"
-    ranges: ClassVar[Ranges] = DENSITY_RANGES
-    event_options: ClassVar[Mapping[str, str]] = DENSITY_OPTIONS
+    ranges: ClassVar[Ranges] = {**DENSITY_RANGES, **PRUNE_RANGES}
+    event_options: ClassVar[Mapping[str, str]] = {**DENSITY_OPTIONS, **PRUNE_OPTIONS}
 
     def stages(self) -> tuple[Stage, ...]:
-        first = growing_stage(self, self.stage1_iterations, self.densify.events(self.budget_cap()))
+        pruning = self.prune.events(self.stage1_iterations, CloneSplitPrune().times)
+        first = growing_stage(self, self.stage1_iterations, (*self.densify.events(self.budget_cap()), *pruning))
         return continued(self, first, self.stage2_iterations)
 
     @classmethod

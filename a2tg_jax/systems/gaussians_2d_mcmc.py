@@ -5,17 +5,22 @@ import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar, Self
 
+from a2tg_jax.mcmc import densify_times
 from a2tg_jax.systems.stage1 import (
     MCMC_OPTIONS,
+    NO_PRUNING,
+    PRUNE_OPTIONS,
+    PRUNE_RANGES,
     QUICK,
     QUICK_CAP,
     SMOKE,
     SMOKE_CAP,
     McmcConfig,
+    PruneConfig,
     continued,
     growing_stage,
 )
-from a2tg_jax.training.options import System
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 
@@ -28,12 +33,15 @@ class Gaussians2dMcmc(System):
     stage2_iterations: int = 0
     """Further iterations without densification; 0: none."""
     densify: McmcConfig = dataclasses.field(default_factory=McmcConfig)
+    prune: PruneConfig = NO_PRUNING
 
     name: ClassVar[str] = "gaussians-2d-mcmc"
-    event_options: ClassVar[Mapping[str, str]] = MCMC_OPTIONS
+    ranges: ClassVar[Ranges] = PRUNE_RANGES
+    event_options: ClassVar[Mapping[str, str]] = {**MCMC_OPTIONS, **PRUNE_OPTIONS}
 
     def stages(self) -> tuple[Stage, ...]:
-        first = growing_stage(self, self.stage1_iterations, self.densify.events(self.budget_cap()))
+        pruning = self.prune.events(self.stage1_iterations, densify_times)
+        first = growing_stage(self, self.stage1_iterations, (*self.densify.events(self.budget_cap()), *pruning))
         return continued(self, first, self.stage2_iterations)
 
     @classmethod

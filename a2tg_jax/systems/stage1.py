@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 from a2tg_jax.appearance import Appearance, Plain
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity, OpacityReset
-from a2tg_jax.events import Event, from_options
+from a2tg_jax.densify.pruning import Prune
+from a2tg_jax.events import Event, Times, from_options, iterations_at
+from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import LearningRates, Stage
@@ -31,9 +34,14 @@ DENSITY_OPTIONS = {
     "CloneSplitPrune.cap": "densify.cap",
     "CloneSplitPrune.threshold": "densify.threshold",
     "CloneSplitPrune.least_opacity": "densify.least_opacity",
+    "CloneSplitPrune.shares_opacity": "densify.shares_opacity",
     "OpacityReset.most": "densify.reset_opacity",
 }
+PRUNE_OPTIONS = {"Prune.share": "prune.share", "Prune.at": "prune.at"}
 """Option that sets a field of an event (`System.event_options`)."""
+PRUNE_RANGES: Ranges = {"prune.share": (0, 0.9)}
+LAST_PRUNING = 0.8
+"""Latest fraction of the first stage at which Gaussians are pruned; MCMC's growth ends at 5/6."""
 DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0, 0.99)}
 
 
@@ -74,6 +82,8 @@ class DensityConfig:
     """Smallest opacity; fainter Gaussians are pruned."""
     reset_opacity: float = OpacityReset.most
     """Largest opacity after a reset, every max(500, n/10) of n iterations until n/2."""
+    shares_opacity: bool = CloneSplitPrune.shares_opacity
+    """Whether a Gaussian and its clone share the opacity, so that cloning makes nothing more opaque."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
         """Return the events: clone, split and prune; reset opacities.
@@ -87,6 +97,38 @@ class DensityConfig:
             raise ValueError(f"densify.reset_opacity must lie between 0 and 1; got {self.reset_opacity}")
         kind, cap = (CloneSplitPrune, self.cap) if budget_cap is None else (FillingDensity, budget_cap)
         return from_options(kind, self, cap=cap), OpacityReset(self.reset_opacity)
+
+
+@dataclasses.dataclass(frozen=True)
+class PruneConfig:
+    """Pruning of the Gaussians that show least; others grow in their place."""
+
+    share: float = Prune.share
+    """Share of the Gaussians to prune each time; 0: none before the end of the stage."""
+    at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+    """Fractions of the first stage, up to 0.8. Those after the last growth are left out."""
+
+    def events(self, num_iterations: int, growth: Callable[[int], Times]) -> tuple[Event, ...]:
+        """Return the event that prunes while others grow; none if the share is 0.
+
+        Args:
+          num_iterations: length of the stage.
+          growth: times of growth in a stage by its length.
+        """
+        if not self.share:
+            return ()
+        iterations_at(self.at, num_iterations, "prune.at")
+        if not self.at or self.at[-1] > LAST_PRUNING:
+            raise ValueError(
+                f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
+                f"what is pruned; got {shortened(self.at)}: lower the last, or set prune.share to 0"
+            )
+        last = growth(num_iterations).last_time
+        at = tuple(fraction for fraction in self.at if round(fraction * num_iterations) < last)
+        return (from_options(Prune, self, at=at),) if at else ()
+
+
+NO_PRUNING = PruneConfig(share=0.0)
 
 
 def growing_stage(
