@@ -156,6 +156,19 @@ def test_others_grow_where_some_were_pruned(scene):
     assert bits_of(again.model) == bits_of(result.model)
 
 
+@pytest.mark.parametrize("name", ["gaussians-2d", "gaussians-2d-mcmc"])
+def test_plain_systems_prune_and_grow_again(scene, name):
+    system = a2tg.find_system(name).preset("smoke")
+    system = dataclasses.replace(
+        system, stage1_iterations=200, memory_budget="30kB", initial_gaussians=None, sh_degree=0,
+        prune=PruneConfig(share=0.3, at=(0.2, 0.3)),
+    )  # fmt: skip
+    assert not any(isinstance(event, Prune) for event in a2tg.find_system(name).stages()[0].events)
+    result = a2tg.fit(scene, system, progress=False)
+    numbers = result.history.num_gaussians
+    assert (np.diff(numbers) < 0).any() and result.model.num == 30_000 // 52
+
+
 def test_what_other_events_have_gathered_follows(scene):
     run = StageRun(scene, SYSTEM, 0, initial_model(scene, SYSTEM))
     first = SYSTEM.stages()[0].events[2].iterations(200)[0]
