@@ -11,21 +11,20 @@ Each training is kept in OUT/dense_points.json as soon as it is measured, so tha
 OUT/dense_points.md.
 """
 
-import argparse
 import dataclasses
+import functools
 import time
 import warnings
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
+from lab.kept import KeptFigures, parser_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.host.memory import tidy_memory
-from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import SYSTEMS, find_system
 
 NUM_POINTS = (20_000, 100_000, 300_000)
@@ -95,26 +94,18 @@ def key_of(name: str, num_points: int, ratio: float) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of table and figures")
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__).parse_args()
     a2tg.configure_cpu()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "dense_points.json"
-    found = read_json(path) if path.is_file() else {}
+    kept = KeptFigures(arguments.out, "dense_points", table)
     for ratio in BUDGETS:
         for num in NUM_POINTS:
             wanted = {name: key_of(name, num, ratio) for name in SYSTEMS}
-            if found.keys() >= set(wanted.values()):
+            if kept.has_all(wanted.values()):
                 continue
             scene = dense_scene(num)
             for name, key in wanted.items():
-                if key not in found:
-                    found[key] = measured(scene, name, ratio)
-                    print(key, found[key], flush=True)
-                    write_json(path, found)
-                    (arguments.out / "dense_points.md").write_text(table(found), encoding="utf-8")
-    print(table(found))
+                kept.measure(key, functools.partial(measured, scene, name, ratio))
+    print(kept.table())
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ Each training is kept in OUT/few_views.json as soon as it is measured, so that a
 OUT/few_views.md.
 """
 
-import argparse
 import dataclasses
+import functools
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,10 +19,10 @@ from typing import Any
 
 from lab import tables
 from lab.interrupts import interruptible
+from lab.kept import KeptFigures, parser_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.host.memory import tidy_memory
-from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import find_system
 from a2tg_jax.training.registry import with_changes
 
@@ -99,27 +99,15 @@ def key_of(name: str, label: str) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", type=Path, required=True, help=f"folder of {', '.join(SCENES)}")
-    parser.add_argument("--out", type=Path, required=True, help="folder of table and figures")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "few_views.json"
-    found = read_json(path) if path.is_file() else {}
+    kept = KeptFigures(arguments.out, "few_views", table)
     for name, scene in captures(arguments.scenes):
         for label in METHODS:
-            key = key_of(name, label)
-            if key not in found:
-                found[key] = measured(scene, name, label)
-                print(
-                    key,
-                    {figure: round(value, 2) for figure, value in found[key].items()},
-                    flush=True,
-                )
-                write_json(path, found)
-                (arguments.out / "few_views.md").write_text(table(found), encoding="utf-8")
-    print(table(found))
+            kept.measure(key_of(name, label), functools.partial(measured, scene, name, label))
+    print(kept.table())
 
 
 if __name__ == "__main__":
