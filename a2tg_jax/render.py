@@ -25,7 +25,7 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of
 from a2tg_jax.core.display import as_bytes, enlarged, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
@@ -42,7 +42,8 @@ from a2tg_jax.rasterize.splats import (
     Wanted,
     project_gaussians,
 )
-from a2tg_jax.rasterize.tiles import TileGrid, count_pairs, tile_lists
+from a2tg_jax.rasterize.tile_pixels import PixelGrid, pixel_grid
+from a2tg_jax.rasterize.tiles import TileGrid, bounds_of, count_pairs, tile_lists
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
 HEAD_ROOM = 1.25
@@ -253,6 +254,8 @@ def render_traced(
       statistic: kind of statistic (`rasterize.pixel.positional_gradient`); not used without a probe.
     """
     compositor = choose(settings.compositor, settings.tile_size)
+    if camera.rays is not None:
+        compositor = _for_rays(settings, compositor)
     compositing = _compositing_settings(
         camera, settings, compositor, has_geometry, None if probe is None else statistic, rule.num_colors
     )
@@ -268,7 +271,8 @@ def render_traced(
         )  # fmt: skip
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     probe = jnp.zeros((gaussians.num, 4), splats.M.dtype) if probe is None else probe
-    shown = _composited(compositing, settings, splats, rule, cutoff, jacobian, probe)
+    pixels = _pixels_of(camera, settings.tile_size)
+    shown = _composited(compositing, settings, splats, rule, cutoff, jacobian, probe, pixels)
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
     channels, transmittance = shown.channels + taint, shown.transmittance + taint
     return _output(compositing, channels, transmittance, background, shown.overflow), shown.num_pairs
@@ -276,17 +280,35 @@ def render_traced(
 
 def _composited(
     compositing: CompositingSettings, settings: RenderSettings, splats: Splats, rule: AppearanceRule, cutoff: Array,
-    jacobian: Array, probe: Array,
+    jacobian: Array, probe: Array, pixels: PixelGrid | None,
 ) -> Composited:  # fmt: skip
     """Return the image without background, of one device or of several."""
     capacity = settings.capacity or 0
     if settings.exchange is not None:
         return composite_in_bands(compositing, settings.exchange, capacity, splats, rule, cutoff, jacobian, probe)
-    list_tiles = native.tile_lists if compositing.compositor == "native" else tile_lists
-    M = jax.lax.stop_gradient(splats.M)
-    lists = list_tiles(M, cutoff, compositing.near_plane, compositing.grid, capacity)
+    M, near_plane, grid = jax.lax.stop_gradient(splats.M), compositing.near_plane, compositing.grid
+    if pixels is None and compositing.compositor == "native":
+        lists = native.tile_lists(M, cutoff, near_plane, grid, capacity)
+    else:
+        lists = tile_lists(M, cutoff, near_plane, grid, capacity, pixels)
     channels, transmittance = composite(compositing, splats, rule, cutoff, lists, jacobian, probe)
     return Composited(channels, transmittance, lists.num_pairs, lists.overflow)
+
+
+def _for_rays(settings: RenderSettings, compositor: Compositor) -> Compositor:
+    """Return the compositor for a camera with a ray for each pixel."""
+    if settings.exchange is not None:
+        raise ValueError("cameras with rays are rendered on one device: leave out settings.exchange (--devices)")
+    if compositor not in ("native", "cuda"):
+        return compositor
+    if settings.compositor != "auto":
+        raise ValueError(f"compositor={compositor!r} cannot render cameras with rays: say 'xla', or 'auto'")
+    return "xla"
+
+
+def _pixels_of(camera: Camera, tile_size: int) -> PixelGrid | None:
+    """Return the pixels of all tiles of a camera with rays; None for a pinhole camera."""
+    return None if camera.rays is None else pixel_grid(camera.rays, tile_size)
 
 
 def _compositing_settings(
@@ -401,8 +423,9 @@ def _count_pairs(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
 ) -> Array:
     M, cutoff = _drawn(gaussians, camera, rule, num_live)
-    bounds = screen_bounds(M, cutoff, near_plane)
-    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size))
+    pixels = _pixels_of(camera, tile_size)
+    bounds = bounds_of(M, cutoff, near_plane, pixels)
+    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size), pixels)
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:

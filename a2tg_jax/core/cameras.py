@@ -39,6 +39,10 @@ class Camera:
     """Image width in pixels."""
     height: int = dataclasses.field(metadata={"static": True})
     """Image height in pixels."""
+    rays: Array | None = None
+    """[H, W, 2] where the ray of each pixel meets the image plane of K, in its pixels, for a lens that is no pinhole:
+    pixel (i, j) looks along K⁻¹·(x, y, 1). A pixel whose numbers are not finite sees the background. A constant, which
+    is not differentiated; None is a pinhole camera."""
 
     def __post_init__(self) -> None:
         """Convert sides of numpy's integers to Python's."""
@@ -66,6 +70,8 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
         if isinstance(value, list | tuple):
             raise ValueError(f"{name}.{field} must be an array; got {type(value).__name__}: use jnp.asarray")
         check_floats(f"{name}.{field}", value, shape)
+    if camera.rays is not None:
+        check_floats(f"{name}.rays", camera.rays, (camera.height, camera.width, 2))
     for side in ("width", "height"):
         value = getattr(camera, side)
         if not isinstance(value, int) or value < 1:
@@ -135,11 +141,30 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return the same view at another image size: K scales with each side (pixel edges stay edges)."""
     dtype = camera.K.dtype
     factors = jnp.asarray([[width / camera.width], [height / camera.height], [1.0]], dtype)
-    return Camera(camera.viewmat, camera.K * factors, width, height)
+    rays = camera.rays
+    if rays is not None:
+        rays = _resampled(_resampled(rays, height, axis=0), width, axis=1) * factors[:2, 0].reshape(1, 1, 2)
+    return Camera(camera.viewmat, camera.K * factors, width, height, rays)
+
+
+def _resampled(values: Array, num: int, axis: int) -> Array:
+    """Return values at the centres of `num` pixels along an axis, linear between and beyond those of the old ones."""
+    old = values.shape[axis]
+    if old == 1 or num == old:
+        return values if num == old else jnp.repeat(values, num, axis=axis)
+    place = (np.arange(num) + 0.5) * (old / num) - 0.5
+    below = np.clip(np.floor(place), 0, old - 2).astype(np.int32)
+    share = jnp.asarray(np.expand_dims(place - below, [k for k in range(values.ndim) if k != axis]), values.dtype)
+    low, high = (jnp.take(values, rows, axis=axis) for rows in (below, below + 1))
+    return low + share * (high - low)
 
 
 def crop_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the same view at another image size and aspect: scaled to cover it, and cropped around its centre."""
+    """Return the same view at another image size and aspect: scaled to cover it, and cropped around its centre.
+
+    The view is that of a pinhole camera: rays of a lens are left out.
+    """
+    camera = dataclasses.replace(camera, rays=None)
     factor = max(width / camera.width, height / camera.height)
     scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
     shift = (

@@ -158,11 +158,22 @@ def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
     )
 
 
-def views_by_size(views: Sequence[View]) -> list[list[View]]:
-    """Return the views of each image size, both in order of appearance."""
-    groups: dict[tuple[int, int], list[View]] = {}
-    for view in views:
-        groups.setdefault(view.picture.size, []).append(view)
+def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
+    """Return height, width and lens of each view. Lens 0 is a pinhole; others are numbered in order of appearance."""
+    lenses: dict[int, int] = {}
+
+    def lens_of(view: View) -> int:
+        rays = view.camera.rays
+        return 0 if rays is None else lenses.setdefault(id(rays), len(lenses) + 1)
+
+    return [(*view.picture.size, lens_of(view)) for view in views]
+
+
+def views_by_kind(views: Sequence[View]) -> list[list[View]]:
+    """Return the views of each image size and lens, both in order of appearance."""
+    groups: dict[tuple[int, int, int], list[View]] = {}
+    for kind, view in zip(kinds_of(views), views, strict=True):
+        groups.setdefault(kind, []).append(view)
     return list(groups.values())
 
 

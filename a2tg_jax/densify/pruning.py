@@ -19,7 +19,7 @@ from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.data import View, counted_pixels, views_by_size
+from a2tg_jax.data import View, counted_pixels, views_by_kind
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
@@ -92,25 +92,29 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
     # Programs are compiled for a capacity: for few of them.
     settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
     dtype = model.gaussians.means.dtype
-    for own in views_by_size(views):
-        cameras = [jax.tree.map(lambda leaf: np.asarray(leaf, dtype), view.camera) for view in own]
-        stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *cameras)
-        total += np.asarray(_jitted()(model, stacked, jnp.asarray(counted_pixels(own), dtype), settings), np.float64)
+    for own in views_by_kind(views):
+        rays = own[0].camera.rays
+        rays = None if rays is None else jnp.asarray(rays, dtype)
+        cameras = [dataclasses.replace(view.camera, rays=None) for view in own]
+        stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
+        counted = jnp.asarray(counted_pixels(own), dtype)
+        total += np.asarray(_jitted()(model, stacked, rays, counted, settings), np.float64)
     return total
 
 
 @functools.cache
 def _jitted() -> Jitted[..., Array]:
-    return Jitted(_weights, static_argnums=(3,))
+    return Jitted(_weights, static_argnums=(4,))
 
 
-def _weights(model: Model, cameras: Camera, counted: Array, settings: RenderSettings) -> Array:
-    """Return the sums over views of one size. A picture is linear in the colours, so this is a backward pass of
+def _weights(model: Model, cameras: Camera, rays: Array | None, counted: Array, settings: RenderSettings) -> Array:
+    """Return the sums over views of one size and lens. A picture is linear in the colours: this is a backward pass of
     ones."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
     def of_view(total: Array, view: tuple[Camera, Array]) -> tuple[Array, None]:
         camera, weight = view
+        camera = dataclasses.replace(camera, rays=rays)
 
         def draw(colors: Array) -> Array:
             rule = GivenColors(model.rule, colors)

@@ -22,7 +22,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import solve_cg
-from a2tg_jax.data import View, counted_pixels, view_image, views_by_size
+from a2tg_jax.data import View, counted_pixels, view_image, views_by_kind
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, render_traced
@@ -44,7 +44,7 @@ class Colors(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Photographs over the background, of V views of one image size, with the weights of their pixels."""
+    """Photographs over the background, of V views of one image size and lens, with the weights of their pixels."""
 
     viewmats: Array
     Ks: Array
@@ -52,6 +52,8 @@ class Targets(NamedTuple):
     """[V, H, W, 3] over the background."""
     weights: Array
     """[V, H, W, 1]: 1 where a pixel counts, else 0; [V, 1, 1, 1] if all do."""
+    rays: Array | None = None
+    """[H, W, 2] rays of the lens; None of a pinhole."""
 
 
 def polish(
@@ -100,11 +102,12 @@ def _solve(
         for group in groups:
             height, width = group.images.shape[1:3]
 
-            def step(total: Colors, view: Targets, height: int = height, width: int = width) -> tuple[Colors, None]:
-                camera = Camera(view.viewmats, view.Ks, width, height)
-                return jax.tree.map(jnp.add, total, function(camera, view)), None
+            seen = functools.partial(Camera, width=width, height=height, rays=group.rays)
 
-            total, _ = jax.lax.scan(step, total, group)
+            def step(total: Colors, view: Targets, seen: Callable[..., Camera] = seen) -> tuple[Colors, None]:
+                return jax.tree.map(jnp.add, total, function(seen(view.viewmats, view.Ks), view)), None
+
+            total, _ = jax.lax.scan(step, total, group._replace(rays=None))
         return total
 
     def right(camera: Camera, view: Targets) -> Colors:
@@ -179,7 +182,7 @@ def _check(model: Model, views: Sequence[View]) -> None:
 
 
 def _stacked(views: Sequence[View], background: Array) -> list[Targets]:
-    """Return the views, one stack for each image size, in the dtype of the background."""
+    """Return the views, one stack for each image size and lens, in the dtype of the background."""
     color, dtype = np.asarray(background), background.dtype
     return [
         Targets(
@@ -187,6 +190,7 @@ def _stacked(views: Sequence[View], background: Array) -> list[Targets]:
             jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
             jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),
             jnp.asarray(counted_pixels(own), dtype),
+            None if own[0].camera.rays is None else jnp.asarray(own[0].camera.rays, dtype),
         )
-        for own in views_by_size(views)
+        for own in views_by_kind(views)
     ]

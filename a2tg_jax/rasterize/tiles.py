@@ -5,6 +5,7 @@ tile are dropped. One stable sort by tile makes the lists here; `kernels.native`
 of P = tile_size² pixels are numbered row by row.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.geometry import Outline, ScreenBounds, screen_bounds
+from a2tg_jax.rasterize.tile_pixels import PixelGrid, covered
 
 
 class TileGrid(NamedTuple):
@@ -45,6 +47,8 @@ class TileLists(NamedTuple):
     """Number of pairs before the outline test, as a float; the capacity must hold it."""
     overflow: Array
     """Whether the pairs did not fit; the lists are then empty."""
+    pixels: PixelGrid | None = None
+    """Pixels of the tiles, if the camera has a ray for each pixel."""
 
 
 class Rectangles(NamedTuple):
@@ -56,10 +60,14 @@ class Rectangles(NamedTuple):
     counts: Array
 
 
-def tile_rectangles(bounds: ScreenBounds, grid: TileGrid) -> Rectangles:
-    """Return the tiles that each splat's box covers."""
-    x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
-    y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
+def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: PixelGrid | None = None) -> Rectangles:
+    """Return the tiles that each splat's box covers, or may cover if pixels have rays of their own."""
+    if pixels is None:
+        x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
+        y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
+    else:
+        x0, columns = covered(pixels.columns, bounds.left, bounds.right)
+        y0, rows = covered(pixels.rows, bounds.top, bounds.bottom)
     columns = jnp.where(rows > 0, columns, jnp.int32(0))
     return Rectangles(x0, y0, columns, columns * rows)
 
@@ -78,9 +86,9 @@ def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Arra
     return begin, jnp.where(last < first, nothing, end - begin)
 
 
-def count_pairs(bounds: ScreenBounds, grid: TileGrid) -> Array:
+def count_pairs(bounds: ScreenBounds, grid: TileGrid, pixels: PixelGrid | None = None) -> Array:
     """Return the number of pairs before the outline test, as a float, which cannot wrap."""
-    return total_pairs(tile_rectangles(bounds, grid).counts)
+    return total_pairs(tile_rectangles(bounds, grid, pixels).counts)
 
 
 def total_pairs(counts: Array) -> Array:
@@ -104,6 +112,20 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
         left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
         return left, left + (tile_size - 1), top, top + (tile_size - 1)
 
+    return _touches(outline, distance_to_box)
+
+
+def outline_touches_rays(outline: Outline, box: Array, magnification: Array) -> Array:
+    """Return whether outlines [N] may reach rays in boxes [N, 4], of pixels that long in the image plane [N]."""
+
+    def distance_to_box(origin_x: Array, origin_y: Array) -> tuple[Array, Array, Array, Array]:
+        return box[:, 0] - origin_x, box[:, 2] - origin_x, box[:, 1] - origin_y, box[:, 3] - origin_y
+
+    return _touches(outline._replace(radius=outline.radius * magnification), distance_to_box)
+
+
+def _touches(outline: Outline, distance_to_box: Callable[[Array, Array], tuple[Array, Array, Array, Array]]) -> Array:
+    """Return whether an outline reaches a box, given its left, right, top and bottom edge from an origin."""
     left, right, top, bottom = distance_to_box(outline.ellipse_x, outline.ellipse_y)
     xx, xy, yy = outline.xx, outline.xy, outline.yy
     # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
@@ -121,17 +143,20 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
     return is_in_ellipse | (nearest <= outline.radius**2) | outline.is_clipped
 
 
-def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
+def tile_lists(
+    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: PixelGrid | None = None
+) -> TileLists:
     """List the splats that touch each tile, ordered by depth, ties by index.
 
     Args:
       M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
       grid: tiles of the image.
       capacity: number of pairs that fit, before the outline test; `overflow` tells if there were more.
+      pixels: of the tiles, if the camera has a ray for each pixel.
     """
-    bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
+    bounds, depths = bounds_of(M, cutoff, near_plane, pixels), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
-    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid))
+    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid, pixels))
     total = total_pairs(rectangles.counts)
     overflow = exceeds(total, capacity)
     counts = jnp.where(overflow, 0, rectangles.counts)
@@ -146,11 +171,32 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     ids = order[rank].astype(jnp.int32)
     dtype = bounds.left.dtype
     per_pair = jax.tree.map(lambda leaf: leaf[ids], bounds.outline)
-    tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
-    is_kept = (position < ends[-1]) & outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
+    if pixels is None:
+        tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
+        is_touched = outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
+    else:
+        own = jnp.minimum(y * grid.columns + x, grid.num - 1)
+        is_touched = outline_touches_rays(per_pair, pixels.tiles.boxes[own], pixels.tiles.magnifications[own])
+    is_kept = (position < ends[-1]) & is_touched
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)
-    return TileLists(ids, starts, total, overflow)
+    return TileLists(ids, starts, total, overflow, pixels)
+
+
+def bounds_of(M: Array, cutoff: Array, near_plane: float, pixels: PixelGrid | None = None) -> ScreenBounds:
+    """Return `core.geometry.screen_bounds`, with the low-pass filter's reach in pixels that have rays of their own."""
+    bounds = screen_bounds(M, cutoff, near_plane)
+    if pixels is None:
+        return bounds
+    outline, (left, top, right, bottom) = bounds.outline, bounds[:4]
+    reach = outline.radius * jnp.max(pixels.tiles.magnifications)
+    return ScreenBounds(
+        jnp.where(left <= right, jnp.minimum(left, outline.mean_x - reach), left),
+        jnp.where(top <= bottom, jnp.minimum(top, outline.mean_y - reach), top),
+        jnp.where(left <= right, jnp.maximum(right, outline.mean_x + reach), right),
+        jnp.where(top <= bottom, jnp.maximum(bottom, outline.mean_y + reach), bottom),
+        outline,
+    )
 
 
 def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:

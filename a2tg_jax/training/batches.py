@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from a2tg_jax.data.scene import View
+from a2tg_jax.data.scene import View, kinds_of
 from a2tg_jax.host.cores import num_threads
 
 HOST_SHARE = 2**30
@@ -24,7 +24,7 @@ ALIGNMENT = 64
 
 
 class Photographs(NamedTuple):
-    """V views of one image size."""
+    """V views of one image size and lens."""
 
     viewmats: Array
     """[V, 4, 4]."""
@@ -36,11 +36,18 @@ class Photographs(NamedTuple):
     """[V, H, W] uint8, or None if the images are opaque."""
     masks: Array | None = None
     """[V, H, W] bool, True at pixels that count; None if all do."""
+    rays: Array | None = None
+    """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
+
+    def of(self, views: Array) -> "Photographs":
+        """Return the views of some indices."""
+        chosen: Photographs = jax.tree.map(lambda x: x[views], self._replace(rays=None))
+        return chosen._replace(rays=self.rays)
 
 
 class BatchOrder:
-    """Batches of views of one image size, in shuffled epochs. The order depends on the seed and the iteration alone, so
-    a resumed run sees the same one."""
+    """Batches of views of one image size and lens, in shuffled epochs. The order depends on the seed and the iteration
+    alone, so a resumed run sees the same one."""
 
     def __init__(self, views: tuple[View, ...], batch_size: int, seed: int, number: int = 0):
         """Args:
@@ -49,7 +56,7 @@ class BatchOrder:
         seed: of the order.
         number: index of the order among those of this seed.
         """
-        self._views, self._batch_size = views, batch_size
+        self._kinds, self._batch_size = kinds_of(views), batch_size
         self._seeds = (seed, number) if number else (seed,)
         self._epoch, self._batches = -1, self._draw(0)
 
@@ -61,13 +68,13 @@ class BatchOrder:
         return self._batches[position]
 
     def _draw(self, epoch: int) -> list[tuple[int, ...]]:
-        """Return one epoch: every view once. The last batch of a size is filled from the start of its order."""
+        """Return one epoch: every view once. The last batch of a kind is filled from the start of its order."""
         rng = np.random.default_rng([*self._seeds, epoch])
-        by_size: dict[tuple[int, int], list[int]] = {}
-        for index in rng.permutation(len(self._views)):
-            by_size.setdefault(self._views[index].picture.size, []).append(int(index))
+        by_kind: dict[tuple[int, int, int], list[int]] = {}
+        for index in rng.permutation(len(self._kinds)):
+            by_kind.setdefault(self._kinds[index], []).append(int(index))
         batches = []
-        for _, order in sorted(by_size.items()):
+        for _, order in sorted(by_kind.items()):
             for start in range(0, len(order), self._batch_size):
                 batches.append(tuple(order[(start + k) % len(order)] for k in range(self._batch_size)))
         return [batches[index] for index in rng.permutation(len(batches))]
@@ -106,11 +113,12 @@ class PhotoStore:
         self._views, self._order, self._last = views, order, last
         plan = plan_batches(views, len(order.indices(1)), room)
         self.is_resident, self.num_ahead = plan.is_resident, plan.num_ahead
-        self._stacks: dict[tuple[int, int], tuple[Photographs, dict[int, int]]] = {}
+        self._kinds = kinds_of(views)
+        self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
         self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices], views), self.num_ahead)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
-        """Return photographs of one size that include those of an iteration, and their int32 indices among them.
+        """Return photographs of one kind that include those of an iteration, and their int32 indices among them.
 
         Raises:
           ValueError: if a photograph that was left on disk has gone or has changed.
@@ -120,16 +128,16 @@ class PhotoStore:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             batch = self._ahead.first({key: self._order.indices(key) for key in following})
             return batch, np.arange(len(indices), dtype=np.int32)
-        stack, places = self._stack(self._views[indices[0]].picture.size)
+        stack, places = self._stack(self._kinds[indices[0]])
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
-    def _stack(self, size: tuple[int, int]) -> tuple[Photographs, dict[int, int]]:
-        """Return all photographs of a size on the device, and the place of each view's."""
-        if size not in self._stacks:
-            found = [index for index, view in enumerate(self._views) if view.picture.size == size]
-            stack = jax.device_put(stack_views([self._views[index] for index in found]))
-            self._stacks[size] = stack, {index: place for place, index in enumerate(found)}
-        return self._stacks[size]
+    def _stack(self, kind: tuple[int, int, int]) -> tuple[Photographs, dict[int, int]]:
+        """Return all photographs of a kind on the device, and the place of each view's."""
+        if kind not in self._stacks:
+            found = [index for index, own in enumerate(self._kinds) if own == kind]
+            stack = jax.device_put(stack_views([self._views[index] for index in found], self._views))
+            self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
+        return self._stacks[kind]
 
     def close(self) -> None:
         """Ends the threads."""
@@ -187,7 +195,7 @@ def device_room() -> float:
 
 
 def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Photographs:
-    """Return views of one image size, stacked on the host.
+    """Return views of one image size and lens, stacked on the host.
 
     Args:
       views: those to stack.
@@ -210,6 +218,7 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Pho
         images=_stacked([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
         alphas=alphas,  # type: ignore[arg-type]
         masks=masks,  # type: ignore[arg-type]
+        rays=views[0].camera.rays,
     )
 
 

@@ -161,7 +161,7 @@ def attempt(
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
     dtype = state.model.gaussians.means.dtype
-    batch = jax.tree.map(lambda x: x[views], photographs)
+    batch = photographs.of(views)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
     backgrounds = _backgrounds(keys[0], settings.background, views.shape[0], dtype)
     own = rows_of(state.corrections, rows)
@@ -233,8 +233,9 @@ def _gradients(
             error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
             return value, (error, output.overflow)
 
+        shot = View(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows)
         found = differentiate(
-            loss, model, View(Camera(viewmat, K, width, height), background, stage.corrections, rows), settings.render,
+            loss, model, shot, settings.render,
             has_geometry=has_geometry, sh_degree=degree, statistic=stage.statistic, has_probe=is_gathering,
         )  # fmt: skip
         error, overflow = found.told

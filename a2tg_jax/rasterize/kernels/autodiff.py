@@ -60,13 +60,13 @@ def _block(
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Composite one block of B splats over one tile; arguments and results are those of `xla._block`."""
     splats, regions = rows
-    x, y = xla.pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
+    x, y = xla.pixels_of(tile, settings.grid.tile_size, splats.M.dtype)
 
     def spread(tree: Any) -> Any:
         return jax.tree.map(lambda entry: jnp.broadcast_to(entry[:, None], (BLOCK, x.shape[1])), tree)
 
     splat = xla.split(splats, settings.has_geometry)
-    planes, splat = spread(pixel.planes_of(splat.M, tile.x, tile.y)), spread(splat)
+    planes, splat = spread(xla.seen_from(splats, tile)), spread(splat)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
 
     def show(planes: pixel.Planes) -> pixel.Shown:

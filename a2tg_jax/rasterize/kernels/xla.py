@@ -20,6 +20,7 @@ from a2tg_jax.core.bilinear import Lookup, TextureRegion
 from a2tg_jax.core.numerics import pixel_sum, spread
 from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats, shading_arguments
+from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileLists
 
 BLOCK = 8
@@ -46,6 +47,8 @@ class Tiles(NamedTuple):
     """Vertical coordinate of its centre."""
     end: Array
     """End of its list."""
+    pixels: TilePixels | None = None
+    """Its pixels, if the camera has a ray for each pixel; the centre is then that of the rays."""
 
 
 def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats) -> None:
@@ -130,6 +133,8 @@ def backward(
 
 def initial_state(settings: CompositingSettings, tiles: Tiles) -> tuple[Array, Array]:
     """Return transmittance 1 [G, P], and the live pixels [G, P]; those outside the image never are."""
+    if tiles.pixels is not None:
+        return jnp.ones_like(tiles.pixels.is_seen, tiles.x.dtype), tiles.pixels.is_seen
     x, y = pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
     is_inside = (tiles.x[:, None] + x < settings.grid.width) & (tiles.y[:, None] + y < settings.grid.height)
     return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
@@ -165,7 +170,12 @@ def tiles_of_group(
     is_real = tile < settings.grid.num
     tile = jnp.minimum(tile, settings.grid.num - 1)
     start = lists.starts[tile]
-    return Tiles(x, y, jnp.where(is_real, lists.starts[tile + 1], start)), start
+    end = jnp.where(is_real, lists.starts[tile + 1], start)
+    if lists.pixels is None:
+        return Tiles(x, y, end), start
+    own: TilePixels = jax.tree.map(lambda leaf: leaf[tile], lists.pixels.tiles)
+    own = own._replace(is_seen=own.is_seen & is_real[:, None])
+    return Tiles(own.centers[:, 0], own.centers[:, 1], end, own), start
 
 
 def block_ids(ids: Array, at: Array) -> Array:
@@ -202,6 +212,27 @@ def pixels_of_tile(size: int, dtype: DTypeLike) -> tuple[Array, Array]:
     return jnp.asarray(x.reshape(1, -1), dtype), jnp.asarray(y.reshape(1, -1), dtype)
 
 
+def seen_from(splats: Splats, tile: Tiles) -> pixel.Planes:
+    """Return the planes of splats [B, ...] for a tile, each number [B]."""
+    return pixel.planes_of(split(splats, False).M, tile.x, tile.y, frame_of(tile))
+
+
+def frame_of(tile: Tiles) -> pixel.Frame | None:
+    """Return the frame of a tile; None if its pixels are those of a pinhole camera."""
+    if tile.pixels is None:
+        return None
+    (xx, xy), (yx, yy) = tile.pixels.frames
+    return (xx, xy), (yx, yy)
+
+
+def pixels_of(tile: Tiles, size: int, dtype: DTypeLike) -> tuple[Array, Array]:
+    """Return x and y of a tile's pixels, each [1, P], in its frame."""
+    if tile.pixels is None:
+        return pixels_of_tile(size, dtype)
+    x, y = tile.pixels.offsets
+    return x[None], y[None]
+
+
 def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.Splat:
     """Split splats [B, ...] into numbers for `pixel`, each [B], or spread over [B, num] pixels."""
 
@@ -219,9 +250,8 @@ def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.S
 
 def _hits(settings: CompositingSettings, rule: AppearanceRule, splats: Splats, tile: Tiles) -> pixel.Hit:
     """Return the hits of a tile's pixels with the splats of a block, [B, P] each."""
-    x, y = pixels_of_tile(settings.grid.tile_size, splats.M.dtype)
-    planes = pixel.planes_of(split(splats, False).M, tile.x, tile.y)
-    planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
+    x, y = pixels_of(tile, settings.grid.tile_size, splats.M.dtype)
+    planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), seen_from(splats, tile))
     return pixel.intersect(planes, x, y, settings.near_plane, rule.has_low_pass)
 
 
@@ -334,9 +364,10 @@ def _statistic(
 ) -> Array:  # fmt: skip
     """Return Σ_pixels of the statistic, and the number of pixels composited, [B, 4]."""
     assert settings.statistic is not None
-    x, y = pixels_of_tile(settings.grid.tile_size, d_rho.dtype)
+    x, y = pixels_of(tile, settings.grid.tile_size, d_rho.dtype)
     M = jax.tree.map(lambda entry: entry[:, None], split(splats, False).M)
     components = pixel.positional_gradient(
-        settings.statistic, M, x, y, tile.x, tile.y, d_rho, jacobian, settings.near_plane, rule.has_low_pass
-    )
+        settings.statistic, M, x, y, tile.x, tile.y, d_rho, jacobian, settings.near_plane, rule.has_low_pass,
+        frame_of(tile),
+    )  # fmt: skip
     return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_rho.dtype))], axis=1)

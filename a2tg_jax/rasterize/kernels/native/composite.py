@@ -79,7 +79,8 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     )
     results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
     size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)
-    return TileLists(*ffi.call(name, results, M, cutoff.astype(M.dtype), size))
+    ids, starts, num_pairs, overflow = ffi.call(name, results, M, cutoff.astype(M.dtype), size)
+    return TileLists(ids, starts, num_pairs, overflow)
 
 
 def _list_handler(functions: "ListFunctions", arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
