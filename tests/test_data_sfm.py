@@ -57,10 +57,10 @@ def test_too_little_in_common(tmp_path, capfd):
 
 def test_failure_says_what_to_do(tmp_path):
     with pytest.raises(ValueError, match=r"take more.*overlap.*texture") as told:
-        sfm._check_model(None, 300, tmp_path, "exhaustive")
+        sfm._check_model(None, 300, "photos", "exhaustive", 4)
     assert "sequential" not in str(told.value)
     with pytest.raises(ValueError, match="matching exhaustive"):
-        sfm._check_model(None, 300, tmp_path, "sequential")
+        sfm._check_model(None, 300, "photos", "sequential", 4)
 
 
 def test_matching_is_chosen(tmp_path):
@@ -79,10 +79,10 @@ def test_no_photographs(tmp_path):
 @pytest.mark.parametrize(
     "names, words",
     [
-        (["a.HEIC", "b.heic", "c.jpg"], ["holds 1 photograph;", "2 .heic", "read: .jpg,", "mogrify -format jpg"]),
-        (["a/clip.MOV"], ["holds no photographs;", "1 .mov", "ffmpeg -i"]),
+        (["a.CR2", "b.cr2", "c.jpg"], ["holds 1 photograph;", "2 .cr2", "read: .jpg,", "mogrify -format jpg"]),
+        (["a/clip.MOV"], ["holds no photographs;", "1 .mov", "A video is given by itself: a2tg sfm"]),
         (["notes", ".DS_Store"], ["1 without suffix;"]),
-        (["a.heic", "b.png", "c.png", "d.png", "notes.txt"], ["Skipped: 1 .heic;"]),
+        (["a.dng", "b.png", "c.png", "d.png", "notes.txt"], ["Skipped: 1 .dng;"]),
     ],
 )
 def test_what_is_skipped_is_counted(tmp_path, names, words):
@@ -95,11 +95,10 @@ def test_what_is_skipped_is_counted(tmp_path, names, words):
     assert all(word in text for word in words)
 
 
-@pytest.mark.parametrize("read", [find_photos, load_scene])
-def test_a_video_is_told_how_to_become_photographs(tmp_path, read):
+def test_a_video_is_told_how_to_become_a_scene(tmp_path):
     (tmp_path / "a clip.mp4").touch()
-    with pytest.raises(ValueError, match=r"extract frames: mkdir photos && ffmpeg -i '.*a clip\.mp4' -vf fps=2"):
-        read(tmp_path / "a clip.mp4")
+    with pytest.raises(ValueError, match=r"run `a2tg sfm '.*a clip\.mp4' SCENE` first"):
+        load_scene(tmp_path / "a clip.mp4")
 
 
 def test_a_folder_of_photographs_is_told_a_command_that_works(tmp_path, monkeypatch):

@@ -34,6 +34,14 @@ def find_model(path: Path) -> Path | None:
     return next((folder for folder in folders if _model_suffix(folder) is not None), None)
 
 
+def _model_of(path: Path) -> Path:
+    """Return the folder of the sparse model of a scene folder, or raise FileNotFoundError."""
+    model = find_model(path)
+    if model is None:
+        raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
+    return model
+
+
 def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
     """Read a COLMAP scene: every registered image as a pinhole view, and the sparse points.
 
@@ -47,9 +55,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
       ValueError: if the model or an image cannot be read, the aspects of an image and its camera differ, a camera
         cannot be undistorted, or the views make no scene (`assemble_scene`).
     """
-    model = find_model(path)
-    if model is None:
-        raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
+    model = _model_of(path)
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
     lenses = {key: checked_lens(camera, f"{model}: camera {key}") for key, camera in reconstruction.cameras.items()}
@@ -64,6 +70,17 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
     train, test = every_kth(shots, test_every)
     return assemble_scene(scene_name(images_folder.parent), train, test, read_points(reconstruction), source=str(path))
+
+
+def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
+    """Return world-to-camera matrices [V, 4, 4] by name of the image, and the points, without reading images.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_colmap`.
+    """
+    reconstruction = _read_model(_model_of(path))
+    images = sorted((reconstruction.images[key] for key in reconstruction.reg_image_ids()), key=lambda image: image.name)
+    return np.stack([viewmat_of(image) for image in images]), read_points(reconstruction)
 
 
 def read_points(reconstruction: Any) -> PointCloud:

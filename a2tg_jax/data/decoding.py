@@ -10,9 +10,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
@@ -24,6 +26,9 @@ LONGEST_BOX = 64
 """Bytes of the first box that are looked at."""
 BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
+TURNED, SIDEWAYS = range(2, 9), range(5, 9)
+"""EXIF orientations other than upright, and those that exchange width and height."""
+LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 LONGEST_REASON = 200
 MOST_BYTES = 1 << 30
 """Largest size of an image file: that of the largest uncompressed picture."""
@@ -49,11 +54,44 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
 
-def check_picture(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return (width, height) of an image file that can be decoded. Raises as `read_pixels` does."""
+class PictureFacts(NamedTuple):
+    """What is known of an image file that can be decoded."""
+
+    size: tuple[int, int]
+    """(width, height) after EXIF rotation."""
+    is_turned: bool
+    """Whether EXIF says that the stored pixels are turned or mirrored."""
+    format: str
+    """Pillow's name of the format."""
+    lens: tuple[str, ...]
+    """Camera and focal length as EXIF has them."""
+
+
+def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
+    """Return facts of an image file after decoding it. Raises as `read_pixels` does."""
     with _opened(path) as image:
         image.load()
-        return image.size
+        exif = image.getexif()
+        turn = exif.get(ExifTags.Base.Orientation, 1)
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        size = image.size[::-1] if turn in SIDEWAYS else image.size
+        lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
+        return PictureFacts(size, turn in TURNED, image.format or "", tuple(str(value) for value in lens if value))
+
+
+def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
+    """Write an image file anew with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
+
+    The other EXIF data are kept, because the focal length is among them.
+    """
+    with _opened(path) as image:
+        exif = image.getexif()
+        upright = ImageOps.exif_transpose(image)
+        exif[ExifTags.Base.Orientation] = 1
+        if target.suffix == ".png":
+            upright.save(target, exif=exif)
+        else:
+            upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)
 
 
 @contextmanager
