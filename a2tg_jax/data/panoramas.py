@@ -30,7 +30,10 @@ class Direction(NamedTuple):
 def directions() -> tuple[Direction, ...]:
     """Return the views that a panorama is cut into, the one towards its middle first."""
     headings = [360.0 * number / AROUND for number in range(AROUND)]
-    angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings] + [("up", 0.0, 90.0), ("down", 0.0, -90.0)]
+    angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings] + [
+        ("up", 0.0, 90.0),
+        ("down", 0.0, -90.0),
+    ]
     return tuple(Direction(name, _rotation(heading, pitch)) for name, heading, pitch in angles)
 
 

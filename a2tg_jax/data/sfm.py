@@ -193,7 +193,7 @@ def _map(staged: Staged, work: Path, seed: int, progress: bool) -> Any:
     if staged.rigs:
         options.ba_refine_sensor_from_rig = False
         options.constant_cameras = _camera_ids(work / "database.db", staged)
-    with _bar("mapping", len(staged.names), progress) as bar:
+    with _bar("mapping", staged.num_places, progress) as bar:
         models = colmap.incremental_mapping(
             work / "database.db",
             staged.folder,
@@ -220,7 +220,9 @@ def _check_model(model: Any, num_photos: int, told: str, matching: Matching, num
         advice += "; only neighbours by name were matched: name them in the order of taking, or choose --matching "
         advice += "exhaustive"
     placed = f"only {num_registered} of" if num_registered else "none of the"
-    message = f"{told}: {placed} {num_photos} photographs could be placed ({counted(num_matched, 'pair')} match); {advice}"
+    message = (
+        f"{told}: {placed} {num_photos} photographs could be placed ({counted(num_matched, 'pair')} match); {advice}"
+    )
     if num_registered < MIN_REGISTERED:
         raise ValueError(message)
     if num_registered < num_photos / 2:

@@ -60,6 +60,11 @@ class Staged(NamedTuple):
         groups = [*self.groups, *(group for rig in self.rigs for group in rig.groups)]
         return sorted(name for group in groups for name in group.names)
 
+    @property
+    def num_places(self) -> int:
+        """Number of places that cameras stood at; the views of a panorama share one."""
+        return sum(len(group.names) for group in (*self.groups, *(rig.groups[0] for rig in self.rigs)))
+
 
 class _Photo(NamedTuple):
     """A photograph of a source."""
@@ -103,7 +108,9 @@ def stage(
             place = work / f"frames{number}"
             written, num_frames = extract_frames(source, place, frames, progress=progress)
             if written < least:
-                raise ValueError(f"{source}: its camera hardly moves, so that {written} of {num_frames} frames differ; walk around")
+                raise ValueError(
+                    f"{source}: its camera hardly moves, so that {written} of {num_frames} frames differ; walk around"
+                )
             tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
         files += [(number, place / name, prefix + name) for name in find_photos(place, least)]
     photos = map_in_threads(lambda file: _look(*file, panorama), files)

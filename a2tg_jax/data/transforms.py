@@ -7,7 +7,7 @@ both are in the file's own world, which is the original world here.
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,6 +46,16 @@ PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "R
 logger = logging.getLogger(__name__)
 
 
+class Frames(NamedTuple):
+    """Frames as `transforms.json` has them, made of files of another program."""
+
+    file: Path
+    """File that messages name; paths of images start from its folder."""
+    frames: list[dict[str, Any]]
+    points: str | None = None
+    """Name of a PLY file of points in that folder."""
+
+
 def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
     """Read a nerfstudio or instant-ngp scene.
 
@@ -72,6 +82,24 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
         train, test = every_kth(shots, test_every)
     cloud = read_ply_points(file.parent / meta["ply_file_path"]) if meta.get("ply_file_path") else None
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
+
+
+def load_frames(made: Frames, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
+    """Make a scene of frames of another program.
+
+    Args:
+      made: the frames.
+      downscale, test_every, room: as in `load_scene`.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_transforms`.
+    """
+    meta = {"frames": made.frames}
+    _check_meta(made.file, meta)
+    shots = sorted(_read_shots(made.file, meta, downscale, Shelf(room)), key=lambda shot: shot.name)
+    cloud = read_ply_points(made.file.parent / made.points) if made.points else None
+    folder = made.file.resolve().parent
+    return assemble_scene(scene_name(folder), *every_kth(shots, test_every), cloud, source=str(made.file))
 
 
 def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
@@ -107,6 +135,13 @@ def _read_json(file: Path) -> dict[str, Any]:
         meta = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
+    _check_meta(file, meta)
+    checked: dict[str, Any] = meta
+    return checked
+
+
+def _check_meta(file: Path, meta: Any) -> None:
+    """Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts."""
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")
     for number, frame in enumerate(meta["frames"]):
@@ -114,7 +149,6 @@ def _read_json(file: Path) -> dict[str, Any]:
             raise ValueError(f"{file}: frame {number} must be an object; got {shortened(frame)}")
         _check_texts(file, frame)
     _check_texts(file, meta)
-    return meta
 
 
 def _check_texts(file: Path, values: dict[str, Any]) -> None:

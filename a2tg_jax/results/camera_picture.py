@@ -29,7 +29,9 @@ def save_camera_picture(scene: Path, path: Path) -> None:
     reach = _reach(centers, cloud.points, middle)
     step = max(1, len(cloud.points) // MOST_POINTS)
     figure = Figure(figsize=(11, 5.5), layout="constrained")
-    for panel, rows, title in zip(figure.subplots(1, 2), ([0, 1], [0, 2]), ("from above", "from the side"), strict=True):
+    for panel, rows, title in zip(
+        figure.subplots(1, 2), ([0, 1], [0, 2]), ("from above", "from the side"), strict=True
+    ):
         plane = axes[rows]
         panel.scatter(*(plane @ (cloud.points[::step] - middle).T), s=1, c=cloud.colors[::step] / 255, linewidths=0)
         _draw_cameras(panel, plane @ (centers - middle).T, plane @ rotations[:, 2].T * (0.06 * reach))
