@@ -54,6 +54,12 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
 
+def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return (width, height) of an image file as stored, without decoding it. Raises as `read_pixels` does."""
+    with _opened(path) as image:
+        return image.size
+
+
 class PictureFacts(NamedTuple):
     """What is known of an image file that can be decoded."""
 

@@ -76,7 +76,7 @@ def record3d_frames(file: Path) -> Frames:
     values = _object(file)
     poses = _matrix(values.get("poses"), 7, f"{file}: poses")
     intrinsics = _record3d_intrinsics(file, values, len(poses))
-    size = {key: values[key] for key in ("w", "h") if key in values}
+    size: dict[str, Any] = {key: values[key] for key in ("w", "h") if key in values}
     frames = []
     for number, image in _numbered_images(file.parent):
         if number < len(poses):
@@ -85,7 +85,7 @@ def record3d_frames(file: Path) -> Frames:
             turned = Rotation.from_quat(poses[number, :4]).as_matrix()
             pose = np.concatenate([turned, poses[number, 4:, None]], axis=1)
             fl_x, fl_y, cx, cy = intrinsics[number]
-            lens = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, **size}
+            lens: dict[str, Any] = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, **size}
             name = image.relative_to(file.parent).as_posix()
             frames.append({**lens, "file_path": name, "transform_matrix": pose.tolist()})
     if not frames:

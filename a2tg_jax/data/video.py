@@ -85,7 +85,7 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
     """
     before, after = before.astype(np.float32), after.astype(np.float32)
     slope = sum(float(np.abs(part).mean()) for part in np.gradient(before))
-    return float(np.abs(after - before).mean()) / max(slope, 1.0) / before.shape[1]
+    return float(np.abs(after - before).mean() / max(slope, 1.0) / before.shape[1])
 
 
 def _sharpness(grey: np.ndarray) -> float:

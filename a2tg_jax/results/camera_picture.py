@@ -33,7 +33,8 @@ def save_camera_picture(scene: Path, path: Path) -> None:
         figure.subplots(1, 2), ([0, 1], [0, 2]), ("from above", "from the side"), strict=True
     ):
         plane = axes[rows]
-        panel.scatter(*(plane @ (cloud.points[::step] - middle).T), s=1, c=cloud.colors[::step] / 255, linewidths=0)
+        x, y = plane @ (cloud.points[::step] - middle).T
+        panel.scatter(x, y, s=1, c=cloud.colors[::step] / 255, linewidths=0)
         _draw_cameras(panel, plane @ (centers - middle).T, plane @ rotations[:, 2].T * (0.06 * reach))
         panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
         panel.set_title(f"{len(centers)} cameras {title}", fontsize=10)
@@ -44,7 +45,7 @@ def _draw_cameras(panel: Axes, places: np.ndarray, ahead: np.ndarray) -> None:
     """Draw places [2, V] with lines in the viewing directions [2, V], joined in the order of their names."""
     panel.plot(*places, color=COLORS[2], linewidth=0.5, alpha=0.5)
     panel.plot(*np.stack([places, places + ahead], axis=1), color=COLORS[1], linewidth=0.8)
-    panel.scatter(*places, s=8, color=COLORS[0], zorder=3)
+    panel.scatter(places[0], places[1], s=8, color=COLORS[0], zorder=3)
 
 
 def _upright_axes(rotations: np.ndarray) -> np.ndarray:
