@@ -36,34 +36,46 @@ def save_dots(folder, names, place=lambda pose: pinhole_place(pose, **FOCAL)):
         save_dot(folder / name, place(pose))
 
 
-@pytest.mark.parametrize("corrected", [False, True])
-def test_polycam(tmp_path, corrected):
+def write_polycam(folder, prefix="corrected_"):
     """Raw data: a JSON file of the pose in ARKit's axes for each keyframe."""
-    prefix = "corrected_" if corrected else ""
-    base = tmp_path / "keyframes"
+    base = folder / "keyframes"
     save_dots(base / f"{prefix}images", [f"{index}.jpg" for index in range(COUNT)])
     (base / f"{prefix}cameras").mkdir()
     lens = dict(fx=100.0, fy=104.0, cx=58.0, cy=47.0, width=WIDTH, height=HEIGHT, blur_score=9.0)
     for index, pose in enumerate(poses()):
         numbers = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         (base / f"{prefix}cameras" / f"{index}.json").write_text(json.dumps({**lens, **numbers}))
+    return base / f"{prefix}cameras"
+
+
+@pytest.mark.parametrize("prefix", ["", "corrected_"])
+def test_polycam(tmp_path, prefix):
+    cameras = write_polycam(tmp_path, prefix)
     check_dots(load_scene(tmp_path), 0.1)
-    (base / f"{prefix}cameras" / "0.json").write_text("{}")
+    (cameras / "0.json").write_text("{}")
     with pytest.raises(ValueError, match=r"0\.json: lacks t_00, a number of the pose"):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize(("metadata", "images"), [("metadata", "rgbd"), ("metadata.json", "rgb")])
-def test_record3d(tmp_path, metadata, images):
+def write_record3d(folder, metadata="metadata", images="rgbd", **changes):
     """Poses are quaternions and positions, K is stored by columns, images are named by number."""
-    save_dots(tmp_path / images, [f"{index}.jpg" for index in range(COUNT)])
+    save_dots(folder / images, [f"{index}.jpg" for index in range(COUNT)])
     rows = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in poses()]
     values = dict(poses=rows, K=[100.0, 0, 0, 0, 104.0, 0, 58.0, 47.0, 1], **SIZE)
-    if images == "rgb":
-        values |= dict(K=None, perFrameIntrinsicCoeffs=[[100.0, 104.0, 58.0, 47.0]] * COUNT)
-    (tmp_path / metadata).write_text(json.dumps(values))
+    (folder / metadata).write_text(json.dumps(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("metadata", "images", "changes"),
+    [
+        ("metadata", "rgbd", {}),
+        ("metadata.json", "rgb", dict(K=None, perFrameIntrinsicCoeffs=[[100.0, 104.0, 58.0, 47.0]] * COUNT)),
+    ],
+)
+def test_record3d(tmp_path, metadata, images, changes):
+    write_record3d(tmp_path, metadata, images, **changes)
     check_dots(load_scene(tmp_path), 0.1)
-    (tmp_path / metadata).write_text(json.dumps({**values, "poses": [[0, 0, 0, 1, 0, 0]]}))
+    write_record3d(tmp_path, metadata, images, poses=[[0, 0, 0, 1, 0, 0]])
     with pytest.raises(ValueError, match="poses must be rows of 7 finite numbers"):
         load_scene(tmp_path)
 
@@ -112,11 +124,15 @@ def metashape_xml(world, within="component", lens=LENS):
 WORLD = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), np.array([3.0, -2.0, 1.0]), 2.5
 
 
+def write_metashape(folder, within="component"):
+    save_dots(folder / "images", [f"{index}.png" for index in range(COUNT)], metashape_place)
+    write_ply(folder / "points.ply")
+    (folder / "cameras.xml").write_text(metashape_xml(WORLD, within))
+
+
 @pytest.mark.parametrize("within", ["component", "chunk"])
 def test_metashape(tmp_path, within):
-    save_dots(tmp_path / "images", [f"{index}.png" for index in range(COUNT)], metashape_place)
-    write_ply(tmp_path / "points.ply")
-    (tmp_path / "cameras.xml").write_text(metashape_xml(WORLD, within))
+    write_metashape(tmp_path, within)
     scene = load_scene(tmp_path)
     check_dots(scene, 0.1)
     np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
@@ -158,10 +174,14 @@ def brown_place(pose):
     return 58 + 100 * radial * x / z, 47 + 104 * radial * y / z
 
 
-def test_realityscan(tmp_path):
-    save_dots(tmp_path, [f"{index}.png" for index in range(COUNT)], brown_place)
+def write_realityscan(folder, position=(0, 0, 0)):
+    save_dots(folder, [f"{index}.png" for index in range(COUNT)], brown_place)
     for index, pose in enumerate(poses()):
-        (tmp_path / f"{index}.xmp").write_text(realityscan_xmp(pose))
+        (folder / f"{index}.xmp").write_text(realityscan_xmp(pose, position))
+
+
+def test_realityscan(tmp_path):
+    write_realityscan(tmp_path)
     check_dots(load_scene(tmp_path), 0.1)
     (tmp_path / "0.xmp").write_text(realityscan_xmp(poses()[0], more='xcr:DistortionCoeficients="0 0 0 0 0.1 0"'))
     with pytest.raises(ValueError, match=r"0\.xmp: has the distortion model brown3 with skew, k4, t1 or t2"):
@@ -170,10 +190,7 @@ def test_realityscan(tmp_path):
 
 def test_a_world_of_a_map_is_moved(tmp_path):
     """Coordinates of a map would leave float32 no digits for the scene."""
-    far = np.array([431_210.0, 5_412_000.0, 210.0])
-    save_dots(tmp_path, [f"{index}.png" for index in range(COUNT)], brown_place)
-    for index, pose in enumerate(poses()):
-        (tmp_path / f"{index}.xmp").write_text(realityscan_xmp(pose, far))
+    write_realityscan(tmp_path, np.array([431_210.0, 5_412_000.0, 210.0]))
     with pytest.warns(UserWarning, match=r"lies far from its origin, which was moved to 43121\d 541200\d 21\d"):
         scene = load_scene(tmp_path)
     assert np.abs(scene.transform.inverse().apply(np.zeros((1, 3)))).max() < 100

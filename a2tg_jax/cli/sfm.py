@@ -37,7 +37,7 @@ class Sfm:
       a2tg sfm photos/phone photos/drone --out scenes/house
     """
 
-    sources: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTOS... SCENE")]
+    sources: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTOS... SCENE", help_behavior_hint="")]
     """Folders of photographs of one scene, and videos; then the new scene folder for the images and the sparse model,
     ready for a2tg train, unless --out names it."""
     out: Annotated[Path | None, defaulting_to("the last of PHOTOS... SCENE", "SCENE")] = None
@@ -67,14 +67,14 @@ class Sfm:
 
     def _places(self) -> tuple[list[Path], Path]:
         """Return the sources and the scene folder."""
+        if not self.sources:
+            raise ValueError("PHOTOS is missing: a folder of photographs, or a video")
         if self.out is not None:
-            if not self.sources:
-                raise ValueError("PHOTOS is missing: a folder of photographs, or a video")
             return list(self.sources), self.out
         if len(self.sources) < 2:
             raise ValueError("SCENE is missing: the new scene folder comes last, or after --out")
         *sources, out = self.sources
-        if len(sources) > 1 and (is_video(out) or holds_photos(out)):
+        if is_video(out) or holds_photos(out):
             raise ValueError(f"{out} holds photographs, but the scene folder comes last; name that by --out SCENE")
         return sources, out
 

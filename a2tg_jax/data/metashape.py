@@ -16,8 +16,11 @@ from a2tg_jax.data.photogrammetry import (
     read_xml,
 )
 from a2tg_jax.data.transforms import Frames
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
+
+HEAD_BYTES = 1 << 16
+"""Number of bytes of an XML file in which a chunk's sensors are looked for."""
 
 
 def metashape_file(path: Path) -> Path | None:
@@ -105,5 +108,5 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
 
 
 def _head(file: Path) -> bytes:
-    with open(file, "rb") as opened:
-        return opened.read(1 << 16)
+    with open_regular(file) as opened:
+        return opened.read(HEAD_BYTES)

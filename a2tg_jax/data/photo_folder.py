@@ -22,8 +22,9 @@ def is_video(path: Path) -> bool:
 
 
 def holds_photos(folder: Path) -> bool:
-    """Return whether a folder has photographs directly in it."""
-    return folder.is_dir() and any(file.suffix.lower() in PHOTO_SUFFIXES for file in folder.iterdir())
+    """Return whether a folder has enough photographs directly in it."""
+    photos = [file for file in folder.iterdir() if file.suffix.lower() in PHOTO_SUFFIXES] if folder.is_dir() else []
+    return len(photos) >= LEAST_PHOTOS
 
 
 def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
