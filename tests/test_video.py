@@ -83,9 +83,11 @@ def test_frames_are_turned_as_players_show_them(tmp_path, rotation):
 
 def test_what_is_no_video_is_named(tmp_path):
     pytest.importorskip("av", reason="the extra [video] is not installed")
-    (tmp_path / "clip.mp4").write_bytes(b"no video")
-    with pytest.raises(ValueError, match=r"clip\.mp4: cannot be read as a video"):
-        extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3)
+    write_video(tmp_path / "other.mp4")
+    for text in ("no video", "ffconcat version 1.0\nfile other.mp4\n"):
+        (tmp_path / "clip.mp4").write_text(text)
+        with pytest.raises(ValueError, match=r"clip\.mp4: cannot be read as a video"):
+            extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3)
 
 
 def test_without_the_extra_the_command_is_told(tmp_path, monkeypatch):

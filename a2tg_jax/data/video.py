@@ -21,6 +21,8 @@ SHARPNESS_WIDTH, MOTION_WIDTH = 640, 128
 """Widths in pixels of the greyscale frames on which sharpness and motion are measured."""
 LEAST_MOTION = 0.005
 """Motion between two frames, as a share of the width, below which the camera counts as still."""
+ONLY_VIDEOS = {"format_whitelist": "mov,matroska,webm,avi", "protocol_whitelist": "file"}
+"""Options that keep FFmpeg from playlists, which name further files and addresses."""
 QUALITY = 95
 """JPEG quality of the written frames."""
 
@@ -97,7 +99,7 @@ def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
     """Yield the decoded frames of the first video stream."""
     av = _av()
     try:
-        with av.open(str(video)) as container:
+        with av.open(str(video), options=ONLY_VIDEOS) as container:
             if not container.streams.video:
                 raise ValueError(f"{video}: has no video stream")
             stream = container.streams.video[0]
