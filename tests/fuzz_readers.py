@@ -42,6 +42,7 @@ READERS = (
     Reader("masks", ("masks/00.png", "masks/01.png", "images/00.png"), (mutate.of_bytes, mutate.of_png), "scene"),
     Reader("blender", ("transforms_train.json", "transforms_test.json"), JSON, "scene"),
     Reader("polycam", tuple(f"keyframes/corrected_cameras/{index}.json" for index in range(4)), JSON, "scene"),
+    Reader("polycam", ("keyframes/depth/1.png", "keyframes/confidence/1.png"), (mutate.of_bytes, mutate.of_png), "scene"),
     Reader("record3d", ("metadata",), JSON, "scene"),
     Reader("metashape", ("cameras.xml",), TEXT, "scene"),
     Reader("realityscan", tuple(f"{index}.xmp" for index in range(4)), TEXT, "scene"),

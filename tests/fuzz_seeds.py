@@ -9,7 +9,7 @@ from fuzz_commands import write_runs
 from fuzz_readers import PICTURES
 from PIL import Image
 from small_models import some_checkpoint, some_model
-from test_captures import write_metashape, write_polycam, write_realityscan, write_record3d
+from test_captures import write_metashape, write_polycam_with_depth, write_realityscan, write_record3d
 from test_data_colmap import CAMERAS
 from test_data_colmap import write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
@@ -34,7 +34,7 @@ SYSTEMS = {
     "gaussians-2d": lambda: a2tg.Gaussians2d(sh_degree=0),
 }
 CAPTURES = {
-    "polycam": write_polycam, "record3d": write_record3d, "metashape": write_metashape,
+    "polycam": write_polycam_with_depth, "record3d": write_record3d, "metashape": write_metashape,
     "realityscan": write_realityscan,
 }  # fmt: skip
 NUM_VIEWS = 4

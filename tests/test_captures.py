@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_data_transforms import (
     FOCAL,
@@ -53,8 +54,42 @@ def test_polycam(tmp_path, prefix):
     cameras = write_polycam(tmp_path, prefix)
     check_dots(load_scene(tmp_path), 0.1)
     (cameras / "0.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"0\.json: lacks t_00, a number of the pose"):
+    with pytest.raises(ValueError, match=r"0\.json: lacks fx, a number of the camera"):
         load_scene(tmp_path)
+
+
+def write_polycam_with_depth(folder):
+    """The target's depth all over each map, in mm; the first map has low confidence."""
+    keyframes = write_polycam(folder).parent
+    for name in ("depth", "confidence"):
+        (keyframes / name).mkdir()
+    for index, pose in enumerate(poses()):
+        depth = np.full((HEIGHT, WIDTH), round(1000 * to_camera(pose, TARGET)[2]), np.uint16)
+        Image.fromarray(depth).save(keyframes / "depth" / f"{index}.png")
+        confidence = np.full((HEIGHT, WIDTH), 255 * (index > 0), np.uint8)
+        Image.fromarray(confidence).save(keyframes / "confidence" / f"{index}.png")
+
+
+def test_depth_maps_of_polycam_are_points(tmp_path):
+    write_polycam_with_depth(tmp_path)
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 3 * WIDTH * HEIGHT
+    points = scene.transform.inverse().apply(scene.points)
+    nearest = np.linalg.norm(points - TARGET, axis=1).argsort()[:3]
+    assert np.linalg.norm(points[nearest] - TARGET, axis=1).max() < 0.03
+    assert scene.colors[nearest].min() > 0.8 and scene.colors.mean() < 0.1
+
+
+def test_the_black_border_of_corrected_images_is_masked(tmp_path):
+    write_polycam(tmp_path)
+    file = tmp_path / "keyframes" / "corrected_images" / "1.jpg"
+    pixels = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
+    pixels[:, :10] = 0
+    pixels[40:50, 60:70] = 0
+    Image.fromarray(pixels).save(file, quality=95)
+    (view,) = [view for view in load_scene(tmp_path).train if view.name.endswith("1.jpg")]
+    counts = view.mask.read()
+    assert not counts[:, :11].any() and counts[:, 14:].all()
 
 
 def write_record3d(folder, metadata="metadata", images="rgbd", **changes):

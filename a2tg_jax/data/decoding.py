@@ -100,23 +100,32 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
             upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)
 
 
+def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
+    """Return a depth map [H, W] of whole numbers, of 8 or 16 bits. Raises as `read_pixels` does, and for colours."""
+    with _opened(path, most_bits=16) as image:
+        if len(image.getbands()) != 1:
+            raise PictureRefused(f"{path}: has colours, but a depth map has one channel; replace or remove it")
+        return np.asarray(image).astype(np.int32)
+
+
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
+def _opened(path: str | os.PathLike[str], most_bits: int = 8) -> Iterator[Image.Image]:
     """Open an image within the block; every decoding error becomes one ValueError."""
     try:
         opened = open_regular(path, MOST_BYTES)
     except OSError as error:
         raise _unreadable(path, error) from error
     with opened as file:
-        yield from _decoded(path, file)
+        yield from _decoded(path, file, most_bits)
 
 
-def _decoded(path: str | os.PathLike[str], file: BufferedReader) -> Iterator[Image.Image]:
+def _decoded(path: str | os.PathLike[str], file: BufferedReader, most_bits: int) -> Iterator[Image.Image]:
     """Yield the image in an open file, once."""
     try:
         with Image.open(file, formats=_formats_of(path, file)) as image:
             _check_size(path, image)
-            _check_depth(path, image)
+            if most_bits == 8:
+                _check_depth(path, image)
             yield image
     except PictureRefused:
         raise

@@ -15,6 +15,7 @@ from a2tg_jax.data.photogrammetry import (
     numbers_in,
     read_xml,
 )
+from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.transforms import Frames
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
@@ -57,7 +58,7 @@ def metashape_frames(file: Path) -> Frames:
             f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
         )
     points = sorted(file.parent.glob("*.ply"))
-    return near_origin(Frames(file, frames, points[0].name if len(points) == 1 else None))
+    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
 
 
 def _world(part: Element, file: Path) -> np.ndarray | None:

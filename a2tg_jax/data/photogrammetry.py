@@ -1,5 +1,6 @@
 """What captures of photogrammetry share: XML, numbers in texts, images by name, and worlds of maps."""
 
+import dataclasses
 import re
 import warnings
 from collections.abc import Iterator
@@ -30,8 +31,10 @@ def near_origin(frames: Frames) -> Frames:
     poses = np.stack([frame["transform_matrix"] for frame in frames.frames])
     middle = np.rint(np.median(poses[:, :3, 3], axis=0))
     spread = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
-    if np.linalg.norm(middle) > FARTHEST * spread > 0 and frames.points is None:
+    if np.linalg.norm(middle) > FARTHEST * spread > 0:
         poses[:, :3, 3] -= middle
+        if frames.cloud is not None:
+            frames = frames._replace(cloud=dataclasses.replace(frames.cloud, points=frames.cloud.points - middle))
         told = " ".join(f"{value:.0f}" for value in middle)
         warnings.warn(f"{frames.file}: its world lies far from its origin, which was moved to {told}", stacklevel=2)
     moved = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames.frames, poses, strict=True)]

@@ -5,7 +5,9 @@ change of COLMAP's world before the file was written. Poses and points of `ply_f
 both are in the file's own world, which is the original world here.
 """
 
+import dataclasses
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +19,8 @@ from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
-from a2tg_jax.data.photo_store import Shelf
+from a2tg_jax.data.masks import Mask
+from a2tg_jax.data.photo_store import Picture, Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import (
     PointCloud,
@@ -52,8 +55,9 @@ class Frames(NamedTuple):
     file: Path
     """File that messages name; paths of images start from its folder."""
     frames: list[dict[str, Any]]
-    points: str | None = None
-    """Name of a PLY file of points in that folder."""
+    cloud: PointCloud | None = None
+    counted: Callable[[np.ndarray], np.ndarray] | None = None
+    """Function from pixels [H, W, C] to a mask [H, W] of those that count."""
 
 
 def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
@@ -97,9 +101,16 @@ def load_frames(made: Frames, *, downscale: int, test_every: int, room: int | No
     meta = {"frames": made.frames}
     _check_meta(made.file, meta)
     shots = sorted(_read_shots(made.file, meta, downscale, Shelf(room)), key=lambda shot: shot.name)
-    cloud = read_ply_points(made.file.parent / made.points) if made.points else None
+    if made.counted is not None:
+        shots = [_masked(shot, made.counted) for shot in shots]
     folder = made.file.resolve().parent
-    return assemble_scene(scene_name(folder), *every_kth(shots, test_every), cloud, source=str(made.file))
+    return assemble_scene(scene_name(folder), *every_kth(shots, test_every), made.cloud, source=str(made.file))
+
+
+def _masked(shot: Shot, counted: Callable[[np.ndarray], np.ndarray]) -> Shot:
+    """Return a shot with a mask of its own pixels, unless it has one or all of them count."""
+    mask = counted(Picture.of(shot.pixels).read()) if shot.mask is None else None
+    return shot if mask is None or mask.all() else dataclasses.replace(shot, mask=Mask.of(mask))
 
 
 def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
