@@ -9,6 +9,7 @@ from fuzz_commands import write_runs
 from fuzz_readers import PICTURES
 from PIL import Image
 from small_models import some_checkpoint, some_model
+from test_captures import write_metashape, write_polycam_with_depth, write_realityscan, write_record3d
 from test_data_colmap import CAMERAS
 from test_data_colmap import write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
@@ -32,6 +33,10 @@ SYSTEMS = {
     "bbsplat": lambda: BBSplat(sh_degree=0),
     "gaussians-2d": lambda: a2tg.Gaussians2d(sh_degree=0),
 }
+CAPTURES = {
+    "polycam": write_polycam_with_depth, "record3d": write_record3d, "metashape": write_metashape,
+    "realityscan": write_realityscan,
+}  # fmt: skip
 NUM_VIEWS = 4
 
 
@@ -69,6 +74,9 @@ def _write_scenes(folder: Path) -> None:
     _write_masks(folder / "nerfstudio" / "masks")
     frames[1]["mask_path"] = "masks/01.png"
     write_json(folder / "nerfstudio", frames, ply_file_path="points.ply", k1=0.01, **FOCAL, **SIZE)
+    for name, write_capture in CAPTURES.items():
+        (folder / name).mkdir()
+        write_capture(folder / name)
     (folder / "blender").mkdir()
     write_blender(folder / "blender")
     (folder / "points").mkdir()

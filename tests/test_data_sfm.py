@@ -5,10 +5,12 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
+from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import find_photos
+from a2tg_jax.data.staging import stage
 
 
 def save_photos(folder, num_photos, width, height):
@@ -20,19 +22,103 @@ def save_photos(folder, num_photos, width, height):
     return scene
 
 
-def test_photographs_become_a_scene(tmp_path):
-    truth = save_photos(tmp_path / "photos", 5, 256, 192)
-    summary = run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
-    assert (summary.num_photos, summary.num_registered) == (5, 5)
+STORED = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
+"""How a picture is stored that EXIF says to turn back, by EXIF's number of the orientation."""
+
+
+def save_turned(image, path, orientation):
+    """Stores a picture turned, as a phone does that is held so."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    exif[ExifTags.Base.Make] = "Phone"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 32
+    image.transpose(STORED[orientation]).save(path, exif=exif, quality=95)
+
+
+def test_photographs_of_two_folders_become_a_scene(tmp_path):
+    """One folder of plain photographs, and one of a phone that was turned."""
+    truth = save_photos(tmp_path / "a", 5, 256, 192)
+    (tmp_path / "b").mkdir()
+    for index, orientation in ((3, 6), (4, 8)):
+        file = tmp_path / "a" / truth.train[index].name
+        save_turned(Image.open(file), tmp_path / "b" / f"{file.stem}.jpg", orientation)
+        file.unlink()
+    told = []
+    summary = run_sfm([tmp_path / "a", tmp_path / "b"], tmp_path / "scene", progress=False, on_note=told.append)
+    assert (summary.num_photos, summary.num_registered, told) == (5, 5, ["2 photographs turned as EXIF says"])
+    assert 0 < summary.mean_error < 1
     assert sorted(file.name for file in (tmp_path / "scene").iterdir()) == ["images", "sparse"]
     scene = load_scene(tmp_path / "scene", test_every=0)
+    assert [view.name for view in scene.train][2:] == ["a/view_002.png", "b/view_003.jpg", "b/view_004.jpg"]
+    assert all(view.camera.width > view.camera.height for view in scene.train)
     assert len(scene.points) == summary.num_points > 100
     centers = np.stack([np.asarray(view.camera.center) for view in scene.train])
     expected = np.stack([np.asarray(view.camera.center) for view in truth.train[:5]])
     steps, expected_steps = (np.linalg.norm(np.diff(c, axis=0), axis=1) for c in (centers, expected))
     np.testing.assert_allclose(steps / steps.sum(), expected_steps / expected_steps.sum(), atol=0.05)
+    up = np.stack([-np.asarray(view.camera.viewmat)[1, :3] for view in scene.train])
+    assert (up @ up.T > 0.9).all(), "no photograph lies on its side"
     with pytest.raises(FileExistsError, match="exists already"):
-        run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
+        run_sfm(tmp_path / "a", tmp_path / "scene", progress=False)
+
+
+def staged(sources, work, panorama="auto", tell=lambda line: None):
+    return stage(sources, work, frames=10, panorama=panorama, progress=False, tell=tell)
+
+
+def cameras_of(found, work):
+    """Lists the staged photographs in a database as `run_sfm` does; returns its cameras, and frames of rigs."""
+    colmap = pycolmap()
+    database = work / "database.db"
+    database.touch()
+    for group in (*found.groups, *(group for rig in found.rigs for group in rig.groups)):
+        sfm._list_images(database, found.folder, group, "SIMPLE_RADIAL")
+    for rig in found.rigs:
+        sfm._join(database, rig)
+    with contextlib.closing(colmap.Database.open(database)) as opened:
+        return opened.read_all_cameras(), opened.read_all_frames()
+
+
+def test_cameras_are_told_apart_and_exif_gives_their_focal_length(tmp_path):
+    """By folder, size and lens. A photograph that is turned keeps its EXIF data."""
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))
+    for name, size in (("a/1.png", (64, 48)), ("a/2.png", (64, 48)), ("a/3.png", (32, 24)), ("b/1.png", (64, 48))):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        image.resize(size).save(tmp_path / name)
+    save_turned(image, tmp_path / "b" / "2.jpg", 6)
+    found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "work")
+    assert {group.names: group.size for group in found.groups} == {
+        ("a/1.png", "a/2.png"): (64, 48),
+        ("a/3.png",): (32, 24),
+        ("b/1.png",): (64, 48),
+        ("b/2.jpg",): (64, 48),
+    }
+    cameras, _ = cameras_of(found, tmp_path)
+    assert [camera.has_prior_focal_length for camera in cameras] == [False, False, False, True]
+    assert (cameras[3].width, cameras[3].height) == (64, 48)
+    assert cameras[3].focal_length == pytest.approx(32 / np.hypot(36, 24) * np.hypot(64, 48), rel=0.02)
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_turned_photographs_are_turned_back(tmp_path, orientation):
+    image = Image.fromarray(np.kron([[0, 255], [90, 160]], np.ones((32, 48))).astype(np.uint8))
+    for index in range(3):
+        save_turned(image, tmp_path / f"{index}.jpg", orientation)
+    (group,) = staged([tmp_path], tmp_path / "work").groups
+    assert group.size == image.size
+    upright = Image.open(tmp_path / "work" / "photos" / "0.jpg")
+    assert upright.getexif()[ExifTags.Base.Orientation] == 1
+    np.testing.assert_allclose(np.asarray(upright)[..., 0], np.asarray(image), atol=12)
+
+
+def test_heic_photographs_become_jpeg(tmp_path):
+    pillow_heif = pytest.importorskip("pillow_heif")
+    image = Image.fromarray(np.full((48, 64, 3), 99, np.uint8))
+    for index in range(3):
+        pillow_heif.from_pillow(image).save(tmp_path / f"{index}.HEIC")
+    (group,) = staged([tmp_path], tmp_path / "work").groups
+    assert group.names == ("0.HEIC.jpg", "1.HEIC.jpg", "2.HEIC.jpg") and group.size == (64, 48)
+    assert abs(np.asarray(Image.open(tmp_path / "work/photos/0.HEIC.jpg")).mean() - 99) < 3
 
 
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd):
@@ -57,10 +143,10 @@ def test_too_little_in_common(tmp_path, capfd):
 
 def test_failure_says_what_to_do(tmp_path):
     with pytest.raises(ValueError, match=r"take more.*overlap.*texture") as told:
-        sfm._check_model(None, 300, tmp_path, "exhaustive")
+        sfm._check_model(None, 300, "photos", "exhaustive", 4)
     assert "sequential" not in str(told.value)
     with pytest.raises(ValueError, match="matching exhaustive"):
-        sfm._check_model(None, 300, tmp_path, "sequential")
+        sfm._check_model(None, 300, "photos", "sequential", 4)
 
 
 def test_matching_is_chosen(tmp_path):
@@ -79,10 +165,10 @@ def test_no_photographs(tmp_path):
 @pytest.mark.parametrize(
     "names, words",
     [
-        (["a.HEIC", "b.heic", "c.jpg"], ["holds 1 photograph;", "2 .heic", "read: .jpg,", "mogrify -format jpg"]),
-        (["a/clip.MOV"], ["holds no photographs;", "1 .mov", "ffmpeg -i"]),
+        (["a.CR2", "b.cr2", "c.jpg"], ["holds 1 photograph;", "2 .cr2", "read: .jpg,", "mogrify -format jpg"]),
+        (["a/clip.MOV"], ["holds no photographs;", "1 .mov", "A video is given by itself: a2tg sfm"]),
         (["notes", ".DS_Store"], ["1 without suffix;"]),
-        (["a.heic", "b.png", "c.png", "d.png", "notes.txt"], ["Skipped: 1 .heic;"]),
+        (["a.dng", "b.png", "c.png", "d.png", "notes.txt"], ["Skipped: 1 .dng;"]),
     ],
 )
 def test_what_is_skipped_is_counted(tmp_path, names, words):
@@ -95,11 +181,10 @@ def test_what_is_skipped_is_counted(tmp_path, names, words):
     assert all(word in text for word in words)
 
 
-@pytest.mark.parametrize("read", [find_photos, load_scene])
-def test_a_video_is_told_how_to_become_photographs(tmp_path, read):
+def test_a_video_is_told_how_to_become_a_scene(tmp_path):
     (tmp_path / "a clip.mp4").touch()
-    with pytest.raises(ValueError, match=r"extract frames: mkdir photos && ffmpeg -i '.*a clip\.mp4' -vf fps=2"):
-        read(tmp_path / "a clip.mp4")
+    with pytest.raises(ValueError, match=r"run `a2tg sfm '.*a clip\.mp4' SCENE` first"):
+        load_scene(tmp_path / "a clip.mp4")
 
 
 def test_a_folder_of_photographs_is_told_a_command_that_works(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from a2tg_jax.data import decoding, run_sfm
-from a2tg_jax.data.decoding import MAX_PIXELS, check_picture, read_pixels
+from a2tg_jax.data.decoding import MAX_PIXELS, picture_facts, read_pixels
 from a2tg_jax.data.images import check_inside, locate_image
 from a2tg_jax.results.images import picture_names
 
@@ -66,7 +66,7 @@ def test_a_small_file_of_many_pixels_is_refused_before_it_is_decoded(tmp_path):
     file.write_bytes(png(12_000, 12_000, rows=40))
     tracemalloc.start()
     try:
-        for read in (read_pixels, check_picture):
+        for read in (read_pixels, picture_facts):
             with pytest.warns(Image.DecompressionBombWarning), pytest.raises(ValueError, match="12000x12000") as caught:
                 read(file)
         assert tracemalloc.get_traced_memory()[1] < 5e6
@@ -87,7 +87,7 @@ def test_a_small_file_of_many_pixels_is_refused_before_it_is_decoded(tmp_path):
 def test_deep_pictures_are_refused_and_never_cut(tmp_path, data):
     file = tmp_path / "deep"
     file.write_bytes(data)
-    for read in (read_pixels, check_picture):
+    for read in (read_pixels, picture_facts):
         with pytest.raises(ValueError, match="deep: has more than 8 bits per channel"):
             read(file)
 
@@ -96,7 +96,7 @@ def test_deep_pictures_are_refused_and_never_cut(tmp_path, data):
 def test_pictures_of_8_bits_are_read(tmp_path, kind):
     (tmp_path / "picture").write_bytes(encoded(kind))
     assert read_pixels(tmp_path / "picture").shape == (12, 16, 3)
-    assert check_picture(tmp_path / "picture") == (16, 12)
+    assert picture_facts(tmp_path / "picture").size == (16, 12)
 
 
 def test_heic_is_read_with_its_library(tmp_path):
@@ -104,7 +104,7 @@ def test_heic_is_read_with_its_library(tmp_path):
     colors = np.full((12, 16, 3), (200, 100, 50), np.uint8)
     library.from_pillow(Image.fromarray(colors)).save(tmp_path / "photo.heic", quality=90)
     assert np.abs(read_pixels(tmp_path / "photo.heic").astype(int) - colors).max() < 10
-    assert check_picture(tmp_path / "photo.heic") == (16, 12)
+    assert picture_facts(tmp_path / "photo.heic").size == (16, 12)
     whole, rng = (tmp_path / "photo.heic").read_bytes(), np.random.default_rng(1)
     for data in (*(whole[:size] for size in range(0, len(whole), 40)), *(flipped(whole, rng) for _ in range(60))):
         (tmp_path / "broken").write_bytes(data)

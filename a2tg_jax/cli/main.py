@@ -1,5 +1,5 @@
 """The command line `a2tg`: demo, train, eval, finish, render, mesh, view, export, convert, compress, info, sfm,
-doctor."""
+download, doctor."""
 
 import dataclasses
 import functools
@@ -17,6 +17,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import defaulting_to, parse, with_flags
 from a2tg_jax.cli.convert import Convert
 from a2tg_jax.cli.doctor import Doctor
+from a2tg_jax.cli.download import Download
 from a2tg_jax.cli.finish import Finish
 from a2tg_jax.cli.mesh import Mesh
 from a2tg_jax.cli.render import Render
@@ -44,7 +45,8 @@ OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
   a2tg demo                            train a built-in scene, about a minute on two cores
-  a2tg sfm photos/ scene/              find camera poses for plain photographs with COLMAP
+  a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
+  a2tg download --list                 benchmark data sets that can be downloaded
   a2tg train scene/ --out runs/scene --preset quick --downscale 4
                                        train a scene in minutes, evaluate it, write a report
   a2tg eval runs/scene                 evaluate a run again
@@ -139,10 +141,11 @@ class Info:
         print(json_text(run_facts(run)) if self.json else describe_run(run))
 
 
-Command = Demo | Train | Eval | Finish | Render | Mesh | View | Export | Convert | Compress | Info | Sfm
+Command = Demo | Train | Eval | Finish | Render | Mesh | View | Export | Convert | Compress | Info | Sfm | Download
 COMMANDS: dict[str, type] = {
     "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "mesh": Mesh, "view": View,
-    "export": Export, "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm, "doctor": Doctor,
+    "export": Export, "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm, "download": Download,
+    "doctor": Doctor,
 }  # fmt: skip
 
 

@@ -1,43 +1,89 @@
 """The command `a2tg sfm`."""
 
 import dataclasses
+import functools
 import shlex
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.data import run_sfm
+from a2tg_jax.cli.arguments import defaulting_to
+from a2tg_jax.data import SfmSummary, run_sfm
+from a2tg_jax.data.photo_folder import holds_photos, is_video
 from a2tg_jax.data.sfm import Matching
+from a2tg_jax.data.staging import Panorama
+from a2tg_jax.data.video import DEFAULT_FRAMES
+from a2tg_jax.results.camera_picture import save_camera_picture
 from a2tg_jax.results.forecast import quick_downscale, quick_flags
 from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_apart
 
+PICTURE = "cameras.png"
+"""File in the scene folder that shows where the cameras stand."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Sfm:
-    """Find camera poses and sparse points for plain photographs.
+    """Find camera poses and sparse points for photographs, videos and panoramas.
 
-    COLMAP extracts features, matches them and maps the scene. Frames of a video are photographs too:
-    ffmpeg -i fox.mp4 -vf fps=2 -q:v 2 photos/fox/%04d.jpg
+    COLMAP extracts features, matches them and maps the scene. Of a video (pip install 'a2tg-jax[video]') it takes the
+    sharpest frames along the camera's way. Panoramas of 360° are cut into views. Photographs are turned as EXIF says.
+    The scene folder gets images, sparse points and cameras.png, which shows where the cameras stand.
 
-    Example:
+    Examples:
       a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
+      a2tg sfm fox.mp4 scenes/fox --frames 200
+      a2tg sfm photos/phone photos/drone --out scenes/house
     """
 
-    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder of photographs of one scene."""
-    out: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """New scene folder for the images and the sparse model, ready for a2tg train."""
+    sources: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTOS... SCENE", help_behavior_hint="")]
+    """Folders of photographs of one scene, and videos; then the new scene folder for the images and the sparse model,
+    ready for a2tg train, unless --out names it."""
+    out: Annotated[Path | None, defaulting_to("the last of PHOTOS... SCENE", "SCENE")] = None
+    """New scene folder."""
     matching: Matching = "auto"
     """Pairs of photographs to match. auto: all pairs up to 200 photographs, neighbours by name beyond. exhaustive: all
     pairs. sequential: neighbours by name, for many photographs named in the order of taking."""
+    frames: int = DEFAULT_FRAMES
+    """Largest number of frames to take from each video."""
+    panorama: Panorama = "auto"
+    """Pictures to cut into perspective views. auto: those twice as wide as high whose left and right edges join. yes:
+    all that are twice as wide as high. no: none."""
 
     def run(self) -> None:
-        check_apart(self.out, self.photos)
-        check_output(self.out)
-        found = run_sfm(self.photos, self.out, matching=self.matching)
-        print(f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points")
-        run = ["a2tg", "train", str(self.out), "--out", f"runs/{self.out.resolve().name}"]
+        sources, out = self._places()
+        for source in sources:
+            check_apart(out, source)
+        check_output(out)
+        found = run_sfm(
+            sources, out, matching=self.matching, frames=self.frames, panorama=self.panorama, on_note=_print
+        )
+        save_camera_picture(out, out / PICTURE)
+        print(_told(found))
+        run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
         command = shlex.join([*run, *quick_flags(quick_downscale(found.longest_side))])
-        print(f"scene: {self.out}; continue with: {command}")
+        print(f"cameras: {out / PICTURE}\nscene: {out}; continue with: {command}")
+
+    def _places(self) -> tuple[list[Path], Path]:
+        """Return the sources and the scene folder."""
+        if not self.sources:
+            raise ValueError("PHOTOS is missing: a folder of photographs, or a video")
+        if self.out is not None:
+            return list(self.sources), self.out
+        if len(self.sources) < 2:
+            raise ValueError("SCENE is missing: the new scene folder comes last, or after --out")
+        *sources, out = self.sources
+        if is_video(out) or holds_photos(out):
+            raise ValueError(f"{out} holds photographs, but the scene folder comes last; name that by --out SCENE")
+        return sources, out
+
+
+def _told(found: SfmSummary) -> str:
+    return (
+        f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points, "
+        f"mean reprojection error {found.mean_error:.2f} pixels"
+    )
+
+
+_print = functools.partial(print, flush=True)

@@ -95,7 +95,7 @@ class Train:
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """Scene folder (COLMAP, transforms.json or Blender), or "synthetic"; not needed with --config or --resume."""
+    """Scene folder with photographs and cameras, or "synthetic"; not needed with --config or --resume."""
     out: Path
     """Run folder for models, checkpoints, metrics, pictures and report.html."""
     config: Annotated[Path | None, arg(metavar="FILE")] = None

@@ -17,6 +17,7 @@ from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.photo_store import Shelf
+from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat, scene_name
 from a2tg_jax.host.regular_files import is_regular
 
@@ -24,6 +25,8 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
 """Folders of the model below a scene folder, in order of preference."""
 EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
 """A points3D file with no points in it."""
+POINTS_PLY = "points3D.ply"
+"""Points of models without COLMAP's points3D."""
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +35,14 @@ def find_model(path: Path) -> Path | None:
     """Return the folder of the sparse model of a scene folder, or None."""
     folders = [path / folder for folder in MODEL_FOLDERS]
     return next((folder for folder in folders if _model_suffix(folder) is not None), None)
+
+
+def _model_of(path: Path) -> Path:
+    """Return the folder of the sparse model of a scene folder, or raise FileNotFoundError."""
+    model = find_model(path)
+    if model is None:
+        raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
+    return model
 
 
 def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
@@ -47,9 +58,7 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
       ValueError: if the model or an image cannot be read, the aspects of an image and its camera differ, a camera
         cannot be undistorted, or the views make no scene (`assemble_scene`).
     """
-    model = find_model(path)
-    if model is None:
-        raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
+    model = _model_of(path)
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
     lenses = {key: checked_lens(camera, f"{model}: camera {key}") for key, camera in reconstruction.cameras.items()}
@@ -63,7 +72,29 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     shots = map_in_threads(shoot, registered)
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
     train, test = every_kth(shots, test_every)
-    return assemble_scene(scene_name(images_folder.parent), train, test, read_points(reconstruction), source=str(path))
+    cloud = _read_cloud(model, reconstruction)
+    return assemble_scene(scene_name(images_folder.parent), train, test, cloud, source=str(path))
+
+
+def _read_cloud(model: Path, reconstruction: Any) -> PointCloud:
+    """Return the points of a model. Networks that estimate depth write a PLY file in place of COLMAP's."""
+    ply = model / POINTS_PLY
+    has_own = any(is_regular(model / f"points3D{suffix}") for suffix in EMPTY_POINTS)
+    return read_ply_points(ply) if not has_own and is_regular(ply) else read_points(reconstruction)
+
+
+def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
+    """Return world-to-camera matrices [V, 4, 4] by name of the image, and the points, without reading images.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_colmap`.
+    """
+    model = _model_of(path)
+    reconstruction = _read_model(model)
+    images = sorted(
+        (reconstruction.images[key] for key in reconstruction.reg_image_ids()), key=lambda image: image.name
+    )
+    return np.stack([viewmat_of(image) for image in images]), _read_cloud(model, reconstruction)
 
 
 def read_points(reconstruction: Any) -> PointCloud:

@@ -10,9 +10,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
@@ -24,6 +26,9 @@ LONGEST_BOX = 64
 """Bytes of the first box that are looked at."""
 BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
+TURNED, SIDEWAYS = range(2, 9), range(5, 9)
+"""EXIF orientations other than upright, and those that exchange width and height."""
+LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 LONGEST_REASON = 200
 MOST_BYTES = 1 << 30
 """Largest size of an image file: that of the largest uncompressed picture."""
@@ -49,30 +54,78 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
 
-def check_picture(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return (width, height) of an image file that can be decoded. Raises as `read_pixels` does."""
+def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return (width, height) of an image file as stored, without decoding it. Raises as `read_pixels` does."""
     with _opened(path) as image:
-        image.load()
         return image.size
 
 
+class PictureFacts(NamedTuple):
+    """What is known of an image file that can be decoded."""
+
+    size: tuple[int, int]
+    """(width, height) after EXIF rotation."""
+    is_turned: bool
+    """Whether EXIF says that the stored pixels are turned or mirrored."""
+    format: str
+    """Pillow's name of the format."""
+    lens: tuple[str, ...]
+    """Camera and focal length as EXIF has them."""
+
+
+def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
+    """Return facts of an image file after decoding it. Raises as `read_pixels` does."""
+    with _opened(path) as image:
+        image.load()
+        exif = image.getexif()
+        turn = exif.get(ExifTags.Base.Orientation, 1)
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        size = image.size[::-1] if turn in SIDEWAYS else image.size
+        lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
+        return PictureFacts(size, turn in TURNED, image.format or "", tuple(str(value) for value in lens if value))
+
+
+def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
+    """Write an image file anew with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
+
+    The other EXIF data are kept, because the focal length is among them.
+    """
+    with _opened(path) as image:
+        exif = image.getexif()
+        upright = ImageOps.exif_transpose(image)
+        exif[ExifTags.Base.Orientation] = 1
+        if target.suffix == ".png":
+            upright.save(target, exif=exif)
+        else:
+            upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)
+
+
+def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
+    """Return a depth map [H, W] of whole numbers, of 8 or 16 bits. Raises as `read_pixels` does, and for colours."""
+    with _opened(path, most_bits=16) as image:
+        if len(image.getbands()) != 1:
+            raise PictureRefused(f"{path}: has colours, but a depth map has one channel; replace or remove it")
+        return np.asarray(image).astype(np.int32)
+
+
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
+def _opened(path: str | os.PathLike[str], most_bits: int = 8) -> Iterator[Image.Image]:
     """Open an image within the block; every decoding error becomes one ValueError."""
     try:
         opened = open_regular(path, MOST_BYTES)
     except OSError as error:
         raise _unreadable(path, error) from error
     with opened as file:
-        yield from _decoded(path, file)
+        yield from _decoded(path, file, most_bits)
 
 
-def _decoded(path: str | os.PathLike[str], file: BufferedReader) -> Iterator[Image.Image]:
+def _decoded(path: str | os.PathLike[str], file: BufferedReader, most_bits: int) -> Iterator[Image.Image]:
     """Yield the image in an open file, once."""
     try:
         with Image.open(file, formats=_formats_of(path, file)) as image:
             _check_size(path, image)
-            _check_depth(path, image)
+            if most_bits == 8:
+                _check_depth(path, image)
             yield image
     except PictureRefused:
         raise

@@ -1,14 +1,21 @@
 """Loading of scenes in any known format."""
 
+import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
+from a2tg_jax.data.metashape import metashape_file, metashape_frames
 from a2tg_jax.data.photo_folder import check_no_video
+from a2tg_jax.data.polycam import polycam_folders, polycam_frames
+from a2tg_jax.data.realityscan import realityscan_files, realityscan_frames
+from a2tg_jax.data.record3d import record3d_file, record3d_frames
 from a2tg_jax.data.scene import Scene, check_test_every
-from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
+from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, Frames, load_blender, load_frames, load_transforms
+from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import as_argument
 
@@ -24,12 +31,13 @@ def load_scene(
     """Read photographs, cameras and points, and normalise the world.
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
-    nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`).
+    nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`),
+    Polycam's raw data, Record3D's frames with their metadata, Metashape's cameras (.xml), RealityScan's XMP files.
     Distorted cameras are undistorted to pinholes. Images in the folder without a pose are ignored. Masks, black
     at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
 
     Args:
-      path: the scene folder, or a transforms.json.
+      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
       downscale: k >= 1; images are read from `images_k` if it exists, and downscaled from the full ones otherwise.
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. Has no
         effect if the scene names its own test views.
@@ -54,7 +62,8 @@ def load_scene(
 def is_scene(folder: Path) -> bool:
     """Return whether a folder holds a scene in a known format."""
     names = (NERFSTUDIO_FILE, BLENDER_FILES[0])
-    return find_model(folder) is not None or any(is_regular(folder / name) for name in names)
+    has_cameras = find_model(folder) is not None or any(is_regular(folder / name) for name in names)
+    return has_cameras or _frames(folder) is not None
 
 
 def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scene:
@@ -69,16 +78,43 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
     options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room}
     check_no_video(path)
     if is_regular(path):
-        if path.suffix.lower() != ".json":
-            raise FileNotFoundError(f"{path} is not a scene folder, and no transforms.json")
-        return load_transforms(path, **options)
+        return _load_file(path, options)
     if find_model(path) is not None:
         return load_colmap(path, **options)
     if is_regular(path / NERFSTUDIO_FILE):
         return load_transforms(path / NERFSTUDIO_FILE, **options)
     if is_regular(path / BLENDER_FILES[0]):
         return load_blender(path, **options)
+    make = _frames(path)
+    if make is not None:
+        return load_frames(make(), **options)
+    told = told_of_capture(path)
+    if told is not None:
+        raise FileNotFoundError(f"{path}: {told}")
     raise FileNotFoundError(
         f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
         f"for plain photographs, run `a2tg sfm {as_argument(path)} SCENE` first"
     )
+
+
+def _load_file(path: Path, options: dict[str, Any]) -> Scene:
+    """Load the scene that one file names."""
+    told = told_of_capture(path)
+    if path.suffix.lower() == ".json" and told is None:
+        return load_transforms(path, **options)
+    if metashape_file(path) is not None:
+        return load_frames(metashape_frames(path), **options)
+    raise FileNotFoundError(f"{path}: {told}" if told else f"{path} is not a scene folder, and no transforms.json")
+
+
+def _frames(path: Path) -> Callable[[], Frames] | None:
+    """Return what reads the frames of another program in a folder, or None."""
+    if (folders := polycam_folders(path)) is not None:
+        return functools.partial(polycam_frames, *folders)
+    if (metadata := record3d_file(path)) is not None:
+        return functools.partial(record3d_frames, metadata)
+    if (cameras := metashape_file(path)) is not None:
+        return functools.partial(metashape_frames, cameras)
+    if files := realityscan_files(path):
+        return functools.partial(realityscan_frames, path, files)
+    return None

@@ -1,30 +1,40 @@
 """Plain photographs in a folder: which are read, which are skipped, and what to do about those."""
 
-import shlex
 import warnings
 from collections import Counter
 from pathlib import Path
 
 from a2tg_jax.core.display import counted
+from a2tg_jax.host.text import as_argument
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-FOREIGN_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".gif")
-"""Suffixes of pictures that COLMAP does not read."""
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
+FOREIGN_SUFFIXES = (".jxl", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".gif")
+"""Suffixes of pictures that are not read."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 LEAST_PHOTOS = 3
 MOST_TOLD = 5
 """Largest number of suffixes that a message counts."""
 
 
-def find_photos(folder: Path) -> list[str]:
+def is_video(path: Path) -> bool:
+    """Return whether a path is a file named as videos are."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def holds_photos(folder: Path) -> bool:
+    """Return whether a folder has enough photographs directly in it."""
+    photos = [file for file in folder.iterdir() if file.suffix.lower() in PHOTO_SUFFIXES] if folder.is_dir() else []
+    return len(photos) >= LEAST_PHOTOS
+
+
+def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     """Return paths of the photographs below a folder, relative to it, sorted. A warning counts pictures and videos
     among the other files.
 
     Raises:
       FileNotFoundError: if there is no such folder.
-      ValueError: if it is a file, or holds fewer than 3 photographs.
+      ValueError: if it is a file, or holds fewer than `least` photographs.
     """
-    check_no_video(folder)
     if folder.is_file():
         raise ValueError(f"{folder}: is a file; give its folder")
     if not folder.is_dir():
@@ -32,9 +42,9 @@ def find_photos(folder: Path) -> list[str]:
     files = sorted(file.relative_to(folder) for file in folder.rglob("*") if file.is_file() and file.name[0] != ".")
     photos = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
     others = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
-    if len(photos) < LEAST_PHOTOS:
+    if len(photos) < least:
         held = f"holds {counted(len(photos), 'photograph') if photos else 'no photographs'}" if files else "is empty"
-        told = f"{folder}: {held}; at least {counted(LEAST_PHOTOS, 'photograph')} are needed"
+        told = f"{folder}: {held}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
         raise ValueError(told + (f". {_skipped(folder, others)}" if others else ""))
     pictures = [file for file in others if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES]
     if pictures:
@@ -43,12 +53,9 @@ def find_photos(folder: Path) -> list[str]:
 
 
 def check_no_video(path: Path) -> None:
-    """Raise ValueError if the path is that of a video, telling how it becomes photographs."""
-    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
-        frames = f"mkdir photos && {_to_frames(path, Path('photos'))}"
-        raise ValueError(
-            f"{path}: is a video. First make a folder and extract frames: {frames}. Then: a2tg sfm photos SCENE"
-        )
+    """Raise ValueError if the path is that of a video, telling how it becomes a scene."""
+    if is_video(path):
+        raise ValueError(f"{path}: is a video; to make a scene of it, run `a2tg sfm {as_argument(path)} SCENE` first")
 
 
 def _skipped(folder: Path, files: list[Path]) -> str:
@@ -62,11 +69,5 @@ def _skipped(folder: Path, files: list[Path]) -> str:
         pattern = folder / foreign.parent / f"*{foreign.suffix}"
         told += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
     if video is not None:
-        told += f". To extract two frames a second from a video: {_to_frames(folder / video, folder)}"
+        told += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"
     return told
-
-
-def _to_frames(video: Path, folder: Path) -> str:
-    """Return a command that writes frames of a video into a folder."""
-    command = ["ffmpeg", "-i", str(video), "-vf", "fps=2", "-q:v", "2", str(folder / "%04d.jpg")]
-    return shlex.join(command)

@@ -4,9 +4,13 @@ import json
 import math
 import re
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from a2tg_jax.host.regular_files import read_regular
+from a2tg_jax.host.text import shortened
 
 MOST_BYTES = 1 << 25
 """Largest JSON text; a scene of 10,000 photographs has a third of that."""
@@ -58,6 +62,22 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
 
     text = data.decode("utf-8-sig", "surrogatepass")
     return json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Raises:
+      OSError: if the file cannot be read.
+      ValueError: naming the file, if it is no such JSON.
+    """
+    try:
+        values = parse_json(read_regular(file, MOST_BYTES))
+    except ValueError as error:
+        raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{file}: must hold an object; got {shortened(values)}")
+    return values
 
 
 def parse_toml(data: bytes) -> dict[str, Any]:

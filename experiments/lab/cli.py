@@ -158,7 +158,7 @@ class Lab:
                     raise ValueError(f"there is no scene folder {path}")
                 raise ValueError(
                     f"there is no scene {self.folders.scenes / path}: --scenes must name the folder of the scenes, as "
-                    "grids/scales.toml has them (experiments/download.py fetches those of --scale full)"
+                    "grids/scales.toml has them (a2tg download mipnerf360 tandt-db fetches those of --scale full)"
                 )
 
     def _save(self) -> None:

@@ -1,0 +1,219 @@
+"""Sources of photographs gathered in one folder, as COLMAP wants them: upright, in formats it reads, by camera.
+
+Folders, videos and panoramas may be mixed. Photographs that need no change are linked.
+"""
+
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from PIL import Image
+
+from a2tg_jax.core.display import counted
+from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
+from a2tg_jax.data.images import map_in_threads
+from a2tg_jax.data.panoramas import Direction, cut_view, directions, is_panorama, view_size
+from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
+from a2tg_jax.data.video import extract_frames
+
+Panorama = Literal["auto", "yes", "no"]
+"""Whether pictures twice as wide as high are panoramas: those whose edges join (auto), all of them, or none."""
+COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP", "WEBP")
+LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
+QUALITY = 95
+"""JPEG quality of photographs that are written anew."""
+
+
+class CameraGroup(NamedTuple):
+    """Photographs of one camera."""
+
+    names: tuple[str, ...]
+    """Paths below the staging folder, sorted."""
+    size: tuple[int, int]
+    focal: float | None = None
+    """Exact focal length in pixels of a view of a panorama, whose principal point is the middle."""
+
+
+class Rig(NamedTuple):
+    """Views of panoramas of one size: the same directions at each place."""
+
+    folder: str
+    """Folder below the staging folder, with one folder per direction."""
+    directions: tuple[Direction, ...]
+    groups: tuple[CameraGroup, ...]
+    """One group for each direction; names below its folder are the panoramas'."""
+
+
+class Staged(NamedTuple):
+    """Photographs ready for structure from motion."""
+
+    folder: Path
+    groups: tuple[CameraGroup, ...]
+    rigs: tuple[Rig, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all photographs, sorted."""
+        groups = [*self.groups, *(group for rig in self.rigs for group in rig.groups)]
+        return sorted(name for group in groups for name in group.names)
+
+    @property
+    def num_places(self) -> int:
+        """Number of places that cameras stood at; the views of a panorama share one."""
+        return sum(len(group.names) for group in (*self.groups, *(rig.groups[0] for rig in self.rigs)))
+
+
+class _Photo(NamedTuple):
+    """A photograph of a source."""
+
+    source: int
+    file: Path
+    name: str
+    """Path below the staging folder, before conversion."""
+    facts: PictureFacts
+    is_panorama: bool
+
+
+def stage(
+    sources: Sequence[Path],
+    work: Path,
+    *,
+    frames: int,
+    panorama: Panorama,
+    progress: bool,
+    tell: Callable[[str], None],
+) -> Staged:
+    """Gather photographs of folders and videos in the folder `work/photos`.
+
+    Args:
+      sources: folders of photographs, and videos. With several, names begin with the source's.
+      work: folder for the gathered photographs.
+      frames: largest number of frames to take from each video.
+      panorama: which pictures are cut into views.
+      progress: show progress bars.
+      tell: takes lines about what was found.
+
+    Raises:
+      FileNotFoundError, ValueError: as `find_photos`, `extract_frames` and `read_pixels`.
+    """
+    folder = work / "photos"
+    files: list[tuple[int, Path, str]] = []
+    least = LEAST_PHOTOS if len(sources) == 1 else 1
+    for number, (source, prefix) in enumerate(zip(sources, _prefixes(sources), strict=True)):
+        place = source
+        if is_video(source):
+            place = work / f"frames{number}"
+            written, num_frames = extract_frames(source, place, frames, progress=progress)
+            if written < least:
+                raise ValueError(
+                    f"{source}: its camera hardly moves, so that {written} of {num_frames} frames differ; walk around"
+                )
+            tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
+        files += [(number, place / name, prefix + name) for name in find_photos(place, least)]
+    photos = map_in_threads(lambda file: _look(*file, panorama), files)
+    flat = [photo for photo in photos if not photo.is_panorama]
+    groups = _stage_flat(flat, folder)
+    rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tell)
+    num_turned = sum(photo.facts.is_turned for photo in photos)
+    if num_turned:
+        tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
+    return Staged(folder, groups, rigs)
+
+
+def _prefixes(sources: Sequence[Path]) -> list[str]:
+    """Return what names of each source begin with: nothing for a single source, else its own name, made unique."""
+    if len(sources) == 1:
+        return [""]
+    prefixes: list[str] = []
+    for source in sources:
+        stem = source.resolve().stem if is_video(source) else source.resolve().name
+        same = sum(prefix.rstrip("/").partition("~")[0] == stem for prefix in prefixes)
+        prefixes.append(f"{stem}~{same + 1}/" if same else f"{stem}/")
+    return prefixes
+
+
+def _look(source: int, file: Path, name: str, panorama: Panorama) -> _Photo:
+    """Return what is known of one photograph."""
+    facts = picture_facts(file)
+    is_double = facts.size[0] == 2 * facts.size[1]
+    is_cut = is_double and panorama != "no" and (panorama == "yes" or is_panorama(read_pixels(file)))
+    return _Photo(source, file, name, facts, is_cut)
+
+
+def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
+    """Link or write anew photographs that are no panoramas, and group them by source, size and lens."""
+    names = map_in_threads(lambda photo: _place(photo, folder), photos)
+    grouped: dict[tuple[int, tuple[int, int], tuple[str, ...]], list[str]] = defaultdict(list)
+    for photo, name in zip(photos, names, strict=True):
+        grouped[photo.source, photo.facts.size, photo.facts.lens].append(name)
+    return tuple(CameraGroup(tuple(sorted(members)), key[1]) for key, members in grouped.items())
+
+
+def _place(photo: _Photo, folder: Path) -> str:
+    """Link a photograph into the folder, or write it anew if it is turned or COLMAP cannot read it; return its name."""
+    is_read = photo.facts.format in COLMAP_FORMATS
+    suffix = Path(photo.name).suffix.lower()
+    name = photo.name
+    if not is_read:
+        name += ".jpg"
+    elif photo.facts.is_turned and suffix not in (".jpg", ".jpeg", ".png"):
+        name += ".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg"
+    target = folder / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if is_read and not photo.facts.is_turned:
+        _link(photo.file, target)
+    else:
+        save_upright(photo.file, target, QUALITY)
+    return name
+
+
+def _link(file: Path, target: Path) -> None:
+    """Make a file appear at another place, without a copy if the file system can."""
+    try:
+        os.link(file.resolve(), target)
+    except OSError:
+        shutil.copyfile(file, target)
+
+
+def _stage_panoramas(photos: list[_Photo], folder: Path, tell: Callable[[str], None]) -> tuple[Rig, ...]:
+    """Cut panoramas into views, and return a rig for each of their sizes."""
+    by_size: dict[tuple[int, int], list[_Photo]] = defaultdict(list)
+    for photo in photos:
+        by_size[photo.facts.size].append(photo)
+    rigs = []
+    for number, (size, members) in enumerate(by_size.items()):
+        name = f"panorama{number or ''}"
+        map_in_threads(lambda photo, name=name: _cut(photo, folder / name), members)  # type: ignore[misc]
+        rigs.append(_rig(name, size, members))
+        side, _ = view_size(size[0])
+        tell(
+            f"{counted(len(members), 'panorama')} of {size[0]}x{size[1]}, each cut into {len(directions())} views of "
+            f"{side}x{side}; --panorama no leaves them whole"
+        )
+    return tuple(rigs)
+
+
+def _cut(photo: _Photo, folder: Path) -> None:
+    """Write the views of one panorama."""
+    pixels = read_pixels(photo.file)[..., :3]
+    for direction in directions():
+        target = folder / direction.name / _view_name(photo)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
+
+
+def _view_name(photo: _Photo) -> str:
+    return f"{photo.name}.jpg" if Path(photo.name).suffix.lower() not in (".jpg", ".jpeg") else photo.name
+
+
+def _rig(name: str, size: tuple[int, int], members: Iterable[_Photo]) -> Rig:
+    side, focal = view_size(size[0])
+    names = sorted(_view_name(photo) for photo in members)
+    groups = tuple(
+        CameraGroup(tuple(f"{name}/{direction.name}/{view}" for view in names), (side, side), focal)
+        for direction in directions()
+    )
+    return Rig(name, directions(), groups)

@@ -1,0 +1,136 @@
+"""Photographs from a video: frames that are sharp and apart from each other, turned as the video is shown.
+
+A first pass scores small greyscale frames, a second one writes those that were chosen.
+"""
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import laplace
+from tqdm import tqdm
+
+from a2tg_jax.data.decoding import MAX_PIXELS
+
+DEFAULT_FRAMES = 150
+SHARPNESS_WIDTH, MOTION_WIDTH = 640, 128
+"""Widths in pixels of the greyscale frames on which sharpness and motion are measured."""
+LEAST_MOTION = 0.005
+"""Motion between two frames, as a share of the width, below which the camera counts as still."""
+ONLY_VIDEOS = {"format_whitelist": "mov,matroska,webm,avi", "protocol_whitelist": "file"}
+"""Options that keep FFmpeg from playlists, which name further files and addresses."""
+QUALITY = 95
+"""JPEG quality of the written frames."""
+
+
+def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = True) -> tuple[int, int]:
+    """Write the frames of a video that suit structure from motion as JPEG files, named by their number.
+
+    Args:
+      video: file of any format that FFmpeg decodes.
+      folder: new folder for the frames.
+      count: largest number of frames to write.
+      progress: show progress bars.
+
+    Returns:
+      (number written, number of frames of the video).
+
+    Raises:
+      ValueError: if PyAV is missing, the file is no video, or its frames are too large.
+    """
+    sharpness, places = [], []
+    seen, path = None, 0.0
+    for frame in _frames(video, "scoring frames", progress):
+        sharpness.append(_sharpness(_grey(frame, SHARPNESS_WIDTH)))
+        small = _grey(frame, MOTION_WIDTH)
+        moved = LEAST_MOTION if seen is None else motion(seen, small)
+        if moved >= LEAST_MOTION:
+            seen, path = small, path + moved
+        places.append(path)
+    if not places:
+        raise ValueError(f"{video}: has no frames that can be decoded; convert it with ffmpeg to MP4 first")
+    chosen = set(choose_frames(np.array(sharpness), np.array(places), count).tolist())
+    folder.mkdir(parents=True)
+    for number, frame in enumerate(_frames(video, "writing frames", progress)):
+        if number in chosen:
+            _write(frame, folder / f"{number:06d}.jpg")
+    return len(chosen), len(places)
+
+
+def choose_frames(sharpness: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
+    """Return the numbers of the frames to keep: the sharpest of each of `count` intervals of equal length.
+
+    Args:
+      sharpness: [T] score of each frame.
+      places: [T] length of the camera's way until each frame; it does not grow while the camera is still.
+      count: number of intervals, at least 1.
+
+    Returns:
+      Sorted numbers [at most count]; an interval that the camera jumped over has none.
+    """
+    way = places - places[0]
+    interval = np.minimum((way * (count / max(way[-1], 1e-12))).astype(int), count - 1)
+    order = np.lexsort((-sharpness, interval))
+    is_first = np.diff(interval[order], prepend=-1) > 0
+    return np.sort(order[is_first])
+
+
+def motion(before: np.ndarray, after: np.ndarray) -> float:
+    """Return how far the picture moved between two small greyscale frames [h, w], as a share of the width.
+
+    The change of brightness over time, divided by that over space, is the speed along the gradient. Beyond a few pixels
+    it saturates, and it is then large enough.
+    """
+    before, after = before.astype(np.float32), after.astype(np.float32)
+    slope = sum(float(np.abs(part).mean()) for part in np.gradient(before))
+    return float(np.abs(after - before).mean() / max(slope, 1.0) / before.shape[1])
+
+
+def _sharpness(grey: np.ndarray) -> float:
+    """Return the variance of the Laplacian."""
+    return float(laplace(grey.astype(np.float32)).var())
+
+
+def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
+    """Yield the decoded frames of the first video stream."""
+    av = _av()
+    try:
+        with av.open(str(video), options=ONLY_VIDEOS) as container:
+            if not container.streams.video:
+                raise ValueError(f"{video}: has no video stream")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            if stream.width * stream.height > MAX_PIXELS:
+                raise ValueError(f"{video}: has frames of more than {MAX_PIXELS // 10**6} megapixels")
+            bar = tqdm(desc=phase, total=stream.frames or None, unit="frame", disable=not progress)
+            with bar:
+                for frame in container.decode(stream):
+                    bar.update()
+                    yield frame
+    except av.FFmpegError as error:
+        raise ValueError(f"{video}: cannot be read as a video ({error.strerror}); convert it with ffmpeg") from None
+
+
+def _grey(frame: Any, width: int) -> np.ndarray:
+    """Return a frame as greyscale of at most a width, [h, w] uint8."""
+    width = min(width, frame.width)
+    height = max(2, round(frame.height * width / frame.width))
+    grey: np.ndarray = frame.reformat(width=width, height=height, format="gray").to_ndarray()
+    return grey
+
+
+def _write(frame: Any, path: Path) -> None:
+    """Write a frame as players show it. Its rotation is in degrees counterclockwise."""
+    pixels = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
+    Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=QUALITY)
+
+
+def _av() -> ModuleType:
+    try:
+        return importlib.import_module("av")
+    except ImportError:
+        raise ValueError("a video needs PyAV, which is not installed: pip install 'a2tg-jax[video]'") from None

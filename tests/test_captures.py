@@ -1,0 +1,301 @@
+"""Captures of other programs: files as each program writes them, of images that show one point as a white dot."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from test_data_transforms import (
+    FOCAL,
+    HEIGHT,
+    SIZE,
+    TARGET,
+    WIDTH,
+    camera_to_world,
+    check_dots,
+    pinhole_place,
+    save_dot,
+    to_camera,
+    write_frames,
+    write_ply,
+)
+
+from a2tg_jax.data import load_scene
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starting from")
+COUNT = 4
+OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def poses():
+    return [camera_to_world(index, COUNT) for index in range(COUNT)]
+
+
+def save_dots(folder, names, place=lambda pose: pinhole_place(pose, **FOCAL)):
+    for name, pose in zip(names, poses(), strict=True):
+        save_dot(folder / name, place(pose))
+
+
+def write_polycam(folder, prefix="corrected_"):
+    """Raw data: a JSON file of the pose in ARKit's axes for each keyframe."""
+    base = folder / "keyframes"
+    save_dots(base / f"{prefix}images", [f"{index}.jpg" for index in range(COUNT)])
+    (base / f"{prefix}cameras").mkdir()
+    lens = dict(fx=100.0, fy=104.0, cx=58.0, cy=47.0, width=WIDTH, height=HEIGHT, blur_score=9.0)
+    for index, pose in enumerate(poses()):
+        numbers = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        (base / f"{prefix}cameras" / f"{index}.json").write_text(json.dumps({**lens, **numbers}))
+    return base / f"{prefix}cameras"
+
+
+@pytest.mark.parametrize("prefix", ["", "corrected_"])
+def test_polycam(tmp_path, prefix):
+    cameras = write_polycam(tmp_path, prefix)
+    check_dots(load_scene(tmp_path), 0.1)
+    (cameras / "0.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"0\.json: lacks fx, a number of the camera"):
+        load_scene(tmp_path)
+
+
+def write_polycam_with_depth(folder):
+    """The target's depth all over each map, in mm; the first map has low confidence."""
+    keyframes = write_polycam(folder).parent
+    for name in ("depth", "confidence"):
+        (keyframes / name).mkdir()
+    for index, pose in enumerate(poses()):
+        depth = np.full((HEIGHT, WIDTH), round(1000 * to_camera(pose, TARGET)[2]), np.uint16)
+        Image.fromarray(depth).save(keyframes / "depth" / f"{index}.png")
+        confidence = np.full((HEIGHT, WIDTH), 255 * (index > 0), np.uint8)
+        Image.fromarray(confidence).save(keyframes / "confidence" / f"{index}.png")
+
+
+def test_depth_maps_of_polycam_are_points(tmp_path):
+    write_polycam_with_depth(tmp_path)
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 3 * WIDTH * HEIGHT
+    points = scene.transform.inverse().apply(scene.points)
+    nearest = np.linalg.norm(points - TARGET, axis=1).argsort()[:3]
+    assert np.linalg.norm(points[nearest] - TARGET, axis=1).max() < 0.03
+    assert scene.colors[nearest].min() > 0.8 and scene.colors.mean() < 0.1
+
+
+def test_the_black_border_of_corrected_images_is_masked(tmp_path):
+    write_polycam(tmp_path)
+    file = tmp_path / "keyframes" / "corrected_images" / "1.jpg"
+    pixels = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
+    pixels[:, :10] = 0
+    pixels[40:50, 60:70] = 0
+    Image.fromarray(pixels).save(file, quality=95)
+    (view,) = [view for view in load_scene(tmp_path).train if view.name.endswith("1.jpg")]
+    counts = view.mask.read()
+    assert not counts[:, :11].any() and counts[:, 14:].all()
+
+
+def write_record3d(folder, metadata="metadata", images="rgbd", **changes):
+    """Poses are quaternions and positions, K is stored by columns, images are named by number."""
+    save_dots(folder / images, [f"{index}.jpg" for index in range(COUNT)])
+    rows = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in poses()]
+    values = dict(poses=rows, K=[100.0, 0, 0, 0, 104.0, 0, 58.0, 47.0, 1], **SIZE)
+    (folder / metadata).write_text(json.dumps(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("metadata", "images", "changes"),
+    [
+        ("metadata", "rgbd", {}),
+        ("metadata.json", "rgb", dict(K=None, perFrameIntrinsicCoeffs=[[100.0, 104.0, 58.0, 47.0]] * COUNT)),
+    ],
+)
+def test_record3d(tmp_path, metadata, images, changes):
+    write_record3d(tmp_path, metadata, images, **changes)
+    check_dots(load_scene(tmp_path), 0.1)
+    write_record3d(tmp_path, metadata, images, poses=[[0, 0, 0, 1, 0, 0]])
+    with pytest.raises(ValueError, match="poses must be rows of 7 finite numbers"):
+        load_scene(tmp_path)
+
+
+def metashape_place(pose, f=100.0, b1=-4.0, cx=-2.0, cy=2.0, k1=-0.1, k2=0.02, k3=0.001, p1=0.004, p2=-0.003):
+    """Where Metashape's manual projects the target: Brown's distortion, then f, b1 and the offset from the middle."""
+    x, y, z = to_camera(pose, TARGET)
+    x, y = x / z, y / z
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    moved_x = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    moved_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return WIDTH / 2 + cx + moved_x * (f + b1), HEIGHT / 2 + cy + moved_y * f
+
+
+LENS = "<f>100</f><b1>-4</b1><cx>-2</cx><cy>2</cy><k1>-.1</k1><k2>.02</k2><k3>.001</k3><p1>.004</p1><p2>-.003</p2>"
+
+
+def numbers(array):
+    return " ".join(map(repr, np.asarray(array, float).ravel().tolist()))
+
+
+def metashape_xml(world, within="component", lens=LENS):
+    """cameras.xml whose chunk or component has the transform `world` (rotation, translation, scale)."""
+    rotation, translation, scale = world
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = scale * rotation, translation
+    transform = f"""<transform><rotation locked="true">{numbers(rotation)}</rotation>
+        <translation locked="true">{numbers(translation)}</translation><scale>{scale}</scale></transform>"""
+    component = f'<component id="0">{transform if within == "component" else ""}</component>'
+    cameras = ""
+    for index, pose in enumerate(poses()):
+        placed = pose @ OPENCV
+        local = np.linalg.inv(matrix) @ placed
+        local[:3, :3] *= scale
+        cameras += f"""<camera id="{index}" sensor_id="0" component_id="0" label="C:\\shots\\{index}.png">
+            <transform>{numbers(local)}</transform></camera>"""
+    return f"""<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1">
+        <sensors next_id="1"><sensor id="0" label="Phone" type="frame"><resolution width="{WIDTH}" height="{HEIGHT}"/>
+        <calibration type="frame" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{lens}</calibration>
+        </sensor></sensors><components>{component}</components>
+        <cameras><group id="0" label="g">{cameras}</group><camera id="9" sensor_id="0" label="9.png"/></cameras>
+        {transform if within == "chunk" else ""}</chunk></document>"""
+
+
+WORLD = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), np.array([3.0, -2.0, 1.0]), 2.5
+
+
+def write_metashape(folder, within="component"):
+    save_dots(folder / "images", [f"{index}.png" for index in range(COUNT)], metashape_place)
+    write_ply(folder / "points.ply")
+    (folder / "cameras.xml").write_text(metashape_xml(WORLD, within))
+
+
+@pytest.mark.parametrize("within", ["component", "chunk"])
+def test_metashape(tmp_path, within):
+    write_metashape(tmp_path, within)
+    scene = load_scene(tmp_path)
+    check_dots(scene, 0.1)
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+    assert load_scene(tmp_path / "cameras.xml").name == tmp_path.name
+
+
+@pytest.mark.parametrize(
+    ("xml", "message"),
+    [
+        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its lens has k4 or b2"),
+        (metashape_xml(WORLD).replace("<f>100</f>", "<f>long</f>"), "1 numbers are expected; got long"),
+        ('<!DOCTYPE x [<!ENTITY a "a">]><chunk><sensors/></chunk>', "it declares entities"),
+        ("<chunk><sensors>", "cannot be read as XML"),
+        ("<chunk><sensors/></chunk>", "none of its cameras has a pose and an image"),
+    ],
+)
+def test_metashape_that_cannot_be_read(tmp_path, xml, message):
+    save_dots(tmp_path / "images", [f"{index}.png" for index in range(COUNT)])
+    (tmp_path / "cameras.xml").write_text(xml)
+    with pytest.raises(ValueError, match=message):
+        load_scene(tmp_path)
+
+
+def realityscan_xmp(pose, position=(0, 0, 0), more='xcr:DistortionCoeficients="-0.1 0.02 0 0 0 0"'):
+    """XMP as RealityCapture's page on its camera mathematics has it: lengths in units of the longer side."""
+    rotation = (pose @ OPENCV)[:3, :3].T
+    return f"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+        <rdf:Description xcr:Version="3" xcr:PosePrior="initial" xcr:DistortionModel="brown3"
+        xcr:FocalLength35mm="{100 / WIDTH * 36}" xcr:Skew="0" xcr:AspectRatio="1.04" {more}
+        xcr:PrincipalPointU="{-2 / WIDTH}" xcr:PrincipalPointV="{2 / WIDTH}"
+        xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"><xcr:Rotation>{numbers(rotation)}</xcr:Rotation>
+        <xcr:Position>{numbers(pose[:3, 3] + position)}</xcr:Position></rdf:Description></rdf:RDF></x:xmpmeta>"""
+
+
+def brown_place(pose):
+    x, y, z = to_camera(pose, TARGET)
+    r2 = (x / z) ** 2 + (y / z) ** 2
+    radial = 1 - 0.1 * r2 + 0.02 * r2**2
+    return 58 + 100 * radial * x / z, 47 + 104 * radial * y / z
+
+
+def write_realityscan(folder, position=(0, 0, 0)):
+    save_dots(folder, [f"{index}.png" for index in range(COUNT)], brown_place)
+    for index, pose in enumerate(poses()):
+        (folder / f"{index}.xmp").write_text(realityscan_xmp(pose, position))
+
+
+def test_realityscan(tmp_path):
+    write_realityscan(tmp_path)
+    check_dots(load_scene(tmp_path), 0.1)
+    (tmp_path / "0.xmp").write_text(realityscan_xmp(poses()[0], more='xcr:DistortionCoeficients="0 0 0 0 0.1 0"'))
+    with pytest.raises(ValueError, match=r"0\.xmp: has the distortion model brown3 with skew, k4, t1 or t2"):
+        load_scene(tmp_path)
+
+
+def test_a_world_of_a_map_is_moved(tmp_path):
+    """Coordinates of a map would leave float32 no digits for the scene."""
+    write_realityscan(tmp_path, np.array([431_210.0, 5_412_000.0, 210.0]))
+    with pytest.warns(UserWarning, match=r"lies far from its origin, which was moved to 43121\d 541200\d 21\d"):
+        scene = load_scene(tmp_path)
+    assert np.abs(scene.transform.inverse().apply(np.zeros((1, 3)))).max() < 100
+
+
+def colmap_text(folder, points="points3D.txt"):
+    """As VGGT and MASt3R write it: a PINHOLE camera for each image, no features, points without tracks."""
+    save_dots(folder / "images", [f"{index}.png" for index in range(COUNT)])
+    model = folder / "sparse"
+    model.mkdir()
+    (model / "cameras.txt").write_text(
+        "".join(f"{index + 1} PINHOLE {WIDTH} {HEIGHT} 100 104 58 47\n" for index in range(COUNT))
+    )
+    lines = []
+    for index, pose in enumerate(poses()):
+        viewmat = np.linalg.inv(pose @ OPENCV)
+        x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat()
+        lines += [f"{index + 1} {numbers([w, x, y, z])} {numbers(viewmat[:3, 3])} {index + 1} {index}.png", ""]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    if points.endswith(".ply"):
+        write_ply(model / points)
+    else:
+        (model / points).write_text(f"1 {numbers(TARGET)} 255 0 51 -1\n" + "2 1 0 0 255 0 51 0\n3 0 1 0 9 9 9 0\n")
+
+
+@pytest.mark.parametrize("points", ["points3D.txt", "points3D.ply"])
+def test_models_of_networks(tmp_path, points):
+    colmap_text(tmp_path, points)
+    scene = load_scene(tmp_path)
+    check_dots(scene)
+    assert len(scene.points) >= 3
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+
+
+def test_models_of_networks_in_binary(tmp_path):
+    from a2tg_jax.data.colmap_library import pycolmap
+
+    colmap_text(tmp_path)
+    model = tmp_path / "sparse"
+    reconstruction = pycolmap().Reconstruction(str(model))
+    for file in model.iterdir():
+        file.unlink()
+    reconstruction.write_binary(str(model))
+    scene = load_scene(tmp_path)
+    check_dots(scene)
+    np.testing.assert_allclose(scene.colors[0], [1, 0, 0.2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("scan.psx", "Export Cameras"),
+        ("scan.r3d", "unpack it"),
+        ("poses_bounds.npy", "a2tg sfm"),
+        ("opensfm/reconstruction.json", "export_colmap"),
+        ("database.db", "colmap mapper"),
+    ],
+)
+def test_a_capture_that_is_not_read_is_told_what_to_do(tmp_path, name, words):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(FileNotFoundError, match=words):
+            load_scene(path)
+
+
+def test_transforms_come_first(tmp_path):
+    """Polycam's folder after nerfstudio's conversion has both."""
+    frames = write_frames(tmp_path)
+    (tmp_path / "transforms.json").write_text(json.dumps({**FOCAL, **SIZE, "frames": frames}))
+    (tmp_path / "cameras.xml").write_text("<sensors")
+    (tmp_path / "images.psx").touch()
+    check_dots(load_scene(tmp_path))

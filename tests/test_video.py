@@ -1,0 +1,98 @@
+"""Frames of a video: sharp ones, apart from each other, turned as players show them."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from a2tg_jax.data.video import LEAST_MOTION, choose_frames, extract_frames, motion
+
+
+def test_the_sharpest_of_each_interval_is_chosen():
+    sharpness = np.array([1.0, 9, 2, 3, 8, 1, 5, 1, 1, 7])
+    np.testing.assert_array_equal(choose_frames(sharpness, np.arange(10.0), 3), [1, 4, 9])
+    assert len(choose_frames(sharpness, np.arange(10.0), 99)) == 10
+
+
+def test_a_camera_that_stands_still_gives_one_frame():
+    places = np.array([0.0, 1, 1, 1, 1, 1, 1, 2, 3])
+    np.testing.assert_array_equal(choose_frames(np.arange(9.0), places, 4), [0, 6, 7, 8])
+    np.testing.assert_array_equal(choose_frames(np.arange(3.0), np.zeros(3), 5), [2])
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5, 1.0, 2.0])
+def test_motion_is_measured_in_widths(shift):
+    wide = gaussian_filter(np.random.default_rng(0).uniform(0, 255, (72, 140)), 4) * 4
+    x = np.arange(128)
+    moved = np.stack([np.interp(x + shift, np.arange(140), row) for row in wide])
+    assert motion(wide[:, :128], moved) == pytest.approx(shift / 128 / 2, rel=0.35, abs=1e-9)
+
+
+WIDTH, HEIGHT = 96, 64
+
+
+def write_video(path, rotation=0):
+    """A pattern that moves, stands still for ten frames, and moves; every third frame is blurred."""
+    av = pytest.importorskip("av", reason="the extra [video] is not installed")
+    wide = np.kron(np.random.default_rng(0).integers(0, 255, (16, 60)), np.ones((4, 4)))
+    wide[:8] = 255
+    places = [*range(0, 40, 2), *[40] * 10, *range(40, 80, 2)]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = WIDTH, HEIGHT, "yuv420p", 4_000_000
+        for number, place in enumerate(places):
+            grey = gaussian_filter(wide[:, place : place + WIDTH], 2 * (number % 3 == 1)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(np.repeat(grey[..., None], 3, -1), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    if rotation:
+        turn(path, rotation)
+    return places
+
+
+def turn(path, degrees):
+    """Writes the matrix of the track header (ISO 14496-12) by which players turn the picture clockwise."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 4 + 40
+    a, b = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[degrees]
+    for place, value in ((0, a), (4, b), (12, -b), (16, a)):
+        data[at + place : at + place + 4] = (value * 65536).to_bytes(4, "big", signed=True)
+    path.write_bytes(bytes(data))
+
+
+def test_sharp_frames_apart_from_each_other_are_written(tmp_path):
+    places = write_video(tmp_path / "clip.mp4")
+    assert extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 12, progress=False) == (12, len(places))
+    numbers = [int(file.stem) for file in sorted((tmp_path / "frames").iterdir())]
+    assert not any(number % 3 == 1 for number in numbers), "blurred"
+    at = [places[number] for number in numbers]
+    assert at.count(40) <= 2 and len(set(at)) >= 11 and max(np.diff(at)) <= 14
+    assert LEAST_MOTION * WIDTH < 2
+
+
+@pytest.mark.parametrize("rotation", [90, 180, 270])
+def test_frames_are_turned_as_players_show_them(tmp_path, rotation):
+    """The white bar on top of the stored picture is to the right after a quarter turn clockwise."""
+    write_video(tmp_path / "clip.mp4", rotation)
+    extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3, progress=False)
+    pixels = np.asarray(Image.open(min((tmp_path / "frames").iterdir())))[..., 0]
+    assert pixels.shape == ((HEIGHT, WIDTH) if rotation == 180 else (WIDTH, HEIGHT))
+    bar = {90: pixels[:, -5:], 180: pixels[-5:], 270: pixels[:, :5]}[rotation]
+    assert bar.min() > 200
+
+
+def test_what_is_no_video_is_named(tmp_path):
+    pytest.importorskip("av", reason="the extra [video] is not installed")
+    write_video(tmp_path / "other.mp4")
+    for text in ("no video", "ffconcat version 1.0\nfile other.mp4\n"):
+        (tmp_path / "clip.mp4").write_text(text)
+        with pytest.raises(ValueError, match=r"clip\.mp4: cannot be read as a video"):
+            extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3)
+
+
+def test_without_the_extra_the_command_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(
+        ValueError, match=r"a video needs PyAV, which is not installed: pip install 'a2tg-jax\[video\]'"
+    ):
+        extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3)
