@@ -13,6 +13,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.core.display import counted
+from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.host.text import shortened
@@ -111,6 +112,8 @@ class Train:
     """Hold out every k-th image for testing."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
+    lens: LensUse = "undistort"
+    """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
     validation: bool = False
     """Hold out every eighth training image in place of the test images, to choose options without seeing these."""
     compare: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
@@ -183,7 +186,7 @@ class Train:
         """Record of the run that the flags ask for."""
         path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
-        source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.validation)
+        source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.lens, self.validation)
         init = None if self.init is None else str(self.init.resolve())
         compare = tuple(dict.fromkeys(compare))
         return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init)
@@ -234,6 +237,7 @@ def train_defaults(arguments: list[str]) -> Train:
         downscale=file.downscale,
         test_every=file.test_every,
         alpha=file.alpha,
+        lens=file.lens,
         validation=file.validation,
         compare=file.compare,
         on_nan=file.on_nan,

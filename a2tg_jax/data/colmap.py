@@ -14,7 +14,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.colmap_text import check_text
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
-from a2tg_jax.data.lenses import Lens, checked_lens
+from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
@@ -45,13 +45,15 @@ def _model_of(path: Path) -> Path:
     return model
 
 
-def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
-    """Read a COLMAP scene: every registered image as a pinhole view, and the sparse points.
+def load_colmap(
+    path: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
+) -> Scene:
+    """Read a COLMAP scene: every registered image as a view, and the sparse points.
 
     Args:
       path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
         beside the model, or up to two folders above.
-      downscale, test_every, room: as in `load_scene`.
+      downscale, test_every, room, lens: as in `load_scene`.
 
     Raises:
       FileNotFoundError: if there is no model, no folder of images, or an image of the model is missing.
@@ -61,7 +63,8 @@ def load_colmap(path: Path, *, downscale: int, test_every: int, room: int | None
     model = _model_of(path)
     reconstruction = _read_model(model)
     images_folder = _find_images_folder(path, model, downscale)
-    lenses = {key: checked_lens(camera, f"{model}: camera {key}") for key, camera in reconstruction.cameras.items()}
+    cameras = reconstruction.cameras.items()
+    lenses = {key: checked_lens(camera, f"{model}: camera {key}", lens) for key, camera in cameras}
     shelf = Shelf(room)
     registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
     _log_unregistered(images_folder, len(registered))
@@ -122,11 +125,12 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
     check_aspect(file, photograph, *lens.size)
     try:
         pixels, K = lens.undistort(photograph, still_to_downscale)
+        rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
         raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, file if pixels is photograph else None)
-    return Shot(image.name, viewmat_of(image), K, kept, mask)
+    return Shot(image.name, viewmat_of(image), K, kept, mask, rays)
 
 
 def _model_suffix(folder: Path) -> str | None:

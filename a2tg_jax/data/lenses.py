@@ -1,8 +1,9 @@
-"""Undistortion from any camera model of COLMAP to a pinhole: intrinsics and image."""
+"""Lenses of any camera model of COLMAP: undistorted to a pinhole, or kept, with a ray for each pixel."""
 
 import dataclasses
+import functools
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -19,6 +20,14 @@ GRID, MARGIN = 9, 0.1
 """Number of test points along an axis of an undistorted image, and their largest distance outside the photograph."""
 ROWS_AT_ONCE = 128
 """Number of rows undistorted at a time, which bounds the memory."""
+
+
+WIDEST_ANGLE = np.deg2rad(80.0)
+"""Largest angle between a ray of a kept lens and the direction of view; pixels beyond it do not count."""
+FARTHEST_FROM_RAY = 0.1
+"""Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
+LensUse = Literal["undistort", "keep"]
+"""Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,6 +101,10 @@ class Lens:
         new_size = downscaled_size(*image_size, downscale)
         return resize_pixels(pixels, *new_size), scaled_intrinsics(K, size, new_size)
 
+    def rays(self, width: int, height: int) -> np.ndarray | None:
+        """Return the rays of pictures of a size, as `Camera.rays` has them; None of a pinhole."""
+        return None
+
     def _warp(self, pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Return a pinhole image with intrinsics K of the given size, sampled bilinearly from the photograph."""
         width, height = size
@@ -113,7 +126,57 @@ class Lens:
         return places[:, ::-1].T.reshape(2, len(rows), width)
 
 
-def checked_lens(camera: Any, what: str) -> Lens:
+@dataclasses.dataclass(frozen=True, eq=False)
+class KeptLens(Lens):
+    """A calibrated camera whose photographs are kept as they are."""
+
+    def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Return a photograph divided by `downscale`, and the K [3, 3] in whose image plane its rays are told."""
+        new_size = downscaled_size(pixels.shape[1], pixels.shape[0], downscale)
+        return resize_pixels(pixels, *new_size), scaled_intrinsics(self._matrix(), self.size, new_size)
+
+    def rays(self, width: int, height: int) -> np.ndarray | None:
+        """Return the rays [height, width, 2] of pictures of a size, NaN where the lens has none; None of a pinhole.
+
+        Raises:
+          ValueError: if the model has no pinhole equivalent (panoramas), or fewer than half of the pixels have a ray.
+        """
+        K = scaled_intrinsics(self._matrix(), self.size, (width, height))
+        if self.is_pinhole:
+            return None
+        camera = self.camera
+        return _rays(camera.model.name, self.size, tuple(camera.params.tolist()), (width, height), K.tobytes())
+
+    def _matrix(self) -> np.ndarray:
+        try:
+            matrix: np.ndarray = self.camera.calibration_matrix()
+        except (ValueError, RuntimeError):
+            raise ValueError(f"{self.camera.model.name} has no image plane: cut its photographs into views") from None
+        return matrix
+
+
+@functools.lru_cache(maxsize=256)
+def _rays(
+    model: str, size: tuple[int, int], params: tuple[float, ...], picture: tuple[int, int], K: bytes
+) -> np.ndarray:
+    """Return the rays of a lens for pictures of a size; the same array for the same lens."""
+    camera = pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
+    x, y = np.meshgrid(*(np.arange(side) + 0.5 for side in picture))
+    places = np.stack([x, y], -1).reshape(-1, 2) * np.divide(size, picture)
+    slopes = np.asarray(camera.cam_from_img(places), np.float64)
+    # A polynomial that folds has no inverse there: what comes back must lead to the pixel again.
+    again = np.asarray(camera.img_from_cam(_homogeneous(np.nan_to_num(slopes))))
+    is_ray = np.linalg.norm(again - places, axis=1) <= FARTHEST_FROM_RAY
+    is_ray &= np.linalg.norm(slopes, axis=1) <= np.tan(WIDEST_ANGLE)  # False for NaN.
+    if 2 * np.count_nonzero(is_ray) < len(is_ray):
+        raise ValueError(f"{model} has a distortion that gives fewer than half of the pixels a ray")
+    rays = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
+    found = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
+    found.setflags(write=False)
+    return found
+
+
+def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
     """Return the lens of a pycolmap.Camera after checking its numbers.
 
     Raises:
@@ -128,7 +191,7 @@ def checked_lens(camera: Any, what: str) -> Lens:
         raise ValueError(f"{what}: its distortion must lie within ±{LARGEST_DISTORTION:g}; got {distortion.tolist()}")
     if len(camera.focal_length_idxs()):  # Panoramas have none.
         check_intrinsics(camera.calibration_matrix(), camera.width, camera.height, what)
-    return Lens(camera)
+    return KeptLens(camera) if use == "keep" else Lens(camera)
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
+from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
 from a2tg_jax.data.metashape import metashape_file, metashape_frames
 from a2tg_jax.data.photo_folder import check_no_video
@@ -27,14 +28,15 @@ def load_scene(
     test_every: int = 8,
     room: int | None = None,
     alpha: AlphaMeaning = "transparency",
+    lens: LensUse = "undistort",
 ) -> Scene:
     """Read photographs, cameras and points, and normalise the world.
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
     nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`),
     Polycam's raw data, Record3D's frames with their metadata, Metashape's cameras (.xml), RealityScan's XMP files.
-    Distorted cameras are undistorted to pinholes. Images in the folder without a pose are ignored. Masks, black
-    at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
+    Photographs of distorted cameras are undistorted to pinholes unless `lens` keeps them. Images in the folder without
+    a pose are ignored. Masks, black at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
 
     Args:
       path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
@@ -45,6 +47,8 @@ def load_scene(
         needed (`Shelf`), which changes no result. None takes a quarter of the process's memory.
       alpha: meaning of the alpha channel: "transparency" before a background, or a "mask", of which only opaque
         pixels count.
+      lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
+        with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the input's.
@@ -55,7 +59,9 @@ def load_scene(
     """
     if alpha not in get_args(AlphaMeaning):
         raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
-    scene = _load(Path(path), downscale, test_every, room)
+    if lens not in get_args(LensUse):
+        raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
+    scene = _load(Path(path), downscale, test_every, room, lens)
     return alpha_as_mask(scene, str(path)) if alpha == "mask" else scene
 
 
@@ -66,7 +72,7 @@ def is_scene(folder: Path) -> bool:
     return has_cameras or _frames(folder) is not None
 
 
-def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scene:
+def _load(path: Path, downscale: int, test_every: int, room: int | None, lens: LensUse) -> Scene:
     """Load the scene as it lies on disk."""
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
@@ -75,7 +81,7 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None) -> Scen
         raise FileNotFoundError(f"{path}: no such scene folder")
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
-    options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room}
+    options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room, "lens": lens}
     check_no_video(path)
     if is_regular(path):
         return _load_file(path, options)

@@ -1,4 +1,4 @@
-"""Scenes: photographs with exact pinhole cameras, and points, in the normalised world."""
+"""Scenes: photographs with their cameras, and points, in the normalised world."""
 
 import dataclasses
 import html
@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -126,6 +127,8 @@ class Shot:
     """[H, W, 3] or [H, W, 4] uint8, with straight alpha."""
     mask: Mask | None = None
     """Mask of the pixels that count; None without a mask."""
+    rays: np.ndarray | None = None
+    """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None of a pinhole."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -358,6 +361,11 @@ def _view(shot: Shot, viewmat: np.ndarray) -> View:
     """Return the shot with its camera in the normalised world."""
     height, width = shot.pixels.shape[:2]
     check_calibration(viewmat, shot.K, width, height, shot.name)
-    camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height)
-    mask = None if shot.mask is None or shot.mask.is_full else shot.mask
+    rays: Any = shot.rays  # Views of one lens share the array.
+    camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height, rays)
+    mask = shot.mask
+    if shot.rays is not None and not np.isfinite(shot.rays).all():
+        has_ray = np.isfinite(shot.rays).all(axis=2)
+        mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
+    mask = None if mask is None or mask.is_full else mask
     return View(shot.name, camera, Picture.of(shot.pixels), mask)

@@ -17,7 +17,7 @@ from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
-from a2tg_jax.data.lenses import Lens, checked_lens
+from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture, Shelf
@@ -60,7 +60,9 @@ class Frames(NamedTuple):
     """Function from pixels [H, W, C] to a mask [H, W] of those that count."""
 
 
-def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
+def load_transforms(
+    file: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
+) -> Scene:
     """Read a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
@@ -68,14 +70,14 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
 
     Args:
       file: path of transforms.json.
-      downscale, test_every, room: as in `load_scene`.
+      downscale, test_every, room, lens: as in `load_scene`.
 
     Raises:
       FileNotFoundError: if an image or the point file is missing.
       ValueError: if the JSON, a frame, an image or a pose is invalid, or the views make no scene (`assemble_scene`).
     """
     meta = _read_json(file)
-    shots = _read_shots(file, meta, downscale, Shelf(room))
+    shots = _read_shots(file, meta, downscale, Shelf(room), lens)
     listed = {key: _names(meta[f"{key}_filenames"]) for key in ("train", "val", "test") if f"{key}_filenames" in meta}
     if listed:
         test_names = listed.get("test") or listed.get("val") or set()
@@ -88,19 +90,21 @@ def load_transforms(file: Path, *, downscale: int, test_every: int, room: int | 
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
-def load_frames(made: Frames, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
+def load_frames(
+    made: Frames, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
+) -> Scene:
     """Make a scene of frames of another program.
 
     Args:
       made: the frames.
-      downscale, test_every, room: as in `load_scene`.
+      downscale, test_every, room, lens: as in `load_scene`.
 
     Raises:
       FileNotFoundError, ValueError: as `load_transforms`.
     """
     meta = {"frames": made.frames}
     _check_meta(made.file, meta)
-    shots = sorted(_read_shots(made.file, meta, downscale, Shelf(room)), key=lambda shot: shot.name)
+    shots = sorted(_read_shots(made.file, meta, downscale, Shelf(room), lens), key=lambda shot: shot.name)
     if made.counted is not None:
         shots = [_masked(shot, made.counted) for shot in shots]
     folder = made.file.resolve().parent
@@ -113,7 +117,9 @@ def _masked(shot: Shot, counted: Callable[[np.ndarray], np.ndarray]) -> Shot:
     return shot if mask is None or mask.all() else dataclasses.replace(shot, mask=Mask.of(mask))
 
 
-def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | None = None) -> Scene:
+def load_blender(
+    folder: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
+) -> Scene:
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
     Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
@@ -121,17 +127,17 @@ def load_blender(folder: Path, *, downscale: int, test_every: int, room: int | N
 
     Args:
       folder: the scene folder.
-      downscale, test_every, room: as in `load_scene`.
+      downscale, test_every, room, lens: as in `load_scene`.
 
     Raises:
       FileNotFoundError, ValueError: as `load_transforms`.
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     shelf = Shelf(room)
-    train = _read_shots(train_file, _read_json(train_file), downscale, shelf)
+    train = _read_shots(train_file, _read_json(train_file), downscale, shelf, lens)
     test: list[Shot] = []
     if is_regular(test_file):
-        test = _read_shots(test_file, _read_json(test_file), downscale, shelf)
+        test = _read_shots(test_file, _read_json(test_file), downscale, shelf, lens)
     else:
         train, test = every_kth(train, test_every)
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
@@ -175,18 +181,18 @@ def _check_texts(file: Path, values: dict[str, Any]) -> None:
             raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
 
 
-def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf) -> list[Shot]:
-    """Return the frames of a transforms file, undistorted and downscaled, in the file's order."""
+def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf, use: LensUse) -> list[Shot]:
+    """Return the frames of a transforms file, downscaled, in the file's order."""
 
     def shoot(frame: dict[str, Any]) -> Shot:
-        return _shot(file, {**meta, **frame}, downscale, shelf)
+        return _shot(file, {**meta, **frame}, downscale, shelf, use)
 
     shots = map_in_threads(shoot, meta["frames"])
     check_masks(shots, str(file))
     return shots
 
 
-def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Shot:
+def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: LensUse) -> Shot:
     """Return one frame; `frame` also holds the file's global values, which the frame's own override."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
@@ -196,15 +202,16 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf) -> Sh
     image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
     image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
     photograph = read_pixels(image_file)
-    lens = _lens(frame, photograph, f"{file}: {name}")
+    lens = _lens(frame, photograph, f"{file}: {name}", use)
     check_aspect(image_file, photograph, *lens.size)
     try:
         pixels, K = lens.undistort(photograph, still_to_downscale)
+        rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
         raise ValueError(f"{file}: {name}: its camera model {error}") from None
     mask = load_mask(_find_mask(file, frame, image_folder / image_name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, image_file if pixels is photograph else None)
-    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask)
+    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask, rays)
 
 
 def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
@@ -228,13 +235,13 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
     return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
-def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str) -> Lens:
+def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str, use: LensUse) -> Lens:
     """Return the camera of a frame; sizes default to the image's, the principal point to the centre."""
     width, height = _side(frame, "w", pixels.shape[1], what), _side(frame, "h", pixels.shape[0], what)
     fx, fy = _focal_lengths(frame, width, height, what)
     model, distortion = _distortion(frame, what)
     params = [fx, fy, _number(frame, "cx", width / 2, what), _number(frame, "cy", height / 2, what), *distortion]
-    return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what)
+    return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what, use)
 
 
 def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float:

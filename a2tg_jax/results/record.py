@@ -21,6 +21,7 @@ from typing import Any, Literal
 import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
+from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.data.scene import scene_name, with_validation_views
 from a2tg_jax.host.atomic import replacing
@@ -57,6 +58,8 @@ class SceneSource:
     """Interval k of test views: every k-th view is held out."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask."""
+    lens: LensUse = "undistort"
+    """Whether photographs of distorted cameras are undistorted, or kept."""
     validation: bool = False
     """Whether every eighth training view is held out for choosing options, in place of the test views."""
 
@@ -85,7 +88,8 @@ class SceneSource:
             width, height = SYNTHETIC_SIZE
             scene = synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=every)
         else:
-            scene = load_scene(self.path, downscale=self.downscale, test_every=every, alpha=self.alpha, room=room)
+            given: Any = {"downscale": self.downscale, "alpha": self.alpha, "lens": self.lens}
+            scene = load_scene(self.path, test_every=every, room=room, **given)
         return with_validation_views(scene) if self.validation else scene
 
 
@@ -158,6 +162,7 @@ class RunFile:
     downscale: int = 1
     test_every: int = 8
     alpha: AlphaMeaning = "transparency"
+    lens: LensUse = "undistort"
     validation: bool = False
     system: str = DEFAULT_SYSTEM
     preset: str | None = None
@@ -236,6 +241,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "downscale": record.scene.downscale,
         "test_every": record.scene.test_every,
         "alpha": record.scene.alpha,
+        **({} if record.scene.lens == "undistort" else {"lens": record.scene.lens}),
         **({"validation": True} if record.scene.validation else {}),
         "system": record.name,
         **({} if record.preset is None else {"preset": record.preset}),
@@ -267,7 +273,7 @@ def read_record(run: RunFolder) -> RunRecord:
     file = read_run_file(run.record)
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
-    source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.validation)
+    source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.lens, file.validation)
     system = file.chosen(str(run.record))
     record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init)
     try:
