@@ -1,15 +1,21 @@
 """Cameras with a ray for each pixel: the picture of a pinhole camera where they are one, and of each ray elsewhere."""
 
 import dataclasses
+import json
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.cameras import Camera, looking, resize_camera
+from a2tg_jax.data.scene import kinds_of
+from a2tg_jax.systems.stage1 import PruneConfig
+from a2tg_jax.training.start import initial_model
 
 WIDTH, HEIGHT = 43, 30
 
@@ -128,3 +134,81 @@ def test_wrong_rays_are_refused():
     camera = fisheye(as_camera(scene, "float32"))
     with pytest.raises(ValueError, match="cannot render cameras with rays: say 'xla', or 'auto'"):
         a2tg.render_image(as_gaussians(scene, "float32"), camera, settings=a2tg.RenderSettings(compositor="native"))
+
+
+def write_fisheye(folder, num_views=4, focal=20.0, size=(32, 24), **more):
+    """Bright photographs of a fisheye, all from places on a circle, as a transforms.json."""
+    rng, (width, height) = np.random.default_rng(0), size
+    frames = []
+    for index in range(num_views):
+        Image.fromarray(rng.integers(180, 256, (height, width, 3), np.uint8)).save(folder / f"{index}.png")
+        camera_to_world = np.linalg.inv(looking(np.array([np.cos(index), np.sin(index), 0.3]) * 3, *aim(index)))
+        pose = camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
+    lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.0, "k3": 0.0, "k4": 0.0, "fl_x": focal, **more}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    return folder
+
+
+def aim(index):
+    """Where the camera of a place looks, and what is down."""
+    return -np.array([np.cos(index), np.sin(index), 0.3]), np.array([0.0, 0.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # There are no points.
+        return a2tg.load_scene(write_fisheye(tmp_path_factory.mktemp("fisheye")), lens="keep", test_every=4)
+
+
+def test_a_kept_photograph_has_the_rays_of_its_lens(kept, tmp_path):
+    camera = kept.train[0].camera
+    places = (np.asarray(camera.rays) - np.asarray(camera.K)[:2, 2]) / np.diag(np.asarray(camera.K))[:2]
+    angle = np.arctan(np.linalg.norm(places, axis=2))
+    x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5)
+    # OpenCV's fisheye: r = f·θ·(1 + k₁·θ²)
+    distance = np.hypot(x - 16, y - 12)
+    seen = np.isfinite(angle)
+    np.testing.assert_allclose((20 * angle * (1 + 0.05 * angle**2))[seen], distance[seen], atol=1e-3)
+    np.testing.assert_allclose(places[12, 30], angle[12, 30] * np.array([14.5, 0.5]) / distance[12, 30] * (
+        np.tan(angle[12, 30]) / angle[12, 30]), rtol=1e-4)  # fmt: skip
+    assert seen.all() and kept.train[0].mask is None
+    assert all(view.camera.rays is camera.rays for view in (*kept.train, *kept.test))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        undistorted = a2tg.load_scene(write_fisheye(tmp_path))
+    assert undistorted.train[0].camera.rays is None
+
+
+def test_pixels_too_far_from_the_direction_of_view_do_not_count(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = a2tg.load_scene(write_fisheye(tmp_path, focal=11.0), lens="keep")
+    view = scene.train[0]
+    has_ray = np.isfinite(view.camera.rays).all(axis=2)
+    assert 0.5 < has_ray.mean() < 1
+    np.testing.assert_array_equal(view.mask.read(), has_ray)
+    with pytest.raises(ValueError, match="fewer than half of the pixels a ray"):
+        a2tg.load_scene(write_fisheye(tmp_path, focal=4.0), lens="keep")
+    with pytest.raises(ValueError, match="lens must be one of undistort, keep; got 'crop'"):
+        a2tg.load_scene(tmp_path, lens="crop")
+
+
+@pytest.mark.filterwarnings("ignore:training does not learn")
+def test_training_through_lenses_learns_and_prunes(kept):
+    """Photographs of another lens, of none, and of the same lens in another array, in one training."""
+    first, second, *others = kept.train
+    other = dataclasses.replace(first.camera, rays=np.asarray(first.camera.rays) + np.float32(0.5))
+    views = (dataclasses.replace(first, camera=other), second,
+             dataclasses.replace(others[0], camera=dataclasses.replace(others[0].camera, rays=None)))  # fmt: skip
+    assert [kind[2] for kind in kinds_of(views)] == [1, 2, 0]
+    mixed = dataclasses.replace(kept, train=views)
+    system = dataclasses.replace(
+        a2tg.Gaussians2dMcmc.preset("smoke"), stage1_iterations=60, initial_gaussians=200, sh_degree=0,
+        prune=PruneConfig(share=0.3, at=(0.5,)),
+    )  # fmt: skip
+    model = a2tg.fit(mixed, system, progress=False).model
+    before, after = (a2tg.evaluate(mixed.train, known).psnr for known in (initial_model(mixed, system), model))
+    assert after > before + 1
+    assert np.isfinite(a2tg.evaluate(mixed.test, model).psnr)
