@@ -299,10 +299,10 @@ def _for_rays(settings: RenderSettings, compositor: Compositor) -> Compositor:
     """Return the compositor for a camera with a ray for each pixel."""
     if settings.exchange is not None:
         raise ValueError("cameras with rays are rendered on one device: leave out settings.exchange (--devices)")
-    if compositor not in ("native", "cuda"):
+    if compositor != "cuda":
         return compositor
     if settings.compositor != "auto":
-        raise ValueError(f"compositor={compositor!r} cannot render cameras with rays: say 'xla', or 'auto'")
+        raise ValueError("compositor='cuda' cannot render cameras with rays: say 'xla', or 'auto'")
     return "xla"
 
 
@@ -328,6 +328,7 @@ def _compositing_settings(
         compositor=compositor,
         tile_batch=min(_tile_batch(settings) or grid.num, grid.num) if compositor in ("xla", "autodiff") else 1,
         num_colors=num_colors,
+        has_rays=camera.rays is not None,
     )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import threading
 from functools import cached_property
 from typing import Any, Literal
 
@@ -26,6 +27,7 @@ WIDEST_ANGLE = np.deg2rad(80.0)
 """Largest angle between a ray of a kept lens and the direction of view; pixels beyond it do not count."""
 FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
+_LOCK = threading.Lock()
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
 
@@ -145,7 +147,8 @@ class KeptLens(Lens):
         if self.is_pinhole:
             return None
         camera = self.camera
-        return _rays(camera.model.name, self.size, tuple(camera.params.tolist()), (width, height), K.tobytes())
+        with _LOCK:  # Threads that read photographs of one lens share its rays.
+            return _rays(camera.model.name, self.size, tuple(camera.params.tolist()), (width, height), K.tobytes())
 
     def _matrix(self) -> np.ndarray:
         try:

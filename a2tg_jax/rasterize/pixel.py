@@ -25,8 +25,6 @@ MIN_TRANSMITTANCE = 1e-4
 Triple = tuple[Array, Array, Array]
 Rows = tuple[Triple, Triple, Triple]
 """Rows of a homography."""
-Frame = tuple[tuple[Array, Array], tuple[Array, Array]]
-"""Rows of the matrix from the image plane to a tile's frame."""
 State = tuple[Array, Array, Array]
 """Transmittance and liveness behind a splat, and `suffix_sum` of the splats behind it."""
 Statistic = Literal["position", "screen", "center"]
@@ -67,6 +65,10 @@ class Planes(NamedTuple):
     """Depth of the mean."""
 
 
+TileNumbers = tuple[Array, ...]
+"""Centre (x, y) of a tile, and with rays of its own the four numbers of its frame, row by row."""
+
+
 class Hit(NamedTuple):
     """Hit of a pixel's ray with a splat."""
 
@@ -96,21 +98,23 @@ def _cross(a: Triple, b: Triple) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _in_frame(row: tuple[Array, Array], first: Triple, second: Triple) -> Triple:
-    return tuple(row[0] * a + row[1] * b for a, b in zip(first, second, strict=True))  # type: ignore[return-value]
+def _mixed(p: Array, a: Triple, q: Array, b: Triple) -> Triple:
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
 
-def planes_of(M: Rows, x: Array, y: Array, frame: Frame | None = None) -> Planes:
+def planes_of(M: Rows, tile: TileNumbers) -> Planes:
     """Return the planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1).
 
     With a frame, pixels are counted in it (`tile_pixels`).
     """
+    x, y, *frame = tile
     last = M[2]
     # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
     first = (M[0][0] - x * last[0], M[0][1] - x * last[1], M[0][2] - x * last[2])
     second = (M[1][0] - y * last[0], M[1][1] - y * last[1], M[1][2] - y * last[2])
-    if frame is not None:
-        first, second = _in_frame(frame[0], first, second), _in_frame(frame[1], first, second)
+    if frame:
+        xx, xy, yx, yy = frame
+        first, second = _mixed(xx, first, xy, second), _mixed(yx, first, yy, second)
     a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
     return Planes(
         p0=(a[0], b[0], c[0]),
@@ -275,8 +279,8 @@ def blend_vjp(
 
 
 def positional_gradient(
-    statistic: Statistic, M: Rows, x: Array, y: Array, tile_x: Array, tile_y: Array, d_rho: Array,
-    jacobian: Sequence[Sequence[Array]] | Array, near_plane: float, has_low_pass: bool, frame: Frame | None = None,
+    statistic: Statistic, M: Rows, x: Array, y: Array, tile: TileNumbers, d_rho: Array,
+    jacobian: Sequence[Sequence[Array]] | Array, near_plane: float, has_low_pass: bool,
 ) -> Triple:  # fmt: skip
     """Return a pixel's contribution to a statistic of densification, through the falloff only; zero where `d_rho` is.
 
@@ -288,18 +292,18 @@ def positional_gradient(
     Args:
       statistic: kind of statistic.
       M: rows of the homography.
-      x, y: the pixel, from the tile's centre (tile_x, tile_y).
+      x, y: the pixel, from the tile's centre.
+      tile: as for `planes_of`.
       d_rho: ∂L/∂ρ through the falloff.
       jacobian: rows of ∂M[:, 2]/∂μ = K·Rc.
       near_plane, has_low_pass: as for `intersect`.
-      frame: as for `planes_of`.
     """
     axes = tuple((row[0], row[1]) for row in M)
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
 
     def rho(mean: Triple) -> tuple[Array, Array]:
         rows: Any = tuple((*axes[i], mean[i]) for i in range(3))
-        hit = intersect(planes_of(rows, tile_x, tile_y, frame), x, y, near_plane, has_low_pass)
+        hit = intersect(planes_of(rows, tile), x, y, near_plane, has_low_pass)
         return hit.rho, hit.is_ray
 
     _, pull_back, is_ray = jax.vjp(rho, mean, has_aux=True)

@@ -58,6 +58,8 @@ class CompositingSettings(NamedTuple):
 
     num_colors: int = 3
     """Number D of colours of a splat."""
+    has_rays: bool = False
+    """Whether pixels have rays of their own (`tile_pixels`)."""
 
     @property
     def num_channels(self) -> int:

@@ -14,7 +14,10 @@ def pack_inputs(
     settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None, cutoff: Array,
     lists: TileLists,
 ) -> tuple[Array, ...]:  # fmt: skip
-    """Pack what kernels read: ids, starts, splats with the cutoff, regions, texels, and (columns, width, height)."""
+    """Pack what kernels read: ids, starts, splats with the cutoff, regions, texels, and (columns, width, height).
+
+    Rays of pixels are packed apart (`native.composite`).
+    """
     packed = pack_splats(splats, settings.has_geometry, cutoff).astype(splats.M.dtype)
     size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
     return lists.ids, lists.starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size

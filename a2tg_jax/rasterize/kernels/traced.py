@@ -43,11 +43,18 @@ class KernelSpec:
     """Statistic that the backward pass computes for densification, if any."""
     num_colors: int = 3
     """Number D of colours of a splat."""
+    has_rays: bool = False
+    """Whether pixels have rays of their own."""
 
     @property
     def arguments(self) -> Arguments:
         """Arguments of the element-wise functions of the rule."""
         return Arguments(self.num_rule_numbers, self.num_columns, self.num_colors, self.dtype)
+
+    @property
+    def num_tile_numbers(self) -> int:
+        """Number of `rasterize.pixel.TileNumbers`."""
+        return 6 if self.has_rays else 2
 
     @property
     def num_channels(self) -> int:
@@ -73,6 +80,7 @@ class KernelSpec:
             has_geometry=settings.has_geometry,
             statistic=settings.statistic,
             num_colors=settings.num_colors,
+            has_rays=settings.has_rays,
         )
 
     def gradient_shapes(self, splats: Splats, texels: Array, probe: Array) -> tuple[tuple[int, ...], ...]:
@@ -96,14 +104,15 @@ class Functions:
         region = TextureRegion(integer, integer, integer) if values else None
         lookup = Lookup(region, Sample(values, values, values)) if region else None
 
-        self.prepare, structure = trace(pixel.planes_of, splat.M, number, number)
+        tile = (number,) * spec.num_tile_numbers
+        self.prepare, structure = trace(pixel.planes_of, splat.M, tile)
         self.num_planes = structure.num_leaves
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
-        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, number, number, planes)
+        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, tile, planes)
         self.reach, _ = trace(self._reach, planes, region, number, number)
         at_pixel, channels = (number, number, number, flag), (number,) * spec.num_channels
         self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
-        of_backward = number, channels, (number, number), (triple,) * 3
+        of_backward = number, channels, tile, (triple,) * 3
         self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
 
     def _reach(
@@ -124,7 +133,7 @@ class Functions:
 
     def _backward(
         self, planes: pixel.Planes, splat: pixel.Splat, lookup: Lookup | None, x: Array, y: Array,
-        transmittance: Array, is_live: Array, suffix_sum: Array, g: tuple[Array, ...], center: tuple[Array, Array],
+        transmittance: Array, is_live: Array, suffix_sum: Array, g: tuple[Array, ...], tile: pixel.TileNumbers,
         jacobian: pixel.Rows,
     ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
         """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
@@ -134,7 +143,7 @@ class Functions:
         added: tuple[Array, ...] = ()
         if spec.statistic and d.rho is not None:
             added = pixel.positional_gradient(
-                spec.statistic, splat.M, x, y, *center, d.rho, jacobian, spec.near_plane, rule.has_low_pass
+                spec.statistic, splat.M, x, y, tile, d.rho, jacobian, spec.near_plane, rule.has_low_pass
             )
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
@@ -177,7 +186,7 @@ def _primitives(jaxpr: Any) -> set[str]:
     return found
 
 
-def _planes_vjp(M: pixel.Rows, x: Array, y: Array, d_planes: pixel.Planes) -> pixel.Rows:
+def _planes_vjp(M: pixel.Rows, tile: pixel.TileNumbers, d_planes: pixel.Planes) -> pixel.Rows:
     """Return the cotangent of M, given that of its planes."""
-    d_M: pixel.Rows = jax.vjp(lambda M: pixel.planes_of(M, x, y), M)[1](d_planes)[0]
+    d_M: pixel.Rows = jax.vjp(lambda M: pixel.planes_of(M, tile), M)[1](d_planes)[0]
     return d_M

@@ -214,15 +214,15 @@ def pixels_of_tile(size: int, dtype: DTypeLike) -> tuple[Array, Array]:
 
 def seen_from(splats: Splats, tile: Tiles) -> pixel.Planes:
     """Return the planes of splats [B, ...] for a tile, each number [B]."""
-    return pixel.planes_of(split(splats, False).M, tile.x, tile.y, frame_of(tile))
+    return pixel.planes_of(split(splats, False).M, numbers_of(tile))
 
 
-def frame_of(tile: Tiles) -> pixel.Frame | None:
-    """Return the frame of a tile; None if its pixels are those of a pinhole camera."""
+def numbers_of(tile: Tiles) -> pixel.TileNumbers:
+    """Return the centre of a tile, and its frame if pixels have rays of their own."""
     if tile.pixels is None:
-        return None
+        return tile.x, tile.y
     (xx, xy), (yx, yy) = tile.pixels.frames
-    return (xx, xy), (yx, yy)
+    return tile.x, tile.y, xx, xy, yx, yy
 
 
 def pixels_of(tile: Tiles, size: int, dtype: DTypeLike) -> tuple[Array, Array]:
@@ -366,8 +366,8 @@ def _statistic(
     assert settings.statistic is not None
     x, y = pixels_of(tile, settings.grid.tile_size, d_rho.dtype)
     M = jax.tree.map(lambda entry: entry[:, None], split(splats, False).M)
+    near_plane, has_low_pass = settings.near_plane, rule.has_low_pass
     components = pixel.positional_gradient(
-        settings.statistic, M, x, y, tile.x, tile.y, d_rho, jacobian, settings.near_plane, rule.has_low_pass,
-        frame_of(tile),
-    )  # fmt: skip
+        settings.statistic, M, x, y, numbers_of(tile), d_rho, jacobian, near_plane, has_low_pass
+    )
     return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_rho.dtype))], axis=1)

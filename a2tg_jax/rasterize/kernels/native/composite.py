@@ -50,9 +50,20 @@ def forward(
     spec = KernelSpec.of(settings, static, splats, texels, regions)
     name = _registered(spec, "forward", _forward_handler)
     shape = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
-    inputs = pack_inputs(settings, splats, texels, regions, cutoff, lists)
+    inputs = _packed(spec, settings, splats, texels, regions, cutoff, lists)
     (image,) = ffi.call(name, [(shape, splats.M.dtype)], *inputs)
     return split_image(image)
+
+
+def _packed(
+    spec: KernelSpec, settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
+    cutoff: Array, lists: TileLists,
+) -> tuple[Array, ...]:  # fmt: skip
+    """Return `pack_inputs`, with the pixels of the tiles before the last."""
+    from a2tg_jax.rasterize.kernels.native.passes import packed_pixels
+
+    *inputs, size = pack_inputs(settings, splats, texels, regions, cutoff, lists)
+    return (*inputs, packed_pixels(spec, lists.pixels, splats.M.dtype), size)
 
 
 def backward(
@@ -64,7 +75,7 @@ def backward(
     name = _registered(spec, "backward", _backward_handler)
     dtype, shapes = splats.M.dtype, spec.gradient_shapes(splats, texels, probe)
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
-    inputs = (*pack_inputs(settings, splats, texels, regions, cutoff, lists), *cotangents)
+    inputs = (*_packed(spec, settings, splats, texels, regions, cutoff, lists), *cotangents)
     found = ffi.call(name, [(shape, dtype) for shape in shapes], *inputs)
     return unpack_gradients(settings, found, splats, texels, probe)
 

@@ -3,11 +3,12 @@
 One call composites the tiles first..last − 1. Every splat of a tile's list is prepared once (scalar code), then applied
 to the tile's pixels, L at a time (vector code). A vector of which the splat reaches no pixel is skipped.
 
-    forward(ids, starts, splats, regions, texels, result; first, last, columns, width, height)
-    backward(ids, starts, splats, regions, texels, g, suffix_sum, jacobian, d_splats, d_texels, d_probe,
+    forward(ids, starts, splats, regions, texels, pixels, result; first, last, columns, width, height)
+    backward(ids, starts, splats, regions, texels, pixels, g, suffix_sum, jacobian, d_splats, d_texels, d_probe,
              places, more_splats, more_texels, more_probe, more_first; the same)
 
 Buffers: ids [pairs], starts [tiles + 1], splats [N, S] packed (`num_floats`), regions [N, 3], texels [T, C],
+pixels (`packed_pixels`) of cameras with rays,
 result [tiles, D + 1, P] channels and transmittance, g [tiles, D, P], suffix_sum [tiles, P], jacobian [3, 3];
 the pass adds to d_splats [N, S], d_texels [T, C] and d_probe [N, 4]. `places` [pairs] holds −1, or k if the splat's own
 row belongs to another thread: the pair then adds to row k of more_splats and more_probe, and to more_texels from texel
@@ -20,7 +21,10 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import llvm_modules
@@ -29,11 +33,25 @@ from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.texels import NativeTexture, Place, TexelWriter
 from a2tg_jax.rasterize.kernels.native.writer import LONG
 from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions, KernelSpec
+from a2tg_jax.rasterize.tile_pixels import PixelGrid
 
 INTEGERS = ("first", "last", "columns", "width", "height")
-FORWARD = ("ids", "starts", "splats", "regions", "texels", "result")
+FORWARD = ("ids", "starts", "splats", "regions", "texels", "pixels", "result")
 BACKWARD = (
-    *("ids", "starts", "splats", "regions", "texels", "g", "suffix_sum", "jacobian", "d_splats", "d_texels", "d_probe"),
+    *(
+        "ids",
+        "starts",
+        "splats",
+        "regions",
+        "texels",
+        "pixels",
+        "g",
+        "suffix_sum",
+        "jacobian",
+        "d_splats",
+        "d_texels",
+        "d_probe",
+    ),
     *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
 
@@ -50,6 +68,26 @@ def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
         return pixels.reshape(-1)
     blocks = pixels.reshape(tile_size // height, height, tile_size // width, width)
     return np.moveaxis(blocks, 2, 1).reshape(-1)
+
+
+def packed_pixels(spec: KernelSpec, pixels: PixelGrid | None, dtype: DTypeLike) -> Array:
+    """Pack the pixels of each tile as a row: its numbers, then x, y and whether they are seen, in the order of vectors.
+
+    All four parts fill whole vectors. Without rays, the result is empty.
+    """
+    if pixels is None:
+        return jnp.zeros((1, 0), dtype)
+    tiles, lanes = pixels.tiles, num_lanes(spec)
+    order = pixel_order(spec.tile_size, lanes)
+    numbers = jnp.concatenate([tiles.centers, tiles.frames.reshape(-1, 4)], axis=1)
+    x, y = (tiles.offsets[:, k, order] for k in range(2))
+    parts = numbers, x, y, tiles.is_seen[:, order].astype(dtype)
+    return jnp.concatenate([jnp.pad(part, ((0, 0), (0, -part.shape[1] % lanes))) for part in parts], axis=1)
+
+
+def num_lanes(spec: KernelSpec) -> int:
+    """Return the number of pixels of a vector."""
+    return llvm_modules.vector_bytes() // np.dtype(spec.dtype).itemsize
 
 
 class _LoadedSplat(NamedTuple):
@@ -80,6 +118,8 @@ class _Rows(NamedTuple):
     """Cotangents of its texels, if the rule has textures."""
 
 
+TileValues = list[ir.Value]
+"""Numbers of a tile (`rasterize.pixel.TileNumbers`)."""
 Composite = Callable[[ir.Value, ir.Value, ir.Value, Place | None, ir.Value], None]
 """Function (k, x, y, place, is_live) that composites a splat on vector k; `place` is the position of its lookup."""
 
@@ -91,9 +131,8 @@ class _Pass(TexelWriter):
         super().__init__(module, name, buffers, INTEGERS, spec.dtype)
         self.spec, self.functions, self.num_columns = spec, functions, spec.num_columns
         self.empty = spec.rule.rule.empty
-        num_lanes = llvm_modules.vector_bytes() // np.dtype(spec.dtype).itemsize
-        self.lanes, self.scalars = Lanes(self.b, num_lanes), Lanes(self.b, 1)
-        self.num_vectors = -(-(spec.tile_size**2) // num_lanes)
+        self.lanes, self.scalars = Lanes(self.b, num_lanes(spec)), Lanes(self.b, 1)
+        self.num_vectors = -(-(spec.tile_size**2) // self.lanes.width)
         self.reals = self.lanes.vector(self.real)
         self.integers = self.lanes.vector(INT)
         order = pixel_order(spec.tile_size, self.lanes.width)
@@ -114,18 +153,28 @@ class _Pass(TexelWriter):
         table.type = ir.PointerType()
         return table
 
-    def all_tiles(self, composite_tile: Callable[[ir.Value, ir.Value, ir.Value], None]) -> None:
-        """Write a loop of composite_tile(tile, tile_x, tile_y) over the tiles, and end the function."""
-        spec, b, given = self.spec, self.b, self.arguments
+    def all_tiles(self, composite_tile: Callable[[ir.Value, TileValues], None]) -> None:
+        """Write a loop of composite_tile(tile, numbers) over the tiles, and end the function."""
+        given = self.arguments
         with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
-            columns = self.long(given["columns"])
-            place = b.srem(tile, columns), b.sdiv(tile, columns)
-            center = [
-                b.fadd(b.fmul(b.sitofp(index, self.real), self.real(spec.tile_size)), self.real(spec.tile_size / 2))
-                for index in place
-            ]
-            composite_tile(tile, *center)
-        b.ret_void()
+            composite_tile(tile, self._tile_with_rays(tile) if self.spec.has_rays else self._tile_center(tile))
+        self.b.ret_void()
+
+    def _tile_center(self, tile: ir.Value) -> TileValues:
+        """Return the centre of a tile of a pinhole camera."""
+        b, size = self.b, self.spec.tile_size
+        columns = self.long(self.arguments["columns"])
+        place = b.srem(tile, columns), b.sdiv(tile, columns)
+        return [b.fadd(b.fmul(b.sitofp(at, self.real), self.real(size)), self.real(size / 2)) for at in place]
+
+    def _tile_with_rays(self, tile: ir.Value) -> TileValues:
+        """Take the pixels of a tile from the buffer (`packed_pixels`); return its numbers."""
+        width, num = self.lanes.width, self.spec.num_tile_numbers
+        header, part = -(-num // width) * width, self.num_vectors * width
+        base = self.at(self.arguments["pixels"], self.times(tile, header + 3 * part), self.real)
+        parts = (self.at(base, LONG(header + k * part), self.real) for k in range(3))
+        self.pixel_x, self.pixel_y, self.is_seen = parts
+        return [self.load(base, LONG(k), self.real) for k in range(num)]
 
     def all_splats(self, tile: ir.Value, each_splat: Callable[[ir.Value, ir.Value], ir.Value]) -> None:
         """Write a loop of each_splat(id, position) over a tile's list, until it returns that no pixel is live."""
@@ -141,9 +190,13 @@ class _Pass(TexelWriter):
         """Write a loop over the vectors of a tile."""
         return self.loop(LONG(0), LONG(self.num_vectors))
 
-    def live_at_first(self, index: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> ir.Value:
-        """Return whether the pixels of a vector lie inside the image, as 0 or 1."""
+    def live_at_first(self, index: ir.Value, tile: TileValues) -> ir.Value:
+        """Return whether the pixels of a vector lie inside the image and have a ray, as 0 or 1."""
         b, inside = self.b, []
+        if self.spec.has_rays:
+            seen = self.load(self.is_seen, index, self.reals)
+            return b.zext(b.fcmp_ordered(">", seen, self.lanes.constant(0.5, self.real)), self.integers)
+        tile_x, tile_y = tile
         for table, center, size in ((self.pixel_x, tile_x, "width"), (self.pixel_y, tile_y, "height")):
             at = b.fadd(self.load(table, index, self.reals), self.lanes.broadcast(center))
             limit = self.lanes.broadcast(b.sitofp(self.arguments[size], self.real))
@@ -154,16 +207,16 @@ class _Pass(TexelWriter):
         """Return the index of a tile's lane k among its numbers [channels, P]."""
         return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.spec.tile_size**2))
 
-    def begin_tile(self, tile_x: ir.Value, tile_y: ir.Value) -> None:
+    def begin_tile(self, tile: TileValues) -> None:
         """Set the transmittance to 1, and the pixels inside the image live."""
         with self.all_vectors() as (k, _):
             self.store(self.lanes.constant(1.0, self.real), self.transmittance, k)
-            self.store(self.live_at_first(k, tile_x, tile_y), self.live, k)
+            self.store(self.live_at_first(k, tile), self.live, k)
 
-    def load_splat(self, id_: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> _LoadedSplat:
+    def load_splat(self, id_: ir.Value, tile: TileValues) -> _LoadedSplat:
         """Load a splat of the list and prepare it for a tile."""
         *numbers, cutoff = self.splat_numbers(id_)
-        planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], tile_x, tile_y])
+        planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], *tile])
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
         region = self.region_numbers(id_)
         spread = self.spread(planes), self.spread(numbers)
@@ -209,21 +262,19 @@ class _Forward(_Pass):
         """Write the function."""
         channels = [self.variable(self.reals, self.num_vectors) for _ in range(self.spec.num_channels)]
 
-        def composite_tile(tile: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> None:
-            self.begin_tile(tile_x, tile_y)
+        def composite_tile(index: ir.Value, tile: TileValues) -> None:
+            self.begin_tile(tile)
             with self.all_vectors() as (k, _):
                 for channel in channels:
                     self.store(self.lanes.constant(0.0, self.real), channel, k)
-            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, channels))
-            self.write_tile(tile, [*channels, self.transmittance])
+            self.all_splats(index, functools.partial(self.splat, tile, channels))
+            self.write_tile(index, [*channels, self.transmittance])
 
         self.all_tiles(composite_tile)
 
-    def splat(
-        self, tile_x: ir.Value, tile_y: ir.Value, channels: Sequence[ir.Value], id_: ir.Value, _: ir.Value
-    ) -> ir.Value:
+    def splat(self, tile: TileValues, channels: Sequence[ir.Value], id_: ir.Value, _: ir.Value) -> ir.Value:
         """Add one splat to a tile; return whether a pixel is still live."""
-        splat = self.load_splat(id_, tile_x, tile_y)
+        splat = self.load_splat(id_, tile)
 
         def composite(k: ir.Value, x: ir.Value, y: ir.Value, place: Place | None, is_live: ir.Value) -> None:
             values = self.sample(splat.texture, place, has_slopes=False) if splat.texture and place else []
@@ -260,11 +311,11 @@ class _Backward(_Pass):
         for k in range(self.num_sums):
             self.store(self.lanes.constant(0.0, self.real), self.sums, k)
 
-        def composite_tile(tile: ir.Value, tile_x: ir.Value, tile_y: ir.Value) -> None:
-            self.begin_tile(tile_x, tile_y)
-            self.read_tile(tile, [suffix_sum], self.arguments["suffix_sum"])
-            self.read_tile(tile, g, self.arguments["g"])
-            self.all_splats(tile, functools.partial(self.splat, tile_x, tile_y, suffix_sum, g))
+        def composite_tile(index: ir.Value, tile: TileValues) -> None:
+            self.begin_tile(tile)
+            self.read_tile(index, [suffix_sum], self.arguments["suffix_sum"])
+            self.read_tile(index, g, self.arguments["g"])
+            self.all_splats(index, functools.partial(self.splat, tile, suffix_sum, g))
 
         self.all_tiles(composite_tile)
 
@@ -279,13 +330,12 @@ class _Backward(_Pass):
                 self.store(self.load(base, self.pixel(k, index), self.real), array, k)
 
     def splat(
-        self, tile_x: ir.Value, tile_y: ir.Value, suffix_sum: ir.Value, g: Sequence[ir.Value], id_: ir.Value,
-        position: ir.Value,
-    ) -> ir.Value:  # fmt: skip
+        self, tile: TileValues, suffix_sum: ir.Value, g: Sequence[ir.Value], id_: ir.Value, position: ir.Value
+    ) -> ir.Value:
         """Add the cotangents of one splat in a tile; return whether a pixel is still live."""
         b, lanes, spec = self.b, self.lanes, self.spec
-        splat, zero = self.load_splat(id_, tile_x, tile_y), self.lanes.constant(0.0, self.real)
-        tile_center = self.spread([tile_x, tile_y])
+        splat, zero = self.load_splat(id_, tile), self.lanes.constant(0.0, self.real)
+        tile_numbers = self.spread(tile)
         jacobian = self.spread([self.load(self.arguments["jacobian"], k, self.real) for k in range(9)])
         rows = self.rows_of(id_, position, splat.texture)
         any_contributes = self.variable(BOOL)
@@ -298,7 +348,7 @@ class _Backward(_Pass):
             state = [self.load(self.transmittance, k, self.reals), is_live, self.load(suffix_sum, k, self.reals)]
             cotangents = [self.load(channel, k, self.reals) for channel in g]
             at_pixel = [*splat.planes, *splat.spread, *splat.spread_region, *sample, x, y]
-            at_pixel += [*state, *cotangents, *tile_center, *jacobian]
+            at_pixel += [*state, *cotangents, *tile_numbers, *jacobian]
             after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
             self.store(after, self.transmittance, k)
             self.store(b.zext(still_live, self.integers), self.live, k)
@@ -317,7 +367,7 @@ class _Backward(_Pass):
 
         is_live = self.reached_vectors(splat, composite)
         with b.if_then(b.load(any_contributes, typ=BOOL)):
-            self.add_totals(rows, splat.numbers, tile_x, tile_y, totals)
+            self.add_totals(rows, splat.numbers, tile, totals)
             if rows.texture:
                 self.finish_texels(rows.texture)
         return is_live
@@ -340,13 +390,13 @@ class _Backward(_Pass):
         return _Rows(at_row(splats, self.times(row, self.spec.num_floats)), at_row(probe, self.times(row, 4)), texture)
 
     def add_totals(
-        self, rows: _Rows, numbers: Sequence[ir.Value], tile_x: ir.Value, tile_y: ir.Value, totals: Sequence[ir.Value]
+        self, rows: _Rows, numbers: Sequence[ir.Value], tile: TileValues, totals: Sequence[ir.Value]
     ) -> None:
         """Sum over lanes, carry the planes' cotangents to the homography, and add all to the splat's rows."""
         spec, functions = self.spec, self.functions
         sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
         d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
-        d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], tile_x, tile_y, *d_planes])
+        d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], *tile, *d_planes])
         num_others = len(numbers) - 9
         self.add(rows.splat, [*d_M, *others[:num_others]])
         if spec.statistic:
