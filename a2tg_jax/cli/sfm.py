@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.data import SfmSummary, run_sfm
 from a2tg_jax.data.photo_folder import holds_photos, is_video
-from a2tg_jax.data.sfm import Matching
+from a2tg_jax.data.sfm_database import Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.results.camera_picture import save_camera_picture

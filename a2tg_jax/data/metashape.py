@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.data.frames import Frames
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
@@ -16,7 +17,6 @@ from a2tg_jax.data.photogrammetry import (
     read_xml,
 )
 from a2tg_jax.data.ply_points import read_ply_points
-from a2tg_jax.data.transforms import Frames
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 
