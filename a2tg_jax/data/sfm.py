@@ -14,6 +14,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
 from a2tg_jax.data.progress import clock, photo_bar
 from a2tg_jax.data.sfm_database import (
+    CameraModel,
     Matching,
     extract_features,
     known_cameras,
@@ -50,7 +51,7 @@ def run_sfm(
     out: str | os.PathLike[str],
     *,
     seed: int = 0,
-    camera_model: str = "SIMPLE_RADIAL",
+    camera_model: CameraModel = "SIMPLE_RADIAL",
     matching: Matching = "auto",
     frames: int = DEFAULT_FRAMES,
     panorama: Panorama = "auto",
@@ -67,7 +68,7 @@ def run_sfm(
       photos: folder of photographs of one scene, whose subfolders are searched, or a video, or several of these.
       out: new folder for `images` and `sparse/0`.
       seed: of COLMAP's random choices, at least 0.
-      camera_model: COLMAP's name of the camera model to estimate.
+      camera_model: COLMAP's name of the camera model to estimate; those of FISHEYE are for action cameras.
       matching: pairs of photographs to match; "auto" takes all pairs of up to 200, and neighbours by name of more.
       frames: largest number of frames to take from each video. The sharpest are taken, evenly along the camera's way.
       panorama: pictures to cut into perspective views: "auto" takes those twice as wide as high whose edges join,
@@ -83,7 +84,12 @@ def run_sfm(
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
     """
-    for name, value, known in (("matching", matching, Matching), ("panorama", panorama, Panorama)):
+    choices = (
+        ("matching", matching, Matching),
+        ("panorama", panorama, Panorama),
+        ("camera_model", camera_model, CameraModel),
+    )
+    for name, value, known in choices:
         if value not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {value!r}")
     if frames < LEAST_PHOTOS:
