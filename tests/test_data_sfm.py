@@ -179,7 +179,7 @@ def test_the_picture_of_the_cameras(tmp_path):
 def test_matching_is_chosen(tmp_path):
     with pytest.raises(ValueError, match="matching must be one of auto"):
         run_sfm(tmp_path, tmp_path / "scene", matching="all")
-    with pytest.raises(ValueError, match="camera_model must be one of SIMPLE_RADIAL"):
+    with pytest.raises(ValueError, match="camera_model must be one of SIMPLE_PINHOLE"):
         run_sfm(tmp_path, tmp_path / "scene", camera_model="EQUIRECTANGULAR")
 
 

@@ -14,8 +14,9 @@ from a2tg_jax.host.cores import num_threads
 Matching = Literal["auto", "exhaustive", "sequential"]
 """Pairs of photographs to match: all of them (exhaustive), neighbours by name (sequential), or by their number."""
 CameraModel = Literal[
-    "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"
-]
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE", "OPENCV_FISHEYE",
+]  # fmt: skip
 """COLMAP's names of camera models that can be estimated from photographs."""
 PHOTOS_PER_CORE = 2
 """Photographs of which features are extracted together, so that the progress bar moves."""
