@@ -84,8 +84,12 @@ def run_sfm(
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
     """
-    names, kinds = ("matching", "panorama", "camera_model"), (Matching, Panorama, CameraModel)
-    for name, value, known in zip(names, (matching, panorama, camera_model), kinds, strict=True):
+    choices = (
+        ("matching", matching, Matching),
+        ("panorama", panorama, Panorama),
+        ("camera_model", camera_model, CameraModel),
+    )
+    for name, value, known in choices:
         if value not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {value!r}")
     if frames < LEAST_PHOTOS:
