@@ -291,6 +291,10 @@ def test_a_capture_that_is_not_read_is_told_what_to_do(tmp_path, name, words):
     for path in (tmp_path, tmp_path / name):
         with pytest.raises(FileNotFoundError, match=words):
             load_scene(path)
+    for index in range(3):
+        (tmp_path / f"{index}.jpg").touch()
+    with pytest.raises(FileNotFoundError, match=rf"{words}.* or find cameras anew: a2tg sfm .* SCENE|a2tg sfm finds"):
+        load_scene(tmp_path)
 
 
 def test_structure_from_motion_tells_of_recordings_too(tmp_path):
