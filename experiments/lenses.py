@@ -35,7 +35,6 @@ SIZE = 208, 156
 LENSES = {
     "90° across": (132.0, 0.02),
     "120° across": (99.0, -0.01),
-    "140° across": (85.0, 0.0),
 }
 """Focal length in pixels and first distortion parameter by the angle of view across the longer side."""
 NUM_VIEWS = 28

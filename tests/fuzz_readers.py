@@ -15,6 +15,7 @@ JSON = (mutate.of_json, mutate.of_json, mutate.of_json, mutate.of_text, mutate.o
 ARCHIVE = (mutate.of_npz, mutate.of_npz, mutate.of_npz, mutate.of_bytes)
 COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
 OF_RUN = ("metrics.json", ".a2tg-run")
+DEPTHS = ("depth", "confidence")
 PICTURES = ("png", "jpg", "tif", "webp", "avif", "bmp", "gif", "ppm")
 
 
@@ -42,7 +43,7 @@ READERS = (
     Reader("masks", ("masks/00.png", "masks/01.png", "images/00.png"), (mutate.of_bytes, mutate.of_png), "scene"),
     Reader("blender", ("transforms_train.json", "transforms_test.json"), JSON, "scene"),
     Reader("polycam", tuple(f"keyframes/corrected_cameras/{index}.json" for index in range(4)), JSON, "scene"),
-    Reader("polycam", ("keyframes/depth/1.png", "keyframes/confidence/1.png"), (mutate.of_bytes, mutate.of_png), "scene"),
+    Reader("polycam", tuple(f"keyframes/{kind}/1.png" for kind in DEPTHS), (mutate.of_bytes, mutate.of_png), "scene"),
     Reader("record3d", ("metadata",), JSON, "scene"),
     Reader("metashape", ("cameras.xml",), TEXT, "scene"),
     Reader("realityscan", tuple(f"{index}.xmp" for index in range(4)), TEXT, "scene"),

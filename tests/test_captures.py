@@ -21,7 +21,7 @@ from test_data_transforms import (
     write_ply,
 )
 
-from a2tg_jax.data import load_scene
+from a2tg_jax.data import load_scene, run_sfm
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starting from")
 COUNT = 4
@@ -152,7 +152,8 @@ def metashape_xml(world, within="component", lens=LENS):
         <sensors next_id="1"><sensor id="0" label="Phone" type="frame"><resolution width="{WIDTH}" height="{HEIGHT}"/>
         <calibration type="frame" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{lens}</calibration>
         </sensor></sensors><components>{component}</components>
-        <cameras><group id="0" label="g">{cameras}</group><camera id="9" sensor_id="0" label="9.png"/></cameras>
+        <cameras><group id="0" label="g">{cameras}</group><camera id="9" sensor_id="0" label="9.png"/>
+        <camera id="8" sensor_id="0" label="0.png" enabled="false"><transform>0</transform></camera></cameras>
         {transform if within == "chunk" else ""}</chunk></document>"""
 
 
@@ -290,6 +291,16 @@ def test_a_capture_that_is_not_read_is_told_what_to_do(tmp_path, name, words):
     for path in (tmp_path, tmp_path / name):
         with pytest.raises(FileNotFoundError, match=words):
             load_scene(path)
+    for index in range(3):
+        (tmp_path / f"{index}.jpg").touch()
+    with pytest.raises(FileNotFoundError, match=rf"{words}.* or find cameras anew: a2tg sfm .* SCENE|a2tg sfm finds"):
+        load_scene(tmp_path)
+
+
+def test_structure_from_motion_tells_of_recordings_too(tmp_path):
+    (tmp_path / "clip.insv").touch()
+    with pytest.raises(ValueError, match=r"clip\.insv: is a recording of Insta360: export an equirectangular MP4"):
+        run_sfm(tmp_path / "clip.insv", tmp_path / "scene", progress=False)
 
 
 def test_transforms_come_first(tmp_path):

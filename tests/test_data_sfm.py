@@ -2,15 +2,19 @@
 
 import contextlib
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from test_data_colmap import write_scene as write_colmap
 
 from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import find_photos
-from a2tg_jax.data.staging import stage
+from a2tg_jax.data.sfm_database import join_rig, list_images
+from a2tg_jax.data.staging import _prefixes, stage
+from a2tg_jax.results.camera_picture import save_camera_picture
 
 
 def save_photos(folder, num_photos, width, height):
@@ -72,9 +76,9 @@ def cameras_of(found, work):
     database = work / "database.db"
     database.touch()
     for group in (*found.groups, *(group for rig in found.rigs for group in rig.groups)):
-        sfm._list_images(database, found.folder, group, "SIMPLE_RADIAL")
+        list_images(database, found.folder, group, "SIMPLE_RADIAL")
     for rig in found.rigs:
-        sfm._join(database, rig)
+        join_rig(database, rig)
     with contextlib.closing(colmap.Database.open(database)) as opened:
         return opened.read_all_cameras(), opened.read_all_frames()
 
@@ -149,9 +153,34 @@ def test_failure_says_what_to_do(tmp_path):
         sfm._check_model(None, 300, "photos", "sequential", 4)
 
 
+def test_photographs_from_one_place_are_told_apart_from_those_that_do_not_match():
+    for num_matched, is_told in ((299, False), (300, True)):
+        with pytest.raises(ValueError, match=rf"photographs could be placed \({num_matched} pairs match\)") as told:
+            sfm._check_model(None, 300, "photos", "exhaustive", num_matched)
+        assert ("show no depth: walk between them" in str(told.value)) == is_told
+
+
+def test_sources_of_one_name_are_told_apart(tmp_path):
+    names = [path.as_posix() for path in (tmp_path / "x/a", tmp_path / "y/a", tmp_path / "b")]
+    assert _prefixes([Path(name) for name in names]) == ["a/", "a~2/", "b/"]
+    assert _prefixes([tmp_path]) == [""]
+
+
+def test_the_picture_of_the_cameras(tmp_path):
+    """Both panels show cameras."""
+    write_colmap(tmp_path)
+    save_camera_picture(tmp_path, tmp_path / "cameras.png")
+    pixels = np.asarray(Image.open(tmp_path / "cameras.png").convert("RGB")).astype(int)
+    assert pixels.shape[1] > 1.8 * pixels.shape[0] > 900
+    blue = np.abs(pixels - [0x44, 0x77, 0xAA]).max(axis=-1) < 20
+    assert blue[:, : pixels.shape[1] // 2].sum() > 50 and blue[:, pixels.shape[1] // 2 :].sum() > 50
+
+
 def test_matching_is_chosen(tmp_path):
     with pytest.raises(ValueError, match="matching must be one of auto"):
         run_sfm(tmp_path, tmp_path / "scene", matching="all")
+    with pytest.raises(ValueError, match="camera_model must be one of SIMPLE_PINHOLE"):
+        run_sfm(tmp_path, tmp_path / "scene", camera_model="EQUIRECTANGULAR")
 
 
 def test_no_photographs(tmp_path):

@@ -139,6 +139,11 @@ MISTAKES = {
     "sfm many photo.png": "photo.png is a file; choose a folder",
     "sfm photos new": "holds 1 photograph; at least 3 photographs are needed",
     "sfm many many/scene": "overlap: choose an output folder",
+    "sfm": "PHOTOS is missing: a folder of photographs",
+    "sfm photos": "SCENE is missing: the new scene folder comes last, or after --out",
+    "sfm photos many": "many holds photographs, but the scene folder comes last; name that by --out SCENE",
+    "sfm many new --frames 2": "--frames must be at least 3; got 2",
+    "download mipnerf": "there is no data set 'mipnerf'; did you mean mipnerf360?",
 }  # fmt: skip
 
 

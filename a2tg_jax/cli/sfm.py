@@ -10,8 +10,9 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.data import SfmSummary, run_sfm
+from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.photo_folder import holds_photos, is_video
-from a2tg_jax.data.sfm import Matching
+from a2tg_jax.data.sfm_database import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.results.camera_picture import save_camera_picture
@@ -51,13 +52,24 @@ class Sfm:
     """Pictures to cut into perspective views. auto: those twice as wide as high whose left and right edges join. yes:
     all that are twice as wide as high. no: none."""
 
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    """Lens to estimate. OPENCV suits wide lenses, OPENCV_FISHEYE action cameras such as GoPro's."""
+
     def run(self) -> None:
         sources, out = self._places()
         for source in sources:
             check_apart(out, source)
+            if is_scene(source):
+                _print(f"{source} has cameras already, which a2tg train reads; finding them anew")
         check_output(out)
         found = run_sfm(
-            sources, out, matching=self.matching, frames=self.frames, panorama=self.panorama, on_note=_print
+            sources,
+            out,
+            camera_model=self.camera_model,
+            matching=self.matching,
+            frames=self.frames,
+            panorama=self.panorama,
+            on_note=_print,
         )
         save_camera_picture(out, out / PICTURE)
         print(_told(found))

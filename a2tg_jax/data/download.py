@@ -8,6 +8,7 @@ import time
 import urllib.error
 import urllib.request
 import zipfile
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -64,7 +65,7 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
         raise ValueError(f"{archive.url}: its SHA-256 is not {archive.sha256}; the file was deleted, call again")
     try:
         unpack(file, scenes / archive.folder, progress=progress)
-    except (zipfile.BadZipFile, tarfile.ReadError, EOFError) as error:
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as error:
         file.unlink()
         raise ValueError(f"{file} is damaged, and was deleted: call again to fetch it anew ({error})") from error
     done.touch()
@@ -86,7 +87,7 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
         except urllib.error.HTTPError as error:
             raise OSError(f"{archive.url}: {error}") from error
         except (urllib.error.URLError, ConnectionError, TimeoutError, http.client.HTTPException) as error:
-            if attempt == ATTEMPTS - 1:
+            if attempt == ATTEMPTS - 1 or (attempt == 0 and isinstance(error, urllib.error.URLError)):
                 raise OSError(f"{archive.url}: the connection broke ({error}); call again to go on") from error
             continue
         if total is None or _size(partial) >= total:

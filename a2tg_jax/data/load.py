@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
+from a2tg_jax.data.frames import Frames, load_frames
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
 from a2tg_jax.data.metashape import metashape_file, metashape_frames
-from a2tg_jax.data.photo_folder import check_no_video
+from a2tg_jax.data.photo_folder import check_no_video, holds_photos
 from a2tg_jax.data.polycam import polycam_folders, polycam_frames
 from a2tg_jax.data.realityscan import realityscan_files, realityscan_frames
 from a2tg_jax.data.record3d import record3d_file, record3d_frames
 from a2tg_jax.data.scene import Scene, check_test_every
-from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, Frames, load_blender, load_frames, load_transforms
+from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import as_argument
@@ -96,7 +97,8 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None, lens: L
         return load_frames(make(), **options)
     told = told_of_capture(path)
     if told is not None:
-        raise FileNotFoundError(f"{path}: {told}")
+        anew = f"; or find cameras anew: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
+        raise FileNotFoundError(f"{path}: {told}{anew}")
     raise FileNotFoundError(
         f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
         f"for plain photographs, run `a2tg sfm {as_argument(path)} SCENE` first"

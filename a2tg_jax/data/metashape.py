@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.data.frames import Frames
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
@@ -16,10 +17,11 @@ from a2tg_jax.data.photogrammetry import (
     read_xml,
 )
 from a2tg_jax.data.ply_points import read_ply_points
-from a2tg_jax.data.transforms import Frames
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 
+SWITCHED_OFF = ("0", "false")
+"""Values of a camera's attribute enabled that leave it out."""
 HEAD_BYTES = 1 << 16
 """Number of bytes of an XML file in which a chunk's sensors are looked for."""
 
@@ -47,7 +49,7 @@ def metashape_frames(file: Path) -> Frames:
         for camera in chunk.iter("camera"):
             pose, sensor = camera.find("transform"), sensors.get(camera.get("sensor_id"))
             image = image_of(file.parent, camera.get("label") or "")
-            if pose is None or sensor is None or image is None:
+            if pose is None or sensor is None or image is None or camera.get("enabled") in SWITCHED_OFF:
                 continue
             world = worlds.get(camera.get("component_id"))
             placed = _placed(of_chunk if world is None else world, numbers_in(pose.text, 16, file).reshape(4, 4))

@@ -5,6 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 from a2tg_jax.core.display import counted
+from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.text import as_argument
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
@@ -36,7 +37,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
       ValueError: if it is a file, or holds fewer than `least` photographs.
     """
     if folder.is_file():
-        raise ValueError(f"{folder}: is a file; give its folder")
+        raise ValueError(f"{folder}: {told_of_capture(folder) or 'is a file; give its folder'}")
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs")
     files = sorted(file.relative_to(folder) for file in folder.rglob("*") if file.is_file() and file.name[0] != ".")

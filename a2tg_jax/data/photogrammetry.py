@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from a2tg_jax.data.frames import Frames
 from a2tg_jax.data.images import check_inside
-from a2tg_jax.data.transforms import Frames
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened

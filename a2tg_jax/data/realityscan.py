@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.data.decoding import picture_size
+from a2tg_jax.data.frames import Frames
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
@@ -15,7 +16,6 @@ from a2tg_jax.data.photogrammetry import (
     numbers_in,
     read_xml,
 )
-from a2tg_jax.data.transforms import Frames
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import read_regular
 from a2tg_jax.host.text import shortened

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.data.transforms import Frames
+from a2tg_jax.data.frames import Frames
 from a2tg_jax.host.json_text import MOST_BYTES, read_object
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened

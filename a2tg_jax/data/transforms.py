@@ -5,11 +5,9 @@ change of COLMAP's world before the file was written. Poses and points of `ply_f
 both are in the file's own world, which is the original world here.
 """
 
-import dataclasses
 import logging
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +17,7 @@ from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
-from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.photo_store import Picture, Shelf
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import (
     PointCloud,
@@ -49,17 +46,6 @@ PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "R
 logger = logging.getLogger(__name__)
 
 
-class Frames(NamedTuple):
-    """Frames as `transforms.json` has them, made of files of another program."""
-
-    file: Path
-    """File that messages name; paths of images start from its folder."""
-    frames: list[dict[str, Any]]
-    cloud: PointCloud | None = None
-    counted: Callable[[np.ndarray], np.ndarray] | None = None
-    """Function from pixels [H, W, C] to a mask [H, W] of those that count."""
-
-
 def load_transforms(
     file: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
 ) -> Scene:
@@ -77,7 +63,7 @@ def load_transforms(
       ValueError: if the JSON, a frame, an image or a pose is invalid, or the views make no scene (`assemble_scene`).
     """
     meta = _read_json(file)
-    shots = _read_shots(file, meta, downscale, Shelf(room), lens)
+    shots = read_shots(file, meta, downscale, Shelf(room), lens)
     listed = {key: _names(meta[f"{key}_filenames"]) for key in ("train", "val", "test") if f"{key}_filenames" in meta}
     if listed:
         test_names = listed.get("test") or listed.get("val") or set()
@@ -88,33 +74,6 @@ def load_transforms(
         train, test = every_kth(shots, test_every)
     cloud = read_ply_points(file.parent / meta["ply_file_path"]) if meta.get("ply_file_path") else None
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
-
-
-def load_frames(
-    made: Frames, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
-) -> Scene:
-    """Make a scene of frames of another program.
-
-    Args:
-      made: the frames.
-      downscale, test_every, room, lens: as in `load_scene`.
-
-    Raises:
-      FileNotFoundError, ValueError: as `load_transforms`.
-    """
-    meta = {"frames": made.frames}
-    _check_meta(made.file, meta)
-    shots = sorted(_read_shots(made.file, meta, downscale, Shelf(room), lens), key=lambda shot: shot.name)
-    if made.counted is not None:
-        shots = [_masked(shot, made.counted) for shot in shots]
-    folder = made.file.resolve().parent
-    return assemble_scene(scene_name(folder), *every_kth(shots, test_every), made.cloud, source=str(made.file))
-
-
-def _masked(shot: Shot, counted: Callable[[np.ndarray], np.ndarray]) -> Shot:
-    """Return a shot with a mask of its own pixels, unless it has one or all of them count."""
-    mask = counted(Picture.of(shot.pixels).read()) if shot.mask is None else None
-    return shot if mask is None or mask.all() else dataclasses.replace(shot, mask=Mask.of(mask))
 
 
 def load_blender(
@@ -134,10 +93,10 @@ def load_blender(
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     shelf = Shelf(room)
-    train = _read_shots(train_file, _read_json(train_file), downscale, shelf, lens)
+    train = read_shots(train_file, _read_json(train_file), downscale, shelf, lens)
     test: list[Shot] = []
     if is_regular(test_file):
-        test = _read_shots(test_file, _read_json(test_file), downscale, shelf, lens)
+        test = read_shots(test_file, _read_json(test_file), downscale, shelf, lens)
     else:
         train, test = every_kth(train, test_every)
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
@@ -152,12 +111,12 @@ def _read_json(file: Path) -> dict[str, Any]:
         meta = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
-    _check_meta(file, meta)
+    check_meta(file, meta)
     checked: dict[str, Any] = meta
     return checked
 
 
-def _check_meta(file: Path, meta: Any) -> None:
+def check_meta(file: Path, meta: Any) -> None:
     """Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts."""
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")
@@ -181,7 +140,7 @@ def _check_texts(file: Path, values: dict[str, Any]) -> None:
             raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
 
 
-def _read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf, use: LensUse) -> list[Shot]:
+def read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf, use: LensUse) -> list[Shot]:
     """Return the frames of a transforms file, downscaled, in the file's order."""
 
     def shoot(frame: dict[str, Any]) -> Shot:

@@ -19,7 +19,6 @@ FOUND_BY: tuple[tuple[str, str], ...] = (
     ("*.sfm", "has Meshroom's cameras: its node ExportColmap writes what is read"),
     ("*.mvs", "is a scene of OpenMVS, which is not read: export COLMAP's format"),
     ("pose/*.txt", "has a pose for each image (ScanNet), which are not read: write transforms.json"),
-    ("*.csv", "has a table, but no cameras that are read: export XMP files or COLMAP's format from RealityScan"),
     ("database.db", "has COLMAP's database without a model: colmap mapper writes sparse/0"),
 )
 """Pattern of files below the capture's folder, and what to do. The first that fits is told."""
