@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -63,15 +65,35 @@ def spread(exchange: Exchange | None, tree: Any) -> Any:
 
     def of_leaf(x: Any) -> Any:
         sharding = exchange.sharding_of(jnp.shape(x))
-        is_traced = isinstance(x, jax.core.Tracer)
-        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else jax.device_put(x, sharding)
+        if isinstance(x, jax.core.Tracer):
+            return jax.lax.with_sharding_constraint(x, sharding)
+        if sharding.is_fully_addressable:
+            return jax.device_put(x, sharding)
+        return jax.make_array_from_callback(jnp.shape(x), sharding, np.asarray(x).__getitem__)
 
     return jax.tree.map(of_leaf, tree)
 
 
 def gathered(exchange: Exchange | None, tree: Any) -> Any:
-    """Return arrays on the first of the devices; without an exchange they stay (host)."""
-    return tree if exchange is None else jax.device_put(tree, exchange.mesh.devices.flat[0])
+    """Return arrays on the first of this process's devices; without an exchange they stay (host).
+
+    If the devices are of several processes, all of these must call it.
+    """
+    return tree if exchange is None else jax.device_put(readable(tree), exchange.mesh.local_mesh.devices.flat[0])
+
+
+def readable(tree: Any) -> Any:
+    """Return arrays that this process can read: those that lie on other processes' devices too are gathered (host).
+
+    All processes must call it.
+    """
+
+    def of_leaf(x: Any) -> Any:
+        if not isinstance(x, jax.Array) or x.is_fully_addressable:
+            return x
+        return np.asarray(x) if x.is_fully_replicated else multihost_utils.process_allgather(x, tiled=True)
+
+    return jax.tree.map(of_leaf, tree)
 
 
 def exchange_among(devices: Any) -> Exchange:

@@ -20,7 +20,7 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.exchange import Exchange, gathered, spread
+from a2tg_jax.rasterize.exchange import Exchange, gathered, readable, spread
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -174,7 +174,7 @@ class StageRun:
     @property
     def checkpoint(self) -> Checkpoint:
         """Present state; the next step reuses its buffers."""
-        return Checkpoint(self.system, self.index, self.state, self.history, self.num_restored)
+        return Checkpoint(self.system, self.index, readable(self.state), self.history, self.num_restored)
 
     def train(
         self,
@@ -292,7 +292,8 @@ class StageRun:
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Make more room for the tile lists; raise an error for every other cause."""
-        self.state = dataclasses.replace(self.state, status=jnp.zeros((), jnp.int32))
+        fine = spread(self.exchange, jnp.zeros((), jnp.int32))
+        self.state = dataclasses.replace(self.state, status=fine)
         if info.status == OVERFLOW:
             self.num_regrown += 1
             size = self._size(iteration)
