@@ -49,6 +49,11 @@ class Exchange:
         """Number D of devices."""
         return self.mesh.size
 
+    @property
+    def is_of_processes(self) -> bool:
+        """Whether the devices are of several processes."""
+        return bool(self.mesh.is_multi_process)
+
     def sharding_of(self, shape: tuple[int, ...]) -> NamedSharding:
         """Return where the rows of an array lie."""
         is_divided = bool(shape) and shape[0] >= self.num and shape[0] % self.num == 0
@@ -94,6 +99,13 @@ def readable(tree: Any) -> Any:
         return np.asarray(x) if x.is_fully_replicated else multihost_utils.process_allgather(x, tiled=True)
 
     return jax.tree.map(of_leaf, tree)
+
+
+def asked_by_any(exchange: Exchange | None, is_asked: bool) -> bool:
+    """Return whether any of the processes asks for something (host); all of them call it."""
+    if exchange is None or not exchange.is_of_processes:
+        return is_asked
+    return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
 
 
 def exchange_among(devices: Any) -> Exchange:

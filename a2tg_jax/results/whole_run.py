@@ -7,6 +7,7 @@ from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
+from a2tg_jax.host.processes import team
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
@@ -15,6 +16,7 @@ from a2tg_jax.results.replacement import drop_old
 from a2tg_jax.results.run_evaluation import evaluate_run
 from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import RunResult
+from a2tg_jax.results.together import check_alike
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
@@ -97,6 +99,7 @@ def go_on(
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
     with _advised(run, is_replacing=replaced_by is not None):
+        check_alike(replaced_by or read_record(run), scene)
         with signals.noted() as is_stopped, watched(scene) as watch:
             train_run(
                 run,
@@ -108,6 +111,8 @@ def go_on(
                 session=session,
                 tensorboard=tensorboard,
             )
+        if (others := team()) is not None:
+            others.leave()
         return measure(run, scene, lpips_weights=lpips_weights)
 
 
@@ -128,12 +133,16 @@ def _advised(run: RunFolder, *, is_replacing: bool) -> Iterator[None]:
         is_untouched = is_replacing and run.record.is_file() and _identity(run.record) == before
         return f"the run that was in {run.path} is untouched" if is_untouched else how_to_go_on(run)
 
+    if (others := team()) is not None:
+        others.advice = advice
     try:
         yield
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
         raise signals.Stopped(number, advice()) from None
     except (ValueError, OSError) as error:
+        if others is not None:
+            others.told(error)
         raise ValueError(f"{error}; {advice()}") from error
 
 

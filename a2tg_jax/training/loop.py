@@ -20,7 +20,7 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.exchange import Exchange, gathered, readable, spread
+from a2tg_jax.rasterize.exchange import Exchange, asked_by_any, gathered, readable, spread
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -215,7 +215,7 @@ class StageRun:
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
-                is_asked = is_stopped()
+                is_asked = asked_by_any(self.exchange, is_stopped())
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
                 if on_checkpoint is not None and (is_due or is_asked or iteration == end):
                     on_checkpoint(self.checkpoint)
@@ -256,7 +256,8 @@ class StageRun:
     def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
         """Run iterations `first` to `last`. Stop at one that cannot be taken and mend its cause."""
         launched: list[StepInfo] = []
-        while first + len(launched) <= last and not is_stopped():
+        is_common = self.exchange is not None and self.exchange.is_of_processes
+        while first + len(launched) <= last and (is_common or not is_stopped()):
             launched.append(self._launch(first + len(launched)))
         infos = read(launched)
         taken = [info for info in infos if info.status == FINE]
@@ -322,6 +323,7 @@ class StageRun:
     def _log(self, iteration: int, info: StepInfo) -> None:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
             model = self.state.model
+            model = dataclasses.replace(model, layout=readable(model.layout))
             num_bytes = model.bytes_of(int(info.num_live))
             row = (
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
