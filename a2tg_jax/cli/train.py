@@ -198,11 +198,11 @@ class Train:
 
     def _follow(self, team: Team) -> None:
         """Train what the first process says, and be quiet."""
-        run = RunFolder(self.out)
-        team.advice = lambda: f"continue with: {resuming_command(run)}"
+        run, session = RunFolder(self.out), tidy_session(devices_named(self.devices))
+        team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
         record = read_record(open_run(self.out)) if self.resume else self.record
         scene = record.scene.load(room_for_photographs(bytes_allowed(self.max_memory)))
-        follow(record, scene, tidy_session(devices_named(self.devices)))
+        follow(record, scene, session)
 
     def _run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)

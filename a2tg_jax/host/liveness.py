@@ -22,14 +22,15 @@ Told = Callable[[str], None]
 class Liveness:
     """Connections of one process to those that must live as long as it does."""
 
-    def __init__(self, others: Mapping[int, Connection], seconds: float, on_end: Told):
+    def __init__(self, others: Mapping[int, Connection], count: int, seconds: float, on_end: Told):
         """Args:
         others: connections by the number of the process.
+        count: number of all processes.
         seconds: time after which a silent process is lost.
         on_end: called in a thread with the reason once another process is lost, or with "" if the first one asks to
           end quietly. It ends the process.
         """
-        self._others, self._seconds, self._on_end = dict(others), seconds, on_end
+        self._others, self._count, self._seconds, self._on_end = dict(others), count, seconds, on_end
         self._ending, self._sending = threading.Lock(), threading.Lock()
         self._is_left = threading.Event()
         for number, connection in self._others.items():
@@ -74,15 +75,17 @@ class Liveness:
                     reason = f"failed: {text}"
                     break
                 if kind in (LOST, QUIT):
-                    self._end(text)
+                    return self._end(text)
         except (EOFError, OSError):
             reason = "has ended"
-        if not self._is_left.is_set():
-            self._end(f"process {number} {reason}")
+        self._end(f"process {number} of {self._count} {reason}")
 
     def _end(self, reason: str) -> None:
         with self._ending:
-            if reason and not self._is_left.is_set():
+            if self._is_left.is_set():
+                return
+            self._is_left.set()
+            if reason:
                 self._say(LOST + reason.encode())
             self._on_end(reason)
 

@@ -59,7 +59,7 @@ class Team:
         others = accept(own[0], self.count) if own else connect(
             told[36:].decode(), int.from_bytes(told[:4], "big"), told[4:36], self.index
         )  # fmt: skip
-        self._liveness = Liveness(others, self._seconds, self._end)
+        self._liveness = Liveness(others, self.count, self._seconds, self._end)
 
     def leave(self) -> None:
         """End the common work; this process goes on alone."""
@@ -85,7 +85,7 @@ class Team:
         """End this process, which waits inside XLA, with one line."""
         if reason:
             with contextlib.suppress(ValueError, OSError):
-                print(f"a2tg: error: {reason} (of {self.count} processes); {self.advice()}", file=sys.stderr)
+                print(f"a2tg: error: {reason}; {self.advice()}", file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(LOST)

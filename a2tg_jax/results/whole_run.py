@@ -7,6 +7,7 @@ from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
+from a2tg_jax.host.machine import Devices
 from a2tg_jax.host.processes import team
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
@@ -98,7 +99,8 @@ def go_on(
 ) -> RunResult:
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
-    with _advised(run, is_replacing=replaced_by is not None):
+    devices = None if session is None else session.devices
+    with _advised(run, devices, is_replacing=replaced_by is not None):
         check_alike(replaced_by or read_record(run), scene)
         with signals.noted() as is_stopped, watched(scene) as watch:
             train_run(
@@ -125,13 +127,13 @@ def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path |
 
 
 @contextlib.contextmanager
-def _advised(run: RunFolder, *, is_replacing: bool) -> Iterator[None]:
+def _advised(run: RunFolder, devices: Devices | None, *, is_replacing: bool) -> Iterator[None]:
     """Add to whatever ends the training how to continue it."""
     before = _identity(run.record) if is_replacing else None
 
     def advice() -> str:
         is_untouched = is_replacing and run.record.is_file() and _identity(run.record) == before
-        return f"the run that was in {run.path} is untouched" if is_untouched else how_to_go_on(run)
+        return f"the run that was in {run.path} is untouched" if is_untouched else how_to_go_on(run, devices)
 
     if (others := team()) is not None:
         others.advice = advice
@@ -152,12 +154,12 @@ def _identity(path: Path) -> tuple[int, int]:
     return status.st_ino, status.st_mtime_ns
 
 
-def how_to_go_on(run: RunFolder) -> str:
-    """Return the path of the newest checkpoint, and the command that resumes."""
+def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
+    """Return the path of the newest checkpoint, and the command that resumes, as `resuming_command`."""
     names = read_record(run).plan.names
     checkpoints = [path for name in names for path in run.checkpoints(name)]
     finished = [run.model(name) for name in names if run.model(name).is_file()]
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     if finished and not checkpoints:
         last = f"the last model is {finished[-1]}"
-    return f"{last}; continue with: {resuming_command(run)}"
+    return f"{last}; continue with: {resuming_command(run, devices)}"

@@ -120,7 +120,7 @@ class StageRun:
         if resume is not None:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
-            check_devices(resume, self.num_devices)
+            warn_of_uneven_rows(resume, self.num_devices)
             self.state: TrainState = spread(self.exchange, jax.tree.map(jnp.array, resume.state))
             self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
@@ -174,7 +174,8 @@ class StageRun:
     @property
     def checkpoint(self) -> Checkpoint:
         """Present state; the next step reuses its buffers."""
-        return Checkpoint(self.system, self.index, readable(self.state), self.history, self.num_restored)
+        state = readable(self.state)
+        return Checkpoint(self.system, self.index, state, self.history, self.num_restored, devices=self.session.devices)
 
     def train(
         self,
@@ -386,7 +387,7 @@ class StageRun:
 
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
         """Return the exchange with room for the rows that travel in some views once all rows exist."""
-        model, rows = self.state.model, self.state.model.gaussians.num // exchange.num
+        model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
         most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)
         share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
@@ -415,14 +416,15 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         )
 
 
-def check_devices(resume: Checkpoint, num_devices: int) -> None:
-    """Raise ValueError unless the rows of a checkpoint can be spread evenly over so many devices."""
+def warn_of_uneven_rows(resume: Checkpoint, num_devices: int) -> None:
+    """Warn if the rows of a checkpoint cannot be spread evenly over so many devices, which costs memory."""
     rows = resume.state.model.gaussians.num
     if rows % num_devices:
         fitting = [number for number in range(1, num_devices) if rows % number == 0]
-        raise ValueError(
-            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: resume with --devices "
-            f"{' or '.join(map(str, fitting))}"
+        warnings.warn(
+            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: each holds all of "
+            f"them until the stage ends; {' or '.join(map(str, fitting))} could share them",
+            stacklevel=2,
         )
 
 
