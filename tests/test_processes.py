@@ -10,6 +10,9 @@ from on_processes import ended, pair, survivor_of
 from a2tg_jax.cli import main as cli
 from a2tg_jax.host import liveness
 from a2tg_jax.host.liveness import Liveness, accept, connect, listen
+from a2tg_jax.host.machine import Devices
+from a2tg_jax.io.archive import write_archive
+from a2tg_jax.results.folder import RunFolder, resuming_command
 
 SECONDS = 0.3
 
@@ -73,6 +76,15 @@ def test_processes_that_live_are_left_alone(three):
     assert three[1] == [[], [], []]
 
 
+def test_processes_that_are_interrupted_together_end_by_themselves(three, monkeypatch):
+    monkeypatch.setattr(liveness, "INTERRUPTED_GRACE", SECONDS)
+    everyone, ends = watched(three, (0, 1, 2)), three[1]
+    everyone[1].interrupt()
+    everyone[0].interrupt()
+    until(lambda: ends[2])
+    assert ends == [[], [], ["process 0 of 3 was interrupted"]]
+
+
 @pytest.mark.parametrize("reason", ["no scene", ""])
 def test_errors_of_one_process_end_the_others(three, reason):
     everyone, ends = watched(three, (0, 1, 2)), three[1]
@@ -84,6 +96,18 @@ def test_errors_of_one_process_end_the_others(three, reason):
         everyone[0].quit()
         until(lambda: ends[1] and ends[2])
         assert ends[1] == ends[2] == [""]
+
+
+def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
+    run, path = RunFolder(tmp_path), tmp_path / "checkpoints" / "a2tg-gaussians-0000000001.npz"
+    assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume"
+    path.parent.mkdir()
+    path.write_bytes(b"damaged")
+    assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume"
+    write_archive(path, {"devices": {"each": 4, "processes": 1}}, {})
+    assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume --devices 4"
+    by_two = "--devices 1 --coordinator HOST:PORT --num-processes 2 --process-id I"
+    assert resuming_command(run, Devices(1, 2)) == f"a2tg train --out {tmp_path} --resume {by_two}"
 
 
 @pytest.mark.parametrize(

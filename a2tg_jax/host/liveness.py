@@ -14,7 +14,9 @@ BEATS = 5
 """Number of signs of life within the time after which a silent process is lost."""
 GRACE = 2.0
 """Seconds in which a process that fails with the others can tell its own error."""
-ALIVE, BYE, FAILED, LOST, QUIT = b".", b"b", b"f", b"l", b"q"
+INTERRUPTED_GRACE = 300.0
+"""Seconds in which a process that is interrupted with the others can write its last checkpoint."""
+ALIVE, BYE, FAILED, INTERRUPTED, LOST, QUIT = b".", b"b", b"f", b"i", b"l", b"q"
 """Kinds of messages; a text follows FAILED and LOST."""
 Told = Callable[[str], None]
 
@@ -46,8 +48,14 @@ class Liveness:
         """Tell the others that this process ends by an error of its own."""
         self._say(FAILED + reason.encode())
 
+    def interrupt(self) -> None:
+        """Tell the others that this process was asked to end, as they should be."""
+        self._is_left.set()
+        self._say(INTERRUPTED)
+
     def quit(self) -> None:
         """Ask the others to end quietly."""
+        self._is_left.set()
         self._say(QUIT)
 
     def _say(self, message: bytes) -> None:
@@ -73,6 +81,10 @@ class Liveness:
                 if kind == FAILED:
                     time.sleep(GRACE)
                     reason = f"failed: {text}"
+                    break
+                if kind == INTERRUPTED:
+                    self._is_left.wait(INTERRUPTED_GRACE)
+                    reason = "was interrupted"
                     break
                 if kind in (LOST, QUIT):
                     return self._end(text)

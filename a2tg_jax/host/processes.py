@@ -71,14 +71,17 @@ class Team:
 
     def told(self, error: BaseException) -> None:
         """Tell the others of an error; if it comes of a lost process, wait for what is known of that one."""
-        if self._liveness is None:
+        liveness, self._liveness = self._liveness, None
+        if liveness is None:
             return
         if is_of_collectives(error):
             time.sleep(2 * self._seconds)  # `_end` comes first.
+        elif isinstance(error, KeyboardInterrupt):
+            liveness.interrupt()
         elif self.is_first:
-            self._liveness.quit()
-        elif not isinstance(error, KeyboardInterrupt):
-            self._liveness.fail(str(error))
+            liveness.quit()
+        else:
+            liveness.fail(str(error))
             time.sleep(self._seconds)
 
     def _end(self, reason: str) -> NoReturn:
@@ -133,6 +136,8 @@ def _initialize(place: Place) -> None:
     late.daemon = True
     late.start()
     is_auto = place.coordinator == AUTO
+    # JAX's handler of SIGTERM would take the place of `signals`.
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         # Its own times are a net beneath this module's.
         jax.distributed.initialize(

@@ -59,10 +59,10 @@ class Exchange:
         """Number of processes that the devices belong to."""
         return len({device.process_index for device in self.mesh.devices.flat})
 
-    def sharding_of(self, shape: tuple[int, ...]) -> NamedSharding:
-        """Return where the rows of an array lie."""
-        is_divided = bool(shape) and shape[0] >= self.num and shape[0] % self.num == 0
-        return NamedSharding(self.mesh, P(AXIS) if is_divided else P())
+    def sharding_of(self, shape: tuple[int, ...], axis: int = 0) -> NamedSharding:
+        """Return where the rows of an array lie, along one of its axes."""
+        is_divided = len(shape) > axis and shape[axis] >= self.num and shape[axis] % self.num == 0
+        return NamedSharding(self.mesh, P(*[None] * axis, AXIS) if is_divided else P())
 
     def filled_up(self, x: Array, value: float | None = None) -> Array:
         """Return rows followed by so many of a value, or copies of the last one, that D divides their number."""
@@ -81,13 +81,28 @@ def spread(exchange: Exchange | None, tree: Any) -> Any:
 
     def of_leaf(x: Any) -> Any:
         sharding = exchange.sharding_of(jnp.shape(x))
-        if isinstance(x, jax.core.Tracer):
-            return jax.lax.with_sharding_constraint(x, sharding)
-        if sharding.is_fully_addressable:
-            return jax.device_put(x, sharding)
-        return jax.make_array_from_callback(jnp.shape(x), sharding, np.asarray(x).__getitem__)
+        is_traced = isinstance(x, jax.core.Tracer)
+        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else _placed(x, sharding)
 
     return jax.tree.map(of_leaf, tree)
+
+
+def spread_pixels(exchange: Exchange, pictures: Array) -> Array:
+    """Return pictures [V, H, ...] with their rows of pixels spread over the devices, if D divides H (host)."""
+    return _placed(pictures, exchange.sharding_of(pictures.shape, axis=1))
+
+
+def everywhere(exchange: Exchange, x: Array) -> Array:
+    """Return an array that every device has whole (host)."""
+    return _placed(x, NamedSharding(exchange.mesh, P()))
+
+
+def _placed(x: Any, sharding: NamedSharding) -> Array:
+    """Return an array whose parts lie where a sharding says; other processes place theirs of an equal one."""
+    if sharding.is_fully_addressable:
+        placed: Array = jax.device_put(x, sharding)
+        return placed
+    return jax.make_array_from_callback(jnp.shape(x), sharding, np.asarray(x).__getitem__)
 
 
 def gathered(exchange: Exchange | None, tree: Any) -> Any:
