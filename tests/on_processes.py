@@ -58,8 +58,12 @@ def started(arguments):
 
 
 def ended(processes, timeout=600):
-    """What processes write to stderr, once they have ended well."""
-    told = [process.communicate(timeout=timeout)[1] for process in processes]
+    """What processes write to stderr, once they have ended well; they are killed after some seconds."""
+    try:
+        told = [process.communicate(timeout=timeout)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
     assert all(process.returncode == 0 for process in processes), "\n".join(told)[-5000:]
     return told
 
@@ -167,7 +171,7 @@ def main():
         for name in SYSTEMS:
             with tempfile.TemporaryDirectory() as folder:
                 arguments = ["--system", name, "--length", str(args.length), "--folder", folder]
-                print(ended(pair(arguments, args.processes))[0])
+                print(ended(pair(arguments, args.processes), 3600)[0])
 
 
 if __name__ == "__main__":

@@ -26,7 +26,8 @@ def test_two_processes_train_as_one(tmp_path):
 def test_a_lost_process_is_noticed(victim, number):
     processes = pair(["--what", "wait", "--seconds", "2"])
     for process in processes:
-        assert process.stdout.readline() == "met\n", process.stderr.read()
+        if process.stdout.readline() != "met\n":
+            pytest.fail(str(ended(processes, 10)))
     took, told = survivor_of(processes, victim, number, 60)
     reason = "has ended" if number == signal.SIGKILL else "was not heard from for 2 s"
     assert told == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8

@@ -200,7 +200,7 @@ class Train:
         """Train what the first process says, and be quiet."""
         run, session = RunFolder(self.out), tidy_session(devices_named(self.devices))
         team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
-        record = read_record(open_run(self.out)) if self.resume else self.record
+        record = self._resumed(open_run(self.out), is_written=False) if self.resume else self.record
         scene = record.scene.load(room_for_photographs(bytes_allowed(self.max_memory)))
         follow(record, scene, session)
 
@@ -250,7 +250,7 @@ class Train:
         compare = tuple(dict.fromkeys(compare))
         return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init)
 
-    def _resumed(self, run: RunFolder) -> RunRecord:
+    def _resumed(self, run: RunFolder, *, is_written: bool = True) -> RunRecord:
         """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it."""
         kept, asked = read_record(run), self.record
         if asked.scene.path != kept.scene.path:
@@ -261,7 +261,7 @@ class Train:
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
         record.check()
-        if record != kept:
+        if record != kept and is_written:
             write_record(run, record)
         return record
 
