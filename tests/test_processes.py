@@ -5,12 +5,13 @@ import threading
 import time
 
 import pytest
-from on_processes import ended, pair, survivor_of
+from on_processes import ended, free_port, pair, started, survivor_of
 
 from a2tg_jax.cli import main as cli
 from a2tg_jax.host import liveness
 from a2tg_jax.host.liveness import Liveness, accept, connect, listen
 from a2tg_jax.host.machine import Devices
+from a2tg_jax.host.processes import LOST
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.results.folder import RunFolder, resuming_command
 
@@ -31,6 +32,14 @@ def test_a_lost_process_is_noticed(victim, number):
     took, told = survivor_of(processes, victim, number, 60)
     reason = "has ended" if number == signal.SIGKILL else "was not heard from for 2 s"
     assert told == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8
+
+
+def test_a_process_that_does_not_come_is_told():
+    place = f"p.Place('127.0.0.1:{free_port()}', 2, 0, 60.0)"
+    code = f"from a2tg_jax.host import processes as p; p.JOIN_SECONDS = 1; p.joined({place}).__enter__()"
+    alone = started(["-c", code])
+    told = alone.communicate(timeout=120)[1]
+    assert alone.returncode == LOST and "not all processes have joined --coordinator 127.0.0.1:" in told
 
 
 @pytest.fixture

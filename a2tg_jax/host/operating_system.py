@@ -144,14 +144,15 @@ def trim_heap() -> None:
 
 
 def wait_in_abort() -> None:
-    """Have a thread that calls abort() wait for ever instead, so that another thread can tell why and end the process.
+    """Have abort() wait some seconds before it ends the process, so that another thread can tell why and end it.
 
     XLA aborts the process once it hears of the end of another one. Windows keeps its abort().
     """
     library = _c_library()
     if library is not None:
         library.signal.argtypes, library.signal.restype = [ctypes.c_int, ctypes.c_void_p], ctypes.c_void_p
-        library.signal(signal.SIGABRT, ctypes.cast(library.pause, ctypes.c_void_p))
+        # C's sleep takes the number of the signal, 6, for seconds.
+        library.signal(signal.SIGABRT, ctypes.cast(library.sleep, ctypes.c_void_p))
 
 
 def own_output_only() -> None:

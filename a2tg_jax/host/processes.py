@@ -113,11 +113,17 @@ def joined(place: Place | None) -> Iterator[Team | None]:
     if place is None:
         yield None
         return
-    _initialize(place)
-    _team = Team(place.seconds)
+    late = threading.Timer(JOIN_SECONDS, _give_up, (place.coordinator,))
+    late.daemon = True
+    late.start()
     try:
+        _initialize(place)
+        _team = Team(place.seconds)
         if _team.count > 1:
             _team.watch(place.coordinator)
+    finally:
+        late.cancel()
+    try:
         yield _team
         _team.leave()
     except BaseException as error:
@@ -128,13 +134,10 @@ def joined(place: Place | None) -> Iterator[Team | None]:
 
 
 def _initialize(place: Place) -> None:
-    """Call `jax.distributed.initialize`; end the process with one line if the others do not come."""
+    """Call `jax.distributed.initialize`."""
     if not os.environ.get("A2TG_DEBUG"):
         own_output_only()
     wait_in_abort()
-    late = threading.Timer(JOIN_SECONDS, _give_up, (place.coordinator,))
-    late.daemon = True
-    late.start()
     is_auto = place.coordinator == AUTO
     # JAX's handler of SIGTERM would take the place of `signals`.
     jax.config.update("jax_enable_preemption_service", False)
@@ -151,10 +154,10 @@ def _initialize(place: Place) -> None:
         )
     except (ValueError, TypeError, RuntimeError) as error:
         raise ValueError(f"--coordinator {place.coordinator}: {error}") from error
-    late.cancel()
 
 
 def _give_up(coordinator: str) -> NoReturn:
+    """End the process with one line, since the others do not come."""
     print(
         f"a2tg: error: not all processes have joined --coordinator {coordinator} within {JOIN_SECONDS} s: start as "
         "many as --num-processes says, each with a --process-id of its own",
