@@ -3,8 +3,7 @@
 import contextlib
 import dataclasses
 import itertools
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,11 +12,12 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
+from a2tg_jax.cli.place import place_of
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.core.display import counted
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
-from a2tg_jax.host.processes import AUTO, Place, Team, joined
+from a2tg_jax.host.processes import Place, Team, joined
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
@@ -169,32 +169,9 @@ class Train:
         Raises:
           ValueError: if flags of several processes are missing, or exclude each other.
         """
-        flags = {"--num-processes": self.num_processes, "--process-id": self.process_id}
-        given = [flag for flag, value in flags.items() if value is not None]
-        if self.coordinator is None:
-            if given:
-                raise ValueError(f"{given[0]} wants --coordinator HOST:PORT, the address of the first process")
-            return None
-        if self.view:
+        if self.coordinator is not None and self.view:
             raise ValueError("--view shows the training of one process: leave out --view or --coordinator")
-        if self.heartbeat_timeout_seconds <= 0:
-            raise ValueError(f"--heartbeat-timeout-seconds must be positive; got {self.heartbeat_timeout_seconds:g}")
-        if self.coordinator != AUTO:
-            self._check_numbers(flags)
-        return Place(self.coordinator, self.num_processes, self.process_id, self.heartbeat_timeout_seconds)
-
-    def _check_numbers(self, flags: Mapping[str, int | None]) -> None:
-        missing = [flag for flag, value in flags.items() if value is None]
-        if missing:
-            raise ValueError(f"--coordinator HOST:PORT also wants {' and '.join(missing)}")
-        if not re.fullmatch(r".+:\d+", str(self.coordinator)):
-            raise ValueError(f"--coordinator must be HOST:PORT or auto; got {self.coordinator!r}")
-        assert self.num_processes is not None and self.process_id is not None
-        if not 0 <= self.process_id < self.num_processes:
-            raise ValueError(
-                f"--process-id must be from 0 to {self.num_processes - 1}, one less than --num-processes; "
-                f"got {self.process_id}"
-            )
+        return place_of(self.coordinator, self.num_processes, self.process_id, self.heartbeat_timeout_seconds)
 
     def _follow(self, team: Team) -> None:
         """Train what the first process says, and be quiet."""

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -82,56 +81,17 @@ def spread(exchange: Exchange | None, tree: Any) -> Any:
     def of_leaf(x: Any) -> Any:
         sharding = exchange.sharding_of(jnp.shape(x))
         is_traced = isinstance(x, jax.core.Tracer)
-        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else _placed(x, sharding)
+        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else placed(x, sharding)
 
     return jax.tree.map(of_leaf, tree)
 
 
-def spread_pixels(exchange: Exchange, pictures: Array) -> Array:
-    """Return pictures [V, H, ...] with their rows of pixels spread over the devices, if D divides H (host)."""
-    return _placed(pictures, exchange.sharding_of(pictures.shape, axis=1))
-
-
-def everywhere(exchange: Exchange, x: Array) -> Array:
-    """Return an array that every device has whole (host)."""
-    return _placed(x, NamedSharding(exchange.mesh, P()))
-
-
-def _placed(x: Any, sharding: NamedSharding) -> Array:
+def placed(x: Any, sharding: NamedSharding) -> Array:
     """Return an array whose parts lie where a sharding says; other processes place theirs of an equal one."""
     if sharding.is_fully_addressable:
-        placed: Array = jax.device_put(x, sharding)
-        return placed
+        array: Array = jax.device_put(x, sharding)
+        return array
     return jax.make_array_from_callback(jnp.shape(x), sharding, np.asarray(x).__getitem__)
-
-
-def gathered(exchange: Exchange | None, tree: Any) -> Any:
-    """Return arrays on the first of this process's devices; without an exchange they stay (host).
-
-    If the devices are of several processes, all of these must call it.
-    """
-    return tree if exchange is None else jax.device_put(readable(tree), exchange.mesh.local_mesh.devices.flat[0])
-
-
-def readable(tree: Any) -> Any:
-    """Return arrays that this process can read: those that lie on other processes' devices too are gathered (host).
-
-    All processes must call it.
-    """
-
-    def of_leaf(x: Any) -> Any:
-        if not isinstance(x, jax.Array) or x.is_fully_addressable:
-            return x
-        return np.asarray(x) if x.is_fully_replicated else multihost_utils.process_allgather(x, tiled=True)
-
-    return jax.tree.map(of_leaf, tree)
-
-
-def asked_by_any(exchange: Exchange | None, is_asked: bool) -> bool:
-    """Return whether any of the processes asks for something (host); all of them call it."""
-    if exchange is None or not exchange.is_of_processes:
-        return is_asked
-    return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
 
 
 def exchange_among(devices: Any) -> Exchange:

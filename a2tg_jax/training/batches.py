@@ -10,7 +10,8 @@ from jax import Array
 
 from a2tg_jax.data.scene import View
 from a2tg_jax.host.cores import num_threads
-from a2tg_jax.rasterize.exchange import Exchange, everywhere, spread_pixels
+from a2tg_jax.rasterize.exchange import Exchange
+from a2tg_jax.rasterize.placement import everywhere, spread_pixels
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from a2tg_jax.core.jit import Jitted
-from a2tg_jax.rasterize.exchange import readable
+from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt, attempt
 

@@ -20,7 +20,8 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.exchange import Exchange, asked_by_any, gathered, readable, spread
+from a2tg_jax.rasterize.exchange import Exchange, spread
+from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, readable
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -341,6 +342,7 @@ class StageRun:
             return
         self.state = gathered(self.exchange, self.state)
         self._apply_host_events(iteration)
+        check_same(self.exchange, self.state, f"the events at iteration {iteration} of stage {self.stage.name}")
         self.state = spread(self.exchange, self.state)
 
     def _apply_host_events(self, iteration: int) -> None:
