@@ -3,6 +3,7 @@
 import signal
 import threading
 import time
+from multiprocessing import AuthenticationError
 
 import pytest
 from on_processes import ended, free_port, pair, started, survivor_of
@@ -50,6 +51,8 @@ def three(monkeypatch):
     found = {}
     accepting = threading.Thread(target=lambda: found.update(accept(listener, 3)))
     accepting.start()
+    with pytest.raises((AuthenticationError, EOFError, OSError)):
+        connect("127.0.0.1", port, b"a stranger's", 1)
     others = [connect("127.0.0.1", port, key, number) for number in (1, 2)]
     accepting.join(10)
     return [found, *others], [[], [], []]

@@ -4,10 +4,12 @@ The first process has a connection to every other one, and tells them whom it ha
 because a training waits for a lost process inside XLA and cannot be interrupted there.
 """
 
+import contextlib
 import os
 import threading
 import time
 from collections.abc import Callable, Mapping
+from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Connection, Listener
 
 BEATS = 5
@@ -103,11 +105,15 @@ class Liveness:
 
 
 def accept(listener: Listener, count: int) -> dict[int, Connection]:
-    """Return the connections of processes 1 to `count` - 1, each of which first sends its number."""
+    """Return the connections of processes 1 to `count` - 1, each of which first sends its number.
+
+    Strangers, who do not know the key, are turned away.
+    """
     found: dict[int, Connection] = {}
-    for _ in range(count - 1):
-        connection = listener.accept()
-        found[int.from_bytes(connection.recv_bytes(), "big")] = connection
+    while len(found) < count - 1:
+        with contextlib.suppress(AuthenticationError, EOFError, OSError):
+            connection = listener.accept()
+            found[int.from_bytes(connection.recv_bytes(), "big")] = connection
     listener.close()
     return found
 
