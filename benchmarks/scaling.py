@@ -5,10 +5,16 @@
 The random scene of the other benchmarks at 1600×1060 pixels, spread over 1 to 64 devices. A device sends a fixed number
 of rows to each other one, the largest that any pair needs; the least that must travel are the rows that reach a band
 which another device owns. Gradients come back in the same rows.
+
+    python -m benchmarks.scaling --train 2000000 --memory-gb 12 --out benchmarks/results/scaling_training.json
+
+This trains so many Gaussians for some steps on several devices of this CPU, and fails if that takes more memory.
 """
 
 import argparse
 import json
+import resource
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import a2tg_jax as a2tg
 from a2tg_jax import RenderSettings
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
@@ -25,12 +32,15 @@ from a2tg_jax.rasterize.exchange import Bands
 from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.tiles import TileGrid
 from a2tg_jax.render import rule_of
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.training.registry import with_changes
 from benchmarks.workload import random_scene
 from experiments.lab.markdown import table as markdown
 
 NUMS, DEVICES = (100_000, 1_000_000, 4_000_000), (1, 2, 4, 8, 16, 64)
 WIDTH, HEIGHT = 1600, 1060
 PROBE, CUTOFF = 4, 1
+KIBIBYTE = 1024
 STATES = 4
 """Parameters, their gradients, and the two moments of Adam."""
 
@@ -68,10 +78,41 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--largest", type=int, default=NUMS[-1], help="largest number of Gaussians")
+    parser.add_argument("--train", type=int, metavar="N", help="train N Gaussians")
+    parser.add_argument("--devices", type=int, default=4, help="devices of the CPU that train them")
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--memory-gb", type=float, default=12.0, help="memory that the training may take")
     args = parser.parse_args()
+    if args.train:
+        jax.config.update("jax_num_cpu_devices", args.devices)
+        trained = training(args.train, args.steps)
+        args.out.write_text(json.dumps(trained, indent=1) + "\n", encoding="utf-8")
+        print(trained)
+        if trained["peak_gb"] > args.memory_gb:
+            sys.exit(f"the training took {trained['peak_gb']:.1f} GB, more than {args.memory_gb:g} GB")
+        return
     found = [counted(num, devices) for num in NUMS if num <= args.largest for devices in DEVICES]
     args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(table(found))
+
+
+def training(num: int, steps: int) -> dict[str, float]:
+    """Return the time and the memory of a training of `num` Gaussians on all devices, at 128×96 pixels."""
+    scene = a2tg.synthetic_scene(num_views=9, width=128, height=96, num_points=num)
+    changes = {"initial_gaussians": num, "densify": {"cap": num}, "stage1_iterations": steps}
+    own = with_changes(Gaussians2dMcmc.preset("smoke"), changes, "here")
+    result = a2tg.fit(scene, own, session=a2tg.Session(devices=jax.devices()))
+    paces = np.diff(result.history.seconds) / np.diff(result.history.iteration)
+    return {
+        "gaussians": result.model.num,
+        "devices": len(jax.devices()),
+        "steps": steps,
+        "first_loss": float(result.history.loss[0]),
+        "last_loss": float(result.history.loss[-1]),
+        "seconds_a_step": float(np.median(paces)),
+        "state_gb": BYTES_PER_FLOAT * STATES * floats_per_gaussian(own.initial_sh_degree) * num / 1e9,
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIBIBYTE / 1e9,
+    }
 
 
 def table(found: Sequence[Mapping[str, float]]) -> str:

@@ -570,6 +570,21 @@ def test_submitit_sends_jobs_out(tmp_path):
     assert list((work / "submitit").iterdir())
 
 
+def test_a_preempted_job_is_queued_again(tmp_path):
+    submitit = pytest.importorskip("submitit")
+    job, folders = Job("synthetic", 2, a2tg.A2tg(), 0), Folders(tmp_path, tmp_path)
+    again = submitit.core.utils.DelayedSubmission(queue.Elsewhere(), job, folders)._checkpoint_function()
+    again.dump(tmp_path / "again.pickle")
+    read = submitit.core.utils.DelayedSubmission.load(tmp_path / "again.pickle")
+    assert isinstance(read.function, queue.Elsewhere) and read.args == (job, folders)
+
+
+def test_errors_of_jobs_are_one_line():
+    trace = "Job (task=0) failed with trace:\n----\nTraceback (most recent call last):\nValueError: no scene\n----"
+    assert queue.told_error(RuntimeError(trace)) == "ValueError: no scene"
+    assert queue.told_error(ValueError("one\nand two")) == "ValueError: one and two"
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [(["--only", "dog"], "no scene 'dog'"), (["--scale", "small", "--scenes", "nowhere"], "nowhere")],
@@ -833,6 +848,8 @@ def test_the_plan_counts_what_is_left(tmp_path):
     assert "8 of 8 stages are left" in everything and "rough figure of CPUs" in everything
     assert "on this machine, 2 at a time, with compilation" in everything and "Disk: about" in everything
     assert "8.00 GB may be used" in everything
+    (row,) = re.findall(r"\| built-in 1/2, A²TG, stage gaussians, [^|]+\| ([\d.]+) \| ([\d.]+) GB \|", everything)
+    assert 0 < float(row[0]) < 0.1 and float(row[1]) >= 4
     on_gpu = plan_of([grid], {}, folders, dataclasses.replace(here, has_gpu=True))
     assert "the paper's program on its GPU" in on_gpu and "compilation" not in on_gpu
     first = next(grid.jobs({}))

@@ -1,5 +1,6 @@
 """The commands that train: `a2tg demo` and `a2tg train`."""
 
+import contextlib
 import dataclasses
 import itertools
 from collections.abc import Sequence
@@ -11,14 +12,16 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
+from a2tg_jax.cli.place import place_of
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.core.display import counted
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.processes import Place, Team, joined
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.lock import opened
 from a2tg_jax.results.preflight import check_weights
@@ -36,6 +39,7 @@ from a2tg_jax.results.record import (
 )
 from a2tg_jax.results.summary import RunResult, summary_text
 from a2tg_jax.results.tensorboard import check_tensorboard
+from a2tg_jax.results.together import follow
 from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -142,10 +146,45 @@ class Train:
     """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training refuses to start if it needs more.
     Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
     devices: Annotated[str, arg(metavar="N")] = "1"
-    """Number of GPUs of this machine that train the scene together, each with a share of its Gaussians; or all."""
+    """Number of GPUs of each process that train the scene together, each with a share of its Gaussians; or all."""
+    coordinator: Annotated[str | None, defaulting_to("one process", "HOST:PORT")] = None
+    """Address of the first of several processes that train the scene together, or auto under Slurm, Open MPI or
+    Kubernetes. Start the same command in each of them."""
+    num_processes: Annotated[int | None, defaulting_to("that of the cluster", "N")] = None
+    """Number of processes, with --coordinator HOST:PORT."""
+    process_id: Annotated[int | None, defaulting_to("that of the cluster", "I")] = None
+    """Number of this process, from 0, with --coordinator HOST:PORT. The first one, 0, writes the run folder."""
+    heartbeat_timeout_seconds: Annotated[float, arg(metavar="SECONDS")] = 60.0
+    """Time after which a process that is silent counts as lost and the others stop."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
+        with joined(self.place) as team:
+            if team is None or team.is_first:
+                self._run()
+            else:
+                self._follow(team)
+
+    @property
+    def place(self) -> Place | None:
+        """Place of this process among those that train together; None if it is the only one.
+
+        Raises:
+          ValueError: if flags of several processes are missing, or exclude each other.
+        """
+        if self.coordinator is not None and self.view:
+            raise ValueError("--view shows the training of one process: leave out --view or --coordinator")
+        return place_of(self.coordinator, self.num_processes, self.process_id, self.heartbeat_timeout_seconds)
+
+    def _follow(self, team: Team) -> None:
+        """Train what the first process says, and be quiet."""
+        run, session = RunFolder(self.out), tidy_session(devices_named(self.devices))
+        team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
+        record = self._resumed(open_run(self.out), is_written=False) if self.resume else self.record
+        scene = record.scene.load(room_for_photographs(bytes_allowed(self.max_memory)))
+        follow(record, scene, session)
+
+    def _run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
         if self.tensorboard:
             check_tensorboard()
@@ -191,7 +230,7 @@ class Train:
         compare = tuple(dict.fromkeys(compare))
         return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init)
 
-    def _resumed(self, run: RunFolder) -> RunRecord:
+    def _resumed(self, run: RunFolder, *, is_written: bool = True) -> RunRecord:
         """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it."""
         kept, asked = read_record(run), self.record
         if asked.scene.path != kept.scene.path:
@@ -202,7 +241,7 @@ class Train:
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
         record.check()
-        if record != kept:
+        if record != kept and is_written:
             write_record(run, record)
         return record
 
@@ -222,7 +261,9 @@ def train_defaults(arguments: list[str]) -> Train:
     system, preset = _value_of("--system", arguments), _value_of("--preset", arguments)
     out = _value_of("--out", arguments)
     if out and "--resume" in arguments and "--overwrite" not in arguments:
-        with opened(out) as run:
+        # Several processes read the folder at a time; the first one claims it later.
+        is_alone = not _value_of("--coordinator", arguments)
+        with opened(out) if is_alone else contextlib.nullcontext(open_run(out)) as run:
             path = path or str(run.record)
             preset = _checked_preset(run, preset)
     file = read_run_file(Path(path)) if path else RunFile()
@@ -290,18 +331,20 @@ def tidy_session(devices: Sequence[jax.Device] | None = None) -> Session:
 
 
 def devices_named(text: str) -> list[jax.Device] | None:
-    """Return the first N devices of this machine, or all; None for one.
+    """Return the first N devices of each process, or all; None for one device of one process.
 
     Raises:
       ValueError: if the text is neither "all" nor a number from 1 to that of the devices.
     """
     devices: list[jax.Device] = jax.local_devices()
     if text == "all":
-        return devices if len(devices) > 1 else None
+        text = str(len(devices))
     if not text.isdecimal() or not 1 <= int(text) <= len(devices):
         found = f"this machine has {counted(len(devices), f'{devices[0].platform.upper()} device')}"
         raise ValueError(f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: {found}")
-    return devices[: int(text)] if int(text) > 1 else None
+    by_process = [jax.local_devices(process_index=index) for index in range(jax.process_count())]
+    chosen = [device for own in by_process for device in own[: int(text)]]
+    return chosen if len(chosen) > 1 else None
 
 
 def tell_result(result: RunResult, folder: Path) -> None:

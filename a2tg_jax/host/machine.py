@@ -38,6 +38,19 @@ class Machine:
         return told
 
 
+@dataclasses.dataclass(frozen=True)
+class Devices:
+    """Numbers of devices and processes that train one scene together."""
+
+    each: int = 1
+    """Devices of each process."""
+    processes: int = 1
+
+
+ALONE = Devices()
+"""One device of one process."""
+
+
 def this_machine() -> Machine:
     """Return the machine of this process. This starts JAX's devices."""
     device = jax.devices()[0]

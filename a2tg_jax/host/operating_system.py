@@ -9,7 +9,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 UNKNOWN_MEMORY = 2**63 - 1
 """Memory of a machine that does not report it."""
@@ -141,6 +141,33 @@ def trim_heap() -> None:
     trim = getattr(_c_library(), "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+def wait_in_abort() -> None:
+    """Have abort() wait some seconds before it ends the process, so that another thread can tell why and end it.
+
+    XLA aborts the process once it hears of the end of another one. Windows keeps its abort().
+    """
+    library = _c_library()
+    if library is not None:
+        library.signal.argtypes, library.signal.restype = [ctypes.c_int, ctypes.c_void_p], ctypes.c_void_p
+        # C's sleep takes the number of the signal, 6, for seconds.
+        library.signal(signal.SIGABRT, ctypes.cast(library.sleep, ctypes.c_void_p))
+
+
+def own_output_only() -> None:
+    """Drop what C++ libraries write to stdout and stderr; `sys.stdout` and `sys.stderr` keep their places."""
+    sys.stdout, sys.stderr = (_moved(stream, number) for number, stream in ((1, sys.stdout), (2, sys.stderr)))
+
+
+def _moved(stream: TextIO, number: int) -> TextIO:
+    """Return the stream on a descriptor of its own, and leave its old one to be dropped."""
+    stream.flush()
+    kept = os.fdopen(os.dup(number), "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, number)
+    os.close(nowhere)
+    return kept
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -47,10 +48,26 @@ class Exchange:
         """Number D of devices."""
         return self.mesh.size
 
-    def sharding_of(self, shape: tuple[int, ...]) -> NamedSharding:
-        """Return where the rows of an array lie."""
-        is_divided = bool(shape) and shape[0] >= self.num and shape[0] % self.num == 0
-        return NamedSharding(self.mesh, P(AXIS) if is_divided else P())
+    @property
+    def is_of_processes(self) -> bool:
+        """Whether the devices are of several processes."""
+        return self.num_processes > 1
+
+    @property
+    def num_processes(self) -> int:
+        """Number of processes that the devices belong to."""
+        return len({device.process_index for device in self.mesh.devices.flat})
+
+    def sharding_of(self, shape: tuple[int, ...], axis: int = 0) -> NamedSharding:
+        """Return where the rows of an array lie, along one of its axes."""
+        is_divided = len(shape) > axis and shape[axis] >= self.num and shape[axis] % self.num == 0
+        return NamedSharding(self.mesh, P(*[None] * axis, AXIS) if is_divided else P())
+
+    def filled_up(self, x: Array, value: float | None = None) -> Array:
+        """Return rows followed by so many of a value, or copies of the last one, that D divides their number."""
+        num = -x.shape[0] % self.num
+        last = x[-1:] if value is None else jnp.full((1, *x.shape[1:]), value, x.dtype)
+        return jnp.concatenate([x, jnp.repeat(last, num, axis=0)]) if num else x
 
 
 def spread(exchange: Exchange | None, tree: Any) -> Any:
@@ -64,14 +81,17 @@ def spread(exchange: Exchange | None, tree: Any) -> Any:
     def of_leaf(x: Any) -> Any:
         sharding = exchange.sharding_of(jnp.shape(x))
         is_traced = isinstance(x, jax.core.Tracer)
-        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else jax.device_put(x, sharding)
+        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else placed(x, sharding)
 
     return jax.tree.map(of_leaf, tree)
 
 
-def gathered(exchange: Exchange | None, tree: Any) -> Any:
-    """Return arrays on the first of the devices; without an exchange they stay (host)."""
-    return tree if exchange is None else jax.device_put(tree, exchange.mesh.devices.flat[0])
+def placed(x: Any, sharding: NamedSharding) -> Array:
+    """Return an array whose parts lie where a sharding says; other processes place theirs of an equal one."""
+    if sharding.is_fully_addressable:
+        array: Array = jax.device_put(x, sharding)
+        return array
+    return jax.make_array_from_callback(jnp.shape(x), sharding, np.asarray(x).__getitem__)
 
 
 def exchange_among(devices: Any) -> Exchange:
@@ -112,16 +132,14 @@ def composite_in_bands(
     The number of pairs is the capacity that has room for the fullest band and for all that is sent to it.
 
     Args:
-      settings, splats, rule, cutoff, jacobian, probe: as for `composite`; D must divide the N rows.
+      settings, splats, rule, cutoff, jacobian, probe: as for `composite`.
       exchange: the devices.
       capacity: number of pairs of the whole image.
-
-    Raises:
-      ValueError: if the number of rows is not divisible by that of devices.
     """
-    num_rows, devices = cutoff.shape[0], exchange.num
-    if num_rows % devices:
-        raise ValueError(f"{num_rows:,} Gaussians cannot be spread over {devices} devices: add rows, or render on one")
+    devices = exchange.num
+    own = splats, rule.regions, probe
+    (splats, regions, probe), cutoff = jax.tree.map(exchange.filled_up, own), exchange.filled_up(cutoff, -1.0)
+    num_rows = cutoff.shape[0]
     share = min(1.0, ROOM_OF_A_BAND / devices)
     room = _Room(
         pairs=math.ceil(capacity * share), pairs_share=share,
@@ -136,7 +154,7 @@ def composite_in_bands(
         in_specs=(rows, rows, rows, rows, everywhere, everywhere),
         out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
-    )(splats, rule.regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian)
+    )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian)
     height = settings.grid.height
     return Composited(channels[:, :height], transmittance[:height], num_pairs, overflow)
 
@@ -146,10 +164,11 @@ def rows_to_send(exchange: Exchange, M: Array, cutoff: Array, near_plane: float,
 
     Args:
       exchange: the D devices.
-      M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`; D divides N.
+      M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
       grid: tiles of the image.
     """
     num = exchange.num
+    M, cutoff = exchange.filled_up(M), exchange.filled_up(cutoff, -1.0)
     reached = Bands.of(grid, num).reached(M, cutoff, near_plane)
     return jnp.max(jnp.sum(reached.reshape(num, num, -1), axis=2, dtype=jnp.int32))
 

@@ -34,7 +34,10 @@ from typing import Any
 
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
+from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.io.archive import read_archive_header
+from a2tg_jax.io.config_json import config_from_dict
 
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
@@ -248,9 +251,31 @@ def open_run(path: str | os.PathLike[str]) -> RunFolder:
     return run
 
 
-def resuming_command(run: RunFolder) -> str:
-    """Return the command line that continues the training of a run."""
-    return shlex.join(["a2tg", "train", "--out", str(run.path), "--resume"])
+def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
+    """Return the command line that continues the training of a run.
+
+    Args:
+      run: the run folder.
+      devices: those that train it; None: those of its newest checkpoint.
+    """
+    devices = _last_devices(run) if devices is None else devices
+    words = ["a2tg", "train", "--out", str(run.path), "--resume"]
+    if devices != ALONE:
+        words += ["--devices", str(devices.each)]
+    if devices.processes > 1:
+        words += ["--coordinator", "HOST:PORT", "--num-processes", str(devices.processes), "--process-id", "I"]
+    return shlex.join(words)
+
+
+def _last_devices(run: RunFolder) -> Devices:
+    """Return the devices of the newest checkpoint; one device if there is none, or it cannot be read."""
+    found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
+    if not found:
+        return ALONE
+    try:
+        return config_from_dict(Devices, read_archive_header(found[-1]).get("devices", {}), "devices")
+    except (ValueError, OSError):
+        return ALONE
 
 
 def _is_file(path: Path) -> bool:

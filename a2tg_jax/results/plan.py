@@ -11,6 +11,8 @@ from a2tg_jax.core.jit import classes_of
 from a2tg_jax.training import Stage, System
 
 PACKAGE = "a2tg_jax"
+LONGEST_WITHOUT_CHECKPOINT = 500
+"""Largest number of iterations between checkpoints."""
 STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
 """Options of every system that reach training only through its stages."""
 
@@ -31,6 +33,11 @@ class PlannedStage:
     @property
     def stage(self) -> Stage:
         return self.system.stages()[self.index]
+
+    @property
+    def checkpoint_every(self) -> int:
+        """Number of iterations between its checkpoints."""
+        return max(1, min(LONGEST_WITHOUT_CHECKPOINT, self.stage.iterations // 10))
 
 
 @dataclasses.dataclass(frozen=True)

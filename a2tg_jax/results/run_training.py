@@ -16,6 +16,7 @@ from a2tg_jax.results.plan import PlannedStage, is_same_so_far
 from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
 from a2tg_jax.results.replacement import set_aside
 from a2tg_jax.results.tensorboard import EventWriter
+from a2tg_jax.results.together import tell_end, tell_stage
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,
@@ -29,8 +30,6 @@ from a2tg_jax.training import (
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 
-LONGEST_WITHOUT_CHECKPOINT = 500
-"""Largest number of iterations between checkpoints."""
 MOST_RESTORED = 5
 """Largest number of times a diverged stage is restored, each time with another order of the views."""
 
@@ -87,6 +86,7 @@ def train_run(
         write_history(run.own(run.history(planned.name)), result.history)
         save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
         run.drop_old_checkpoints(planned.name, keep=0)
+    tell_end()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,14 +120,17 @@ class _Training:
         planned = self.planned
         if self.events is not None and resume is not None:
             self.events.skip(resume.history)
+        resumed = None if resume is None else self.run.checkpoint(planned.name, resume.iteration)
+        start = None if planned.start is None else self.run.model(planned.start)
+        tell_stage(planned.name, resumed, start, num_restored)
         return fit_stage(
             self.scene,
             planned.system,
             planned.index,
-            None if planned.start is None else load_model(self.run.model(planned.start)),
+            None if start is None else load_model(start),
             resume=resume,
             on_checkpoint=keep,
-            checkpoint_every=max(1, min(LONGEST_WITHOUT_CHECKPOINT, planned.stage.iterations // 10)),
+            checkpoint_every=planned.checkpoint_every,
             progress=self.progress,
             title=planned.name,
             is_stopped=self.is_stopped,

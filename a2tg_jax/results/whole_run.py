@@ -7,6 +7,8 @@ from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
+from a2tg_jax.host.machine import Devices
+from a2tg_jax.host.processes import team
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
@@ -15,6 +17,7 @@ from a2tg_jax.results.replacement import drop_old
 from a2tg_jax.results.run_evaluation import evaluate_run
 from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import RunResult
+from a2tg_jax.results.together import check_alike
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
@@ -96,7 +99,9 @@ def go_on(
 ) -> RunResult:
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
-    with _advised(run, is_replacing=replaced_by is not None):
+    devices = None if session is None else session.devices
+    with _advised(run, devices, is_replacing=replaced_by is not None):
+        check_alike(replaced_by or read_record(run), scene)
         with signals.noted() as is_stopped, watched(scene) as watch:
             train_run(
                 run,
@@ -108,6 +113,8 @@ def go_on(
                 session=session,
                 tensorboard=tensorboard,
             )
+        if (others := team()) is not None:
+            others.leave()
         return measure(run, scene, lpips_weights=lpips_weights)
 
 
@@ -120,20 +127,24 @@ def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path |
 
 
 @contextlib.contextmanager
-def _advised(run: RunFolder, *, is_replacing: bool) -> Iterator[None]:
+def _advised(run: RunFolder, devices: Devices | None, *, is_replacing: bool) -> Iterator[None]:
     """Add to whatever ends the training how to continue it."""
     before = _identity(run.record) if is_replacing else None
 
     def advice() -> str:
         is_untouched = is_replacing and run.record.is_file() and _identity(run.record) == before
-        return f"the run that was in {run.path} is untouched" if is_untouched else how_to_go_on(run)
+        return f"the run that was in {run.path} is untouched" if is_untouched else how_to_go_on(run, devices)
 
+    if (others := team()) is not None:
+        others.advice = advice
     try:
         yield
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
         raise signals.Stopped(number, advice()) from None
     except (ValueError, OSError) as error:
+        if others is not None:
+            others.told(error)
         raise ValueError(f"{error}; {advice()}") from error
 
 
@@ -143,12 +154,12 @@ def _identity(path: Path) -> tuple[int, int]:
     return status.st_ino, status.st_mtime_ns
 
 
-def how_to_go_on(run: RunFolder) -> str:
-    """Return the path of the newest checkpoint, and the command that resumes."""
+def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
+    """Return the path of the newest checkpoint, and the command that resumes, as `resuming_command`."""
     names = read_record(run).plan.names
     checkpoints = [path for name in names for path in run.checkpoints(name)]
     finished = [run.model(name) for name in names if run.model(name).is_file()]
     last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
     if finished and not checkpoints:
         last = f"the last model is {finished[-1]}"
-    return f"{last}; continue with: {resuming_command(run)}"
+    return f"{last}; continue with: {resuming_command(run, devices)}"

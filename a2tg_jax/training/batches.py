@@ -10,6 +10,8 @@ from jax import Array
 
 from a2tg_jax.data.scene import View, kinds_of
 from a2tg_jax.host.cores import num_threads
+from a2tg_jax.rasterize.exchange import Exchange
+from a2tg_jax.rasterize.placement import everywhere, spread_pixels
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -103,14 +105,22 @@ class PhotoStore:
     """Photographs of a stage's iterations. They stay on the device if all of them fit; otherwise threads prepare
     batches ahead of the step. Close it when the stage is over."""
 
-    def __init__(self, views: tuple[View, ...], order: BatchOrder, last: int, room: float | None = None):
+    def __init__(
+        self,
+        views: tuple[View, ...],
+        order: BatchOrder,
+        last: int,
+        exchange: Exchange | None = None,
+        room: float | None = None,
+    ):
         """Args:
         views: of one scene.
         order: views of each iteration.
         last: the stage's last iteration.
+        exchange: devices over which the rows of pixels are spread; None: one.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
-        self._views, self._order, self._last = views, order, last
+        self._views, self._order, self._last, self._exchange = views, order, last, exchange
         plan = plan_batches(views, len(order.indices(1)), room)
         self.is_resident, self.num_ahead = plan.is_resident, plan.num_ahead
         self._kinds = kinds_of(views)
@@ -127,7 +137,7 @@ class PhotoStore:
         if not self.is_resident:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             batch = self._ahead.first({key: self._order.indices(key) for key in following})
-            return batch, np.arange(len(indices), dtype=np.int32)
+            return on_devices(batch, self._exchange), np.arange(len(indices), dtype=np.int32)
         stack, places = self._stack(self._kinds[indices[0]])
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
@@ -135,13 +145,25 @@ class PhotoStore:
         """Return all photographs of a kind on the device, and the place of each view's."""
         if kind not in self._stacks:
             found = [index for index, own in enumerate(self._kinds) if own == kind]
-            stack = jax.device_put(stack_views([self._views[index] for index in found], self._views))
+            stack = on_devices(stack_views([self._views[index] for index in found], self._views), self._exchange)
+            if self._exchange is None:
+                stack = jax.device_put(stack)
             self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[kind]
 
     def close(self) -> None:
         """Ends the threads."""
         self._ahead.close()
+
+
+def on_devices(photographs: Photographs, exchange: Exchange | None) -> Photographs:
+    """Return photographs with their rows of pixels spread over the devices; without an exchange they stay."""
+    if exchange is None:
+        return photographs
+    viewmats, Ks, *pictures = photographs
+    images, alphas, masks = (None if one is None else spread_pixels(exchange, one) for one in pictures)
+    assert images is not None
+    return Photographs(everywhere(exchange, viewmats), everywhere(exchange, Ks), images, alphas, masks)
 
 
 class Ahead:

@@ -12,7 +12,7 @@ import numpy as np
 from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.host.machine import Machine, this_machine
+from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
@@ -116,6 +116,8 @@ class Checkpoint:
     """Number of times the stage went back because it diverged; it decides the order of the views."""
     machine: Machine | None = None
     """Machine on which it was saved; None if unknown or not saved yet."""
+    devices: Devices = ALONE
+    """Devices that trained it; it can go on with others."""
 
     @property
     def iteration(self) -> int:
@@ -158,6 +160,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "is_ahead": [event is not None for event in state.events],
         "num_restored": checkpoint.num_restored,
         "machine": config_to_dict(this_machine()),
+        "devices": config_to_dict(checkpoint.devices),
     }
     shown = model.appearance.arrays(model.params, model.layout)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
@@ -214,7 +217,8 @@ def _checkpoint_of(
     num_restored = header.get("num_restored", 0)
     check_count("num_restored", num_restored, MOST_RESTORED)
     machine = config_from_dict(Machine, header["machine"], "machine") if "machine" in header else None
-    return Checkpoint(options, header["stage"], state, history, num_restored, machine)
+    devices = config_from_dict(Devices, header.get("devices", {}), "devices")
+    return Checkpoint(options, header["stage"], state, history, num_restored, machine, devices)
 
 
 MOST_RESTORED = 2**31 - 1

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from a2tg_jax.core.jit import Jitted
+from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt, attempt
 
@@ -50,7 +51,7 @@ def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
       arguments: of `train_step`, with the state before the step that could not be taken.
       names: of its views.
     """
-    tried: Attempt = _jitted_attempt()(*arguments)
+    tried: Attempt = readable(_jitted_attempt()(*arguments))
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {told}" for told in _not_finite(tried.grads)]

@@ -20,7 +20,8 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.exchange import Exchange, gathered, spread
+from a2tg_jax.rasterize.exchange import Exchange, spread
+from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, readable
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -120,7 +121,7 @@ class StageRun:
         if resume is not None:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
-            check_devices(resume, self.num_devices)
+            warn_of_uneven_rows(resume, self.num_devices)
             self.state: TrainState = spread(self.exchange, jax.tree.map(jnp.array, resume.state))
             self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
@@ -134,7 +135,7 @@ class StageRun:
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
-        self.photographs = PhotoStore(self.views, self.order, self.stage.iterations)
+        self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, self.exchange)
         self.learning = LearningCheck(
             self.views,
             self.order,
@@ -174,7 +175,8 @@ class StageRun:
     @property
     def checkpoint(self) -> Checkpoint:
         """Present state; the next step reuses its buffers."""
-        return Checkpoint(self.system, self.index, self.state, self.history, self.num_restored)
+        state = readable(self.state)
+        return Checkpoint(self.system, self.index, state, self.history, self.num_restored, devices=self.session.devices)
 
     def train(
         self,
@@ -215,7 +217,7 @@ class StageRun:
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
-                is_asked = is_stopped()
+                is_asked = asked_by_any(self.exchange, is_stopped())
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
                 if on_checkpoint is not None and (is_due or is_asked or iteration == end):
                     on_checkpoint(self.checkpoint)
@@ -256,7 +258,8 @@ class StageRun:
     def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
         """Run iterations `first` to `last`. Stop at one that cannot be taken and mend its cause."""
         launched: list[StepInfo] = []
-        while first + len(launched) <= last and not is_stopped():
+        is_common = self.exchange is not None and self.exchange.is_of_processes
+        while first + len(launched) <= last and (is_common or not is_stopped()):
             launched.append(self._launch(first + len(launched)))
         infos = read(launched)
         taken = [info for info in infos if info.status == FINE]
@@ -292,7 +295,8 @@ class StageRun:
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Make more room for the tile lists; raise an error for every other cause."""
-        self.state = dataclasses.replace(self.state, status=jnp.zeros((), jnp.int32))
+        fine = spread(self.exchange, jnp.zeros((), jnp.int32))
+        self.state = dataclasses.replace(self.state, status=fine)
         if info.status == OVERFLOW:
             self.num_regrown += 1
             size = self._size(iteration)
@@ -321,6 +325,7 @@ class StageRun:
     def _log(self, iteration: int, info: StepInfo) -> None:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
             model = self.state.model
+            model = dataclasses.replace(model, layout=readable(model.layout))
             num_bytes = model.bytes_of(int(info.num_live))
             row = (
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
@@ -337,6 +342,7 @@ class StageRun:
             return
         self.state = gathered(self.exchange, self.state)
         self._apply_host_events(iteration)
+        check_same(self.exchange, self.state, f"the events at iteration {iteration} of stage {self.stage.name}")
         self.state = spread(self.exchange, self.state)
 
     def _apply_host_events(self, iteration: int) -> None:
@@ -383,7 +389,7 @@ class StageRun:
 
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
         """Return the exchange with room for the rows that travel in some views once all rows exist."""
-        model, rows = self.state.model, self.state.model.gaussians.num // exchange.num
+        model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
         most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)
         share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
@@ -412,14 +418,15 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         )
 
 
-def check_devices(resume: Checkpoint, num_devices: int) -> None:
-    """Raise ValueError unless the rows of a checkpoint can be spread evenly over so many devices."""
+def warn_of_uneven_rows(resume: Checkpoint, num_devices: int) -> None:
+    """Warn if the rows of a checkpoint cannot be spread evenly over so many devices, which costs memory."""
     rows = resume.state.model.gaussians.num
     if rows % num_devices:
         fitting = [number for number in range(1, num_devices) if rows % number == 0]
-        raise ValueError(
-            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: resume with --devices "
-            f"{' or '.join(map(str, fitting))}"
+        warnings.warn(
+            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: each holds all of "
+            f"them until the stage ends; {' or '.join(map(str, fitting))} could share them",
+            stacklevel=2,
         )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Hashable, Sequence
 
 import jax
 
+from a2tg_jax.host.machine import Devices
 from a2tg_jax.rasterize.exchange import exchange_among
 from a2tg_jax.texture import Shape
 
@@ -22,8 +23,9 @@ class Session:
     def __init__(self, after_compiling: Callable[[], object] = _nothing, devices: Sequence[jax.Device] | None = None):
         """Args:
         after_compiling: called after a step was compiled, such as `host.memory.tidy_memory`.
-        devices: two or more devices of this process that train one scene together, each with a share of the Gaussians
-          and of the pixels, such as `jax.devices()`; None: JAX's default device.
+        devices: two or more devices that train one scene together, each with a share of the Gaussians and of the
+          pixels, such as `jax.devices()`; None: JAX's default device. If they are of several processes, each of these
+          makes the same calls.
 
         Raises:
           ValueError: if there is one device or none.
@@ -34,6 +36,9 @@ class Session:
         self.exchange = None if devices is None else exchange_among(devices)
         """Devices among which rows are spread; None: one."""
         self.num_devices = 1 if self.exchange is None else self.exchange.num
+        processes = 1 if self.exchange is None else self.exchange.num_processes
+        self.devices = Devices(self.num_devices // processes, processes)
+        """Their numbers."""
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
         self.capacities: dict[Hashable, set[int]] = {}

@@ -52,6 +52,11 @@ class Estimate:
     source: str
     """Origin of the time of its steps."""
 
+    @property
+    def seconds(self) -> float:
+        """Seconds of the stage alone."""
+        return self.shared + self.own
+
 
 def plan_of(grids: Sequence[Grid], records: Mapping[str, Record], folders: Folders, machine: Machine) -> str:
     """Return a table of the cells, and estimates of what is left."""
@@ -59,12 +64,24 @@ def plan_of(grids: Sequence[Grid], records: Mapping[str, Record], folders: Folde
     left = [stage for key, stage in stages.items() if key not in records]
     if not left:
         return f"{_cells(grids, records)}\nAll {len(stages)} stages are finished."
-    steps = sum(stage.job.iterations for stage in left)
+    steps, forecaster = sum(stage.job.iterations for stage in left), Forecaster(folders)
+    estimates = [_estimate(stage.job, records, machine, forecaster) for stage in left]
     return (
         f"{_cells(grids, records)}\n"
         f"{len(left)} of {len(stages)} stages are left, {steps:,} iterations; one that several methods share "
-        f"counts once.\n{_time(left, records, folders, machine)}\n{_room(left, folders, machine)}"
+        f"counts once.\n\n{told_jobs(left, estimates)}\n{_time(estimates, machine)}\n"
+        f"{_room(left, folders, machine)}"
     )
+
+
+def told_jobs(left: Sequence[Stage], estimates: Sequence[Estimate]) -> str:
+    """Return a row for each stage that is left, with its hours and memory as a job of its own."""
+    rows = [
+        [str(stage), f"{one.seconds / 3600:.2g}", in_bytes(estimated_bytes(stage.job))]
+        for stage, one in zip(left, estimates, strict=True)
+    ]
+    more = f"… and {len(rows) - MOST_ROWS} more stages\n" if len(rows) > MOST_ROWS else ""
+    return table(["stage, a job on a cluster", "hours", "memory"], rows[:MOST_ROWS]) + more
 
 
 def _cells(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
@@ -86,9 +103,7 @@ def _told_left(labels: Sequence[str], num: int) -> str:
     return "all" if len(labels) == num > 1 else "; ".join(labels)
 
 
-def _time(left: Sequence[Stage], records: Mapping[str, Record], folders: Folders, machine: Machine) -> str:
-    forecaster = Forecaster(folders)
-    found = [_estimate(stage.job, records, machine, forecaster) for stage in left]
+def _time(found: Sequence[Estimate], machine: Machine) -> str:
     seconds = sum(one.shared for one in found) + sum(one.own for one in found) / machine.jobs
     sources = " and ".join(dict.fromkeys(one.source for one in found))
     compiling = "" if machine.has_gpu else ", with compilation"

@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import time
@@ -21,9 +22,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
+from a2tg_jax.host.text import shortened
 from lab.jobs import Folders, Job, Record, model_bytes, run_job
 
 POLL_SECONDS = 0.5
+LONGEST_REASON = 400
+"""Largest number of characters of the reason of a failure."""
 BASE_BYTES = 4.0e9
 """Bytes of a process that trains: libraries, a small scene, and the compiled programs of a hundred jobs."""
 COPIES = 12
@@ -175,7 +179,7 @@ class SubmititPool:
         self._sent: list[Any] = []
 
     def submit(self, job: Job, folders: Folders) -> Handle:
-        self._sent.append(self._executor.submit(_run_elsewhere, job, folders))
+        self._sent.append(self._executor.submit(Elsewhere(), job, folders))
         return self._sent[-1]
 
     def is_death(self, error: Exception) -> bool:
@@ -191,11 +195,35 @@ class SubmititPool:
                 handle.cancel()
 
 
-def _run_elsewhere(job: Job, folders: Folders) -> Record:
-    import a2tg_jax
+class Elsewhere:
+    """Call of submitit's that runs a job; if it is preempted or out of time it is queued again, and continues."""
 
-    a2tg_jax.configure_cpu()
-    return run_job(job, folders)
+    def __call__(self, job: Job, folders: Folders) -> Record:
+        import a2tg_jax
+
+        a2tg_jax.configure_cpu()
+        return run_job(job, folders)
+
+    def checkpoint(self, job: Job, folders: Folders) -> Any:
+        """Return what is queued in place of this call: the same, since a job finds its own newest checkpoint."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, job, folders)
+
+
+def told_error(error: Exception) -> str:
+    """Return an error on one line; of a trace that submitit quotes, the line of its error."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [""]
+    quoted = [line for line in lines if re.match(r"[A-Za-z_][\w.]*(Error|Exception|Interrupt|Exit)\b", line)]
+    if len(lines) > 1 and quoted:
+        return shortened(quoted[-1], LONGEST_REASON)
+    return shortened(f"{type(error).__name__}: {' '.join(lines)}", LONGEST_REASON)
+
+
+def told_log(handle: Handle) -> str:
+    """Return where the log of a job lies, if it has one."""
+    paths = getattr(handle, "paths", None)
+    return f"; log: {paths.stderr}" if paths is not None else ""
 
 
 def run_all(
@@ -247,9 +275,10 @@ def run_all(
                 record = handle.result()
             except Exception as error:
                 if not pool.is_death(error):
-                    fail(job, f"{type(error).__name__}: {error}")
+                    fail(job, f"{told_error(error)}{told_log(handle)}")
                 elif deaths[key] and was_alone:
-                    fail(job, f"its process died twice, the second time with nothing beside it; of memory? {error}")
+                    twice = "its process died twice, the second time with nothing beside it; of memory?"
+                    fail(job, f"{twice} {told_error(error)}{told_log(handle)}")
                 else:
                     deaths[key] += 1
             else:

@@ -1,0 +1,63 @@
+"""Arrays on the devices of an exchange and back (host): in one process, or in several that make the same calls."""
+
+import zlib
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from jax.experimental import multihost_utils
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from a2tg_jax.rasterize.exchange import Exchange, placed
+
+
+def spread_pixels(exchange: Exchange, pictures: Array) -> Array:
+    """Return pictures [V, H, ...] with their rows of pixels spread over the devices, if D divides H (host)."""
+    return placed(pictures, exchange.sharding_of(pictures.shape, axis=1))
+
+
+def everywhere(exchange: Exchange, x: Array) -> Array:
+    """Return an array that every device has whole (host)."""
+    return placed(x, NamedSharding(exchange.mesh, P()))
+
+
+def gathered(exchange: Exchange | None, tree: Any) -> Any:
+    """Return arrays on the first of this process's devices; without an exchange they stay (host).
+
+    If the devices are of several processes, all of these must call it.
+    """
+    return tree if exchange is None else jax.device_put(readable(tree), exchange.mesh.local_mesh.devices.flat[0])
+
+
+def readable(tree: Any) -> Any:
+    """Return arrays that this process can read: those that lie on other processes' devices too are gathered (host).
+
+    All processes must call it.
+    """
+
+    def of_leaf(x: Any) -> Any:
+        if not isinstance(x, jax.Array) or x.is_fully_addressable:
+            return x
+        return np.asarray(x) if x.is_fully_replicated else multihost_utils.process_allgather(x, tiled=True)
+
+    return jax.tree.map(of_leaf, tree)
+
+
+def asked_by_any(exchange: Exchange | None, is_asked: bool) -> bool:
+    """Return whether any of the processes asks for something (host); all of them call it."""
+    if exchange is None or not exchange.is_of_processes:
+        return is_asked
+    return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
+
+
+def check_same(exchange: Exchange | None, tree: Any, what: str) -> None:
+    """Raise ValueError unless all processes have the same arrays (host); all of them call it."""
+    if exchange is None or not exchange.is_of_processes:
+        return
+    digest = 0
+    for leaf in map(np.asarray, jax.tree.leaves(tree)):
+        digest = zlib.crc32(leaf.tobytes(), zlib.crc32(repr(leaf.shape).encode(), digest))
+    if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
+        raise ValueError(f"the processes differ after {what}: train on machines that are alike")

@@ -1,0 +1,178 @@
+"""Trains on several processes of this machine and compares with one; kills and stops processes of trainings.
+
+python tests/on_processes.py --processes 4           longer than `test_processes`, with more systems
+python tests/on_processes.py --losses                a process of a training is killed or stopped in every way
+
+`test_processes` calls it with the number of one process, which it then is.
+"""
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from on_devices import scene, system
+
+import a2tg_jax as a2tg
+from a2tg_jax.host.processes import LOST, Place, joined
+from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.training import Session, loop
+
+SYSTEMS = {
+    "a2tg": lambda length: system(
+        a2tg.A2tg,
+        densify={"cap": 120},
+        texture={"upscale_at": (0.5,)},
+        stage1_iterations=length,
+        stage2_iterations=length,
+    ),
+    "mcmc": lambda length: system(Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length),
+}
+RUN = ("synthetic", "--preset", "smoke", "--downscale", "4", "--stage1-iterations", "20000", "--densify.cap", "60")
+
+
+def free_port():
+    """A port that nothing listens on."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+def pair(arguments, count=2):
+    """Processes that run this script with some arguments and the place of each."""
+    place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", str(count), "--process-id"]
+    return [started([__file__, *arguments, *place, str(number)]) for number in range(count)]
+
+
+def started(arguments):
+    command = [sys.executable, *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended(processes, timeout=600):
+    """What processes write to stderr, once they have ended well; they are killed after some seconds."""
+    try:
+        told = [process.communicate(timeout=timeout)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert all(process.returncode == 0 for process in processes), "\n".join(told)[-5000:]
+    return told
+
+
+def fit(own, path, session, **options):
+    """The result, and Adam's first moments after the first step, which are a tenth of its gradients."""
+    first = []
+
+    def keep(checkpoint):
+        if checkpoint.stage == 0 and checkpoint.iteration == 1:
+            first.append(jax.tree.map(np.array, checkpoint.state.moments.mu))
+        if checkpoint.iteration == own.stages()[checkpoint.stage].iterations // 2 and path is not None:
+            a2tg.save_checkpoint(path, checkpoint)
+
+    result = a2tg.fit(scene(), own, progress=False, session=session, on_checkpoint=keep, checkpoint_every=1, **options)
+    return result, first
+
+
+def train(place, name, length, folder):
+    """Train together, then on the first process alone, from the start and from the common checkpoint."""
+    loop.LOG_EVERY = 1
+    own = SYSTEMS[name](length)
+    with joined(place) as team:
+        path = Path(folder) / "checkpoint.npz" if team.is_first else None
+        together, first = fit(own, path, Session(devices=jax.devices()))
+    if not team.is_first:
+        return
+    alone, expected = fit(own, None, None)
+    np.testing.assert_allclose(together.history.loss[0], alone.history.loss[0], rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(first), strict=True):
+        np.testing.assert_allclose(b, a, rtol=0, atol=1e-5 * max(np.abs(a).max(), 1e-9))
+    assert together.model.num_bytes == alone.model.num_bytes
+    checkpoint = a2tg.load_checkpoint(path)
+    assert checkpoint.devices.processes == team.count
+    resumed, _ = fit(own, None, None, resume=checkpoint)
+    end, *others = (float(np.mean(result.history.psnr[-4:])) for result in (alone, together, resumed))
+    assert all(abs(other - end) < 0.02 for other in others)
+    print(f"{name}: {end:.3f} dB alone, {others[0]:.3f} by {team.count} processes", file=sys.stderr)
+
+
+def wait(place):
+    """Meet the other processes for ever."""
+    with joined(place) as team:
+        team.advice = lambda: "go on"
+        while True:
+            multihost_utils.process_allgather(np.zeros(1))
+            print("met", flush=True)
+            time.sleep(0.02)
+
+
+def losses(seconds=8.0):
+    """A process of a training is killed or stopped: the other one ends in time, and the checkpoint can be read."""
+    for victim in (0, 1):
+        for number in (signal.SIGKILL, signal.SIGSTOP):
+            with tempfile.TemporaryDirectory() as folder:
+                print(victim, number.name, *_lost_in_training(victim, number, seconds, Path(folder) / "run"))
+
+
+def _lost_in_training(victim, number, seconds, out):
+    place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2"]
+    words = ["-m", "a2tg_jax.cli", "train", *RUN, "--out", str(out), "--heartbeat-timeout-seconds", str(seconds)]
+    processes = [started([*words, *place, "--process-id", str(index)]) for index in range(2)]
+    while not list(out.glob("checkpoints/*.npz")):
+        assert all(process.poll() is None for process in processes)
+        time.sleep(0.1)
+    at = time.perf_counter()
+    took, told = survivor_of(processes, victim, number, 5 * seconds)
+    checkpoint = a2tg.load_checkpoint(sorted(out.glob("checkpoints/*.npz"))[-1])
+    assert time.perf_counter() - at < 3 * seconds
+    return took, told.splitlines()[-1], checkpoint
+
+
+def survivor_of(processes, victim, number, timeout):
+    """Seconds until the other process has ended, and what it wrote to stderr."""
+    os.kill(processes[victim].pid, number)
+    at = time.perf_counter()
+    told = processes[1 - victim].communicate(timeout=timeout)[1]
+    took = time.perf_counter() - at
+    processes[victim].kill()
+    processes[victim].communicate()
+    assert processes[1 - victim].returncode == LOST, told
+    return took, told
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    add = parser.add_argument
+    add("--what", default="train")
+    add("--system", default="a2tg")
+    add("--length", type=int, default=120)
+    add("--folder")
+    add("--seconds", type=float, default=60.0)
+    add("--processes", type=int, default=4)
+    add("--losses", action="store_true")
+    add("--coordinator")
+    add("--num-processes", type=int)
+    add("--process-id", type=int)
+    args = parser.parse_args()
+    if args.coordinator is not None:
+        place = Place(args.coordinator, args.num_processes, args.process_id, args.seconds)
+        wait(place) if args.what == "wait" else train(place, args.system, args.length, args.folder)
+    elif args.losses:
+        losses()
+    else:
+        for name in SYSTEMS:
+            with tempfile.TemporaryDirectory() as folder:
+                arguments = ["--system", name, "--length", str(args.length), "--folder", folder]
+                print(ended(pair(arguments, args.processes), 3600)[0])
+
+
+if __name__ == "__main__":
+    main()

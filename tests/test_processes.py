@@ -1,0 +1,139 @@
+"""Several processes that train together: those of this machine (`on_processes`), and connections without a training."""
+
+import signal
+import threading
+import time
+from multiprocessing import AuthenticationError
+
+import pytest
+from on_processes import ended, free_port, pair, started, survivor_of
+
+from a2tg_jax.cli import main as cli
+from a2tg_jax.host import liveness
+from a2tg_jax.host.liveness import Liveness, accept, connect, listen
+from a2tg_jax.host.machine import Devices
+from a2tg_jax.host.processes import LOST
+from a2tg_jax.io.archive import write_archive
+from a2tg_jax.results.folder import RunFolder, resuming_command
+
+SECONDS = 0.3
+
+
+def test_two_processes_train_as_one(tmp_path):
+    told = ended(pair(["--length", "8", "--folder", str(tmp_path)]))
+    assert "by 2 processes" in told[0] and told[1] == ""
+
+
+@pytest.mark.parametrize(("victim", "number"), [(0, signal.SIGKILL), (1, signal.SIGSTOP)])
+def test_a_lost_process_is_noticed(victim, number):
+    processes = pair(["--what", "wait", "--seconds", "2"])
+    for process in processes:
+        if process.stdout.readline() != "met\n":
+            pytest.fail(str(ended(processes, 10)))
+    took, told = survivor_of(processes, victim, number, 60)
+    reason = "has ended" if number == signal.SIGKILL else "was not heard from for 2 s"
+    assert told == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8
+
+
+def test_a_process_that_does_not_come_is_told():
+    place = f"p.Place('127.0.0.1:{free_port()}', 2, 0, 60.0)"
+    code = f"from a2tg_jax.host import processes as p; p.JOIN_SECONDS = 1; p.joined({place}).__enter__()"
+    alone = started(["-c", code])
+    told = alone.communicate(timeout=120)[1]
+    assert alone.returncode == LOST and "not all processes have joined --coordinator 127.0.0.1:" in told
+
+
+@pytest.fixture
+def three(monkeypatch):
+    """The connections of three processes, and what ends each of them."""
+    monkeypatch.setattr(liveness, "GRACE", 0.0)
+    listener, port, key = listen()
+    found = {}
+    accepting = threading.Thread(target=lambda: found.update(accept(listener, 3)))
+    accepting.start()
+    with pytest.raises((AuthenticationError, EOFError, OSError)):
+        connect("127.0.0.1", port, b"a stranger's", 1)
+    others = [connect("127.0.0.1", port, key, number) for number in (1, 2)]
+    accepting.join(10)
+    return [found, *others], [[], [], []]
+
+
+def watched(three, numbers):
+    connections, ends = three
+    return [Liveness(connections[number], 3, SECONDS, ends[number].append) for number in numbers]
+
+
+def until(is_so):
+    limit = time.perf_counter() + 10
+    while not is_so():
+        assert time.perf_counter() < limit
+        time.sleep(0.01)
+
+
+def test_a_silent_process_is_told_to_all(three):
+    watched(three, (0, 1))
+    ends = three[1]
+    until(lambda: ends[0] and ends[1])
+    assert ends[0] == ends[1] == [f"process 2 of 3 was not heard from for {SECONDS} s"]
+
+
+def test_processes_that_live_are_left_alone(three):
+    everyone = watched(three, (0, 1, 2))
+    time.sleep(3 * SECONDS)
+    for one in everyone:
+        one.leave()
+    for connections in three[0]:
+        for connection in connections.values():
+            connection.close()
+    time.sleep(SECONDS)
+    assert three[1] == [[], [], []]
+
+
+def test_processes_that_are_interrupted_together_end_by_themselves(three, monkeypatch):
+    monkeypatch.setattr(liveness, "INTERRUPTED_GRACE", SECONDS)
+    everyone, ends = watched(three, (0, 1, 2)), three[1]
+    everyone[1].interrupt()
+    everyone[0].interrupt()
+    until(lambda: ends[2])
+    assert ends == [[], [], ["process 0 of 3 was interrupted"]]
+
+
+@pytest.mark.parametrize("reason", ["no scene", ""])
+def test_errors_of_one_process_end_the_others(three, reason):
+    everyone, ends = watched(three, (0, 1, 2)), three[1]
+    if reason:
+        everyone[2].fail(reason)
+        until(lambda: ends[0] and ends[1])
+        assert ends[0] == ends[1] == ["process 2 of 3 failed: no scene"]
+    else:
+        everyone[0].quit()
+        until(lambda: ends[1] and ends[2])
+        assert ends[1] == ends[2] == [""]
+
+
+def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
+    run, path = RunFolder(tmp_path), tmp_path / "checkpoints" / "a2tg-gaussians-0000000001.npz"
+    assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume"
+    path.parent.mkdir()
+    path.write_bytes(b"damaged")
+    assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume"
+    write_archive(path, {"devices": {"each": 4, "processes": 1}}, {})
+    assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume --devices 4"
+    by_two = "--devices 1 --coordinator HOST:PORT --num-processes 2 --process-id I"
+    assert resuming_command(run, Devices(1, 2)) == f"a2tg train --out {tmp_path} --resume {by_two}"
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        ("--num-processes 2", "--num-processes wants --coordinator HOST:PORT"),
+        ("--coordinator h:1 --process-id 0", "--coordinator HOST:PORT also wants --num-processes"),
+        ("--coordinator h --num-processes 2 --process-id 0", "--coordinator must be HOST:PORT or auto; got 'h'"),
+        ("--coordinator h:1 --num-processes 2 --process-id 2", "--process-id must be from 0 to 1"),
+        ("--coordinator auto --view", "--view shows the training of one process"),
+        ("--coordinator auto --heartbeat-timeout-seconds 0", "--heartbeat-timeout-seconds must be positive; got 0"),
+    ],
+)
+def test_wrong_places_are_told(tmp_path, capsys, flags, told):
+    assert cli.main(["train", "synthetic", "--out", str(tmp_path / "run"), *flags.split()]) == 2
+    assert told in capsys.readouterr().err
