@@ -1,5 +1,6 @@
 """Batches of views: the order of a training, and photographs on their way to the device."""
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
@@ -160,10 +161,15 @@ def on_devices(photographs: Photographs, exchange: Exchange | None) -> Photograp
     """Return photographs with their rows of pixels spread over the devices; without an exchange they stay."""
     if exchange is None:
         return photographs
-    viewmats, Ks, *pictures = photographs
-    images, alphas, masks = (None if one is None else spread_pixels(exchange, one) for one in pictures)
-    assert images is not None
-    return Photographs(everywhere(exchange, viewmats), everywhere(exchange, Ks), images, alphas, masks)
+    on_all, in_rows = (functools.partial(place, exchange) for place in (everywhere, spread_pixels))
+    return Photographs(
+        viewmats=on_all(photographs.viewmats),
+        Ks=on_all(photographs.Ks),
+        images=in_rows(photographs.images),
+        alphas=None if photographs.alphas is None else in_rows(photographs.alphas),
+        masks=None if photographs.masks is None else in_rows(photographs.masks),
+        rays=photographs.rays,
+    )
 
 
 class Ahead:
