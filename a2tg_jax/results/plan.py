@@ -11,7 +11,7 @@ from a2tg_jax.core.jit import classes_of
 from a2tg_jax.training import Stage, System
 
 PACKAGE = "a2tg_jax"
-STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "floaters")
 """Options of every system that reach training only through its stages."""
 
 

@@ -1,6 +1,7 @@
 """Batches of views: the order of a training, and photographs on their way to the device."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ ROOM_AHEAD = 2**28
 MOST_AHEAD = 10
 """Largest number of prepared batches."""
 
+BYTES_PER_DEPTH = 4
 ALIGNMENT = 64
 """Alignment in bytes of memory that XLA adopts."""
 
@@ -36,6 +38,8 @@ class Photographs(NamedTuple):
     """[V, H, W] uint8, or None if the images are opaque."""
     masks: Array | None = None
     """[V, H, W] bool, True at pixels that count; None if all do."""
+    depths: Array | None = None
+    """[V, H, W] float32 depth maps, NaN where unknown; None unless asked for."""
 
 
 class BatchOrder:
@@ -84,10 +88,13 @@ class BatchPlan(NamedTuple):
     """Number of batches prepared ahead, if the photographs do not all stay on the device."""
 
 
-def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None) -> BatchPlan:
+def plan_batches(
+    views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
+) -> BatchPlan:
     """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
-    fits = sum(view.picture.nbytes for view in views) <= (device_room() if room is None else room)
-    batch_bytes = batch_size * max(view.picture.nbytes for view in views)
+    sizes = [view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size) for view in views]
+    fits = sum(sizes) <= (device_room() if room is None else room)
+    batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
     return BatchPlan(fits and all(view.picture.is_held for view in views), batch_bytes, num_ahead)
 
@@ -96,18 +103,26 @@ class PhotoStore:
     """Photographs of a stage's iterations. They stay on the device if all of them fit; otherwise threads prepare
     batches ahead of the step. Close it when the stage is over."""
 
-    def __init__(self, views: tuple[View, ...], order: BatchOrder, last: int, room: float | None = None):
+    def __init__(
+        self,
+        views: tuple[View, ...],
+        order: BatchOrder,
+        last: int,
+        room: float | None = None,
+        has_depths: bool = False,
+    ):
         """Args:
         views: of one scene.
         order: views of each iteration.
         last: the stage's last iteration.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
+        has_depths: whether their depth maps come along.
         """
-        self._views, self._order, self._last = views, order, last
-        plan = plan_batches(views, len(order.indices(1)), room)
+        self._views, self._order, self._last, self._has_depths = views, order, last, has_depths
+        plan = plan_batches(views, len(order.indices(1)), room, has_depths)
         self.is_resident, self.num_ahead = plan.is_resident, plan.num_ahead
         self._stacks: dict[tuple[int, int], tuple[Photographs, dict[int, int]]] = {}
-        self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices], views), self.num_ahead)
+        self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
         """Return photographs of one size that include those of an iteration, and their int32 indices among them.
@@ -127,9 +142,12 @@ class PhotoStore:
         """Return all photographs of a size on the device, and the place of each view's."""
         if size not in self._stacks:
             found = [index for index, view in enumerate(self._views) if view.picture.size == size]
-            stack = jax.device_put(stack_views([self._views[index] for index in found]))
+            stack = jax.device_put(self._stacked(found))
             self._stacks[size] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[size]
+
+    def _stacked(self, indices: Sequence[int], among: tuple[View, ...] | None = None) -> Photographs:
+        return stack_views([self._views[index] for index in indices], among, has_depths=self._has_depths)
 
     def close(self) -> None:
         """Ends the threads."""
@@ -178,6 +196,11 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
                 f"got {list(view.mask.shape)}"
             )
+        if view.depth is not None and view.depth.shape != (height, width):
+            raise ValueError(
+                f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
+                f"got {list(view.depth.shape)}"
+            )
 
 
 def device_room() -> float:
@@ -186,13 +209,14 @@ def device_room() -> float:
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 
 
-def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Photographs:
+def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False) -> Photographs:
     """Return views of one image size, stacked on the host.
 
     Args:
       views: those to stack.
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them. None: `views`.
+      has_depths: whether depth maps come along; NaN where a view has none.
     """
     alike = [view for view in among or views if view.picture.size == views[0].picture.size]
     pixels = [view.picture.read() for view in views]
@@ -210,7 +234,13 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Pho
         images=_stacked([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
         alphas=alphas,  # type: ignore[arg-type]
         masks=masks,  # type: ignore[arg-type]
+        depths=_stacked([_depth(view) for view in views]) if has_depths else None,  # type: ignore[arg-type]
     )
+
+
+def _depth(view: View) -> np.ndarray:
+    """Return the depth map of a view [H, W] float32, NaN without one."""
+    return np.full(view.picture.size, np.nan, np.float32) if view.depth is None else view.depth.read()
 
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:

@@ -92,6 +92,11 @@ class Stage:
         wanted = {event.statistic for event in self.events} - {None}
         return next(iter(wanted), None)
 
+    @property
+    def has_depths(self) -> bool:
+        """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
+        return any(getattr(term, "has_depths", False) for term in self.losses)
+
     def is_ahead(self, event: Event) -> bool:
         """Return whether an event happens at all (host)."""
         return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
