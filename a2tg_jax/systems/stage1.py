@@ -124,7 +124,7 @@ def later_stage(
         name=name,
         appearance=appearance,
         events=events,
-        losses=system.loss.terms(),
+        losses=system.loss.terms(is_first=False),
         rates=system.rates,
         iterations=iterations,
         params_rate=params_rate,

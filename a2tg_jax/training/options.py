@@ -49,8 +49,12 @@ class LossConfig:
     depth_kind: DepthKind = "inverse"
     """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
 
-    def terms(self) -> tuple[LossTerm, ...]:
-        """Return the loss terms whose weight is not 0."""
+    def terms(self, is_first: bool = True) -> tuple[LossTerm, ...]:
+        """Return the loss terms whose weight is not 0.
+
+        Args:
+          is_first: whether they are of the first stage, in whose beginning robust_share leaves out nothing.
+        """
         optional: tuple[Term | DepthPrior, ...] = (
             Term(normals, self.normal_weight, has_geometry=True),
             Term(distortion, self.distortion_weight, has_geometry=True),
@@ -58,11 +62,12 @@ class LossConfig:
             Term(scale, self.scale_weight),
             DepthPrior(self.depth_weight, self.depth_kind),
         )
-        return (self._photometric(), *(term for term in optional if term.weight))
+        return (self._photometric(is_first), *(term for term in optional if term.weight))
 
-    def _photometric(self) -> LossTerm:
+    def _photometric(self, is_first: bool) -> LossTerm:
         if self.robust_share:
-            return RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor)
+            start = RobustPhotometric.start if is_first else 0.0
+            return RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start)
         return Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
 
 

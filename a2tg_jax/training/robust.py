@@ -15,10 +15,10 @@ from a2tg_jax.render import RenderOutput
 from a2tg_jax.training.losses import photometric_loss
 from a2tg_jax.training.terms import Target
 
-PATCHES = 40
+PATCHES = 32
 """Number of patches along the shorter side of a photograph."""
 REACH = 1
-"""Number of patches around one that are left out with it, and over which the residual is averaged."""
+"""Number of patches around one over which the residual is averaged."""
 
 
 @event
@@ -26,17 +26,19 @@ class RobustPhotometric:
     """The photometric loss over inliers: patches without an outlying residual (`inliers`)."""
 
     ssim_weight: float = 0.2
-    share: float = 0.2
+    share: float = 0.3
     """Largest share of a photograph that is left out."""
     factor: float = 4.0
     """Least residual of what is left out, as a multiple of the photograph's median."""
+    start: float = 0.25
+    """Share of the stage after which something is left out; before, much is outlying that is not learned yet."""
 
     has_geometry = False
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)
-        counts = inliers(residual, self.share, self.factor, target.mask)[..., None]
-        color, image = (jnp.where(counts, x, jnp.zeros_like(x)) for x in (output.color, target.image))
+        counts = inliers(residual, self.share, self.factor, target.mask) | (target.progress < self.start)
+        color, image = (jnp.where(counts[..., None], x, jnp.zeros_like(x)) for x in (output.color, target.image))
         return photometric_loss(color, image, ssim_weight=self.ssim_weight)
 
 
@@ -44,8 +46,7 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
     """Return [H, W] bool, False at pixels of patches with an outlying residual; no gradient goes through it.
 
     The residual of a patch is the mean over the patch and its neighbours. It is outlying if it is larger than the
-    quantile 1 − `share` of all patches and than `factor` times their median. The neighbours of outlying patches are
-    left out too.
+    quantile 1 − `share` of all patches and than `factor` times their median.
 
     Args:
       residual: [H, W] not negative.
@@ -59,16 +60,16 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
     sums, nums = (_around(_patch_sums(x, side)) for x in (jax.lax.stop_gradient(residual) * counts, counts))
     patches = jnp.where(nums > 0, sums / jnp.maximum(nums, 1), jnp.nan)
     middle, high = jnp.nanquantile(patches, jnp.stack([jnp.asarray(0.5), 1 - jnp.asarray(share)]))
-    is_outlying = patches > jnp.maximum(high, factor * middle)
-    is_left_out = _around(is_outlying.astype(residual.dtype)) > 0
-    found = jnp.repeat(jnp.repeat(~is_left_out, side, axis=0), side, axis=1)
+    is_fine = ~(patches > jnp.maximum(high, factor * middle))
+    found = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
     return found[:height, :width]
 
 
 def _patch_sums(image: Array, side: int) -> Array:
     """Return the sums over square patches; those at the right and lower edges may be cut off."""
     zero = jnp.zeros((), image.dtype)
-    return jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), _padding(image, side))
+    sums: Array = jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), _padding(image, side))
+    return sums
 
 
 def _padding(image: Array, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -79,4 +80,6 @@ def _around(patches: Array) -> Array:
     """Return the sums over each patch and its neighbours."""
     side = 2 * REACH + 1
     zero = jnp.zeros((), patches.dtype)
-    return jax.lax.reduce_window(patches, zero, jax.lax.add, (side, side), (1, 1), ((REACH, REACH), (REACH, REACH)))
+    reach = (REACH, REACH), (REACH, REACH)
+    sums: Array = jax.lax.reduce_window(patches, zero, jax.lax.add, (side, side), (1, 1), reach)
+    return sums

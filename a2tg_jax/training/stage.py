@@ -151,6 +151,10 @@ class Clock(NamedTuple):
     largest_loss: float = math.inf
     """Largest loss; the step is not taken beyond it."""
 
+    def progress(self, iteration: Array) -> Array:
+        """Return the share of the stage that so many finished iterations are; traced."""
+        return jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)
+
 
 def _times(event: Event, num_iterations: int) -> Times | None:
     if not isinstance(event, StepEvent):

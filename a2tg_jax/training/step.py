@@ -170,7 +170,7 @@ def attempt(
     found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration, own)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
-    progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
+    progress = clock.progress(state.iteration)
     decay = jnp.exp(clock.log_decay * progress)
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
     step = _optimized(stage, state, grads, rate)
@@ -228,7 +228,7 @@ def _gradients(
         photograph = _black_outside(mask, _over(image, alpha, background))
 
         def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
-            target = Target(seen.camera, photograph, background, mask, depth)
+            target = Target(seen.camera, photograph, background, mask, depth, clock.progress(iteration - 1))
             color = corrected_color(seen.corrections, seen.rows, output.color)
             output = output._replace(color=_black_outside(mask, color))
             terms = [term(shown, target, output) for term in stage.losses]

@@ -28,6 +28,8 @@ class Target(NamedTuple):
     """[H, W] bool, True at pixels that count; None: all. Excluded pixels of photograph and render are black."""
     depth: Array | None = None
     """[H, W] depth map as given, NaN where unknown; None unless a term of the stage has `has_depths`."""
+    progress: Array | float = 1.0
+    """Share of the stage that is done."""
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
