@@ -149,7 +149,7 @@ def _weights(
         color, back = jax.vjp(draw, nothing)
         (weights,) = back(jnp.broadcast_to(weight, color.shape))
         total, num = found
-        return (total + weights[:, 0], num + (weights[:, 0] >= least)), None
+        return (total + weights[:, 0], num + (weights[:, 0] >= least).astype(num.dtype)), None
 
     none = jnp.zeros(len(nothing), jnp.int32)
     return jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))[0]
