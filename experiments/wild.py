@@ -72,8 +72,8 @@ def with_ellipses(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def processed() -> a2tg.Scene:
-    """Return the capture with a vignette of random strength in each training photograph, and shadows that a local tone
-    mapping lifts in one half of it."""
+    """Return the capture with corners of each training photograph made darker or brighter, and shadows lifted or
+    lowered on one side of it; on average over the photographs, nothing is changed."""
     rng = np.random.default_rng(0)
     return painted(whole(), lambda index, image: tone_mapped(image, rng))
 
@@ -82,7 +82,7 @@ def tone_mapped(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return an image [H, W, 3] uint8 with a vignette, and a gamma that changes from one side to the other."""
     height, width = image.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
-    direction, strength, gamma = rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.35), rng.uniform(0.6, 1.5)
+    direction, strength, gamma = rng.uniform(0, 2 * np.pi), rng.uniform(-0.25, 0.25), np.exp(rng.uniform(-0.4, 0.4))
     side = np.clip(0.5 + 0.5 * (x * np.cos(direction) + y * np.sin(direction)), 0, 1)
     exponent = (1 + (gamma - 1) * side)[..., None]
     mapped = (image / 255) ** exponent * (1 - strength * (x * x + y * y))[..., None]

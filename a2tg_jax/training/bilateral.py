@@ -21,13 +21,13 @@ LUMINANCE = (0.299, 0.587, 0.114)
 class BilateralGrid(Correction):
     """An affine map of colours per view, position and luminance, [L, Gy, Gx, 3, 4]; see `sliced`.
 
-    For each luminance, the maps are the identity on average over views and positions: a change shared by all views
-    would only shift the model. What all views share and varies with the position, such as a vignette, is learned.
+    Each node is on average over the views the identity. Cameras look at one subject, so that a change which all views
+    share, even one that varies over the picture, would shift the model.
     """
 
-    size: tuple[int, int, int] = static(default=(16, 16, 8))
+    size: tuple[int, int, int] = static(default=(4, 4, 4))
     """Numbers (Gx, Gy, L) of nodes along x, along y, and of luminances."""
-    rate: float = 2e-3
+    rate: float = 5e-3
     final_factor: float = 0.1
     """Factor of the rate at the end of a stage."""
     smoothness: float = 10.0
@@ -50,8 +50,7 @@ class BilateralGrid(Correction):
         return self.smoothness * total_variation(row)
 
     def project(self, rows: Array) -> Array:
-        shared = jnp.mean(rows, axis=(0, 2, 3), keepdims=True)
-        return rows - shared + jnp.eye(3, 4, dtype=rows.dtype)[None, None, None, None]
+        return rows - jnp.mean(rows, axis=0, keepdims=True) + jnp.asarray(self.neutral, rows.dtype)[None]
 
 
 def sliced(grid: Array, color: Array) -> Array:

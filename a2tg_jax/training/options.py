@@ -76,10 +76,12 @@ class CorrectionConfig:
     """What `exposure` and `refine_poses` learn, and how fast."""
 
     exposure_kind: Literal["affine", "grid"] = "affine"
-    """Exposure of a photograph: an affine map of its colours, or a bilateral grid of such maps, which also follows
-    vignettes and local tone mapping."""
+    """Exposure of a photograph: an affine map of its colours, or in addition a bilateral grid of such maps, which
+    follows vignettes and local tone mapping."""
     exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
+    grid_size: tuple[int, int, int] = BilateralGrid.size
+    """Numbers of nodes of a bilateral grid along x, along y, and of luminances."""
     grid_rate: float = BilateralGrid.rate
     """Adam's learning rate of the bilateral grids."""
     grid_smoothness: float = BilateralGrid.smoothness
@@ -208,11 +210,10 @@ class System:
         poses = (PoseRefinement(rate=rates.pose_rate * start, final_factor=end),) if self.refine_poses else ()
         if not self.exposure:
             return poses
-        if rates.exposure_kind == "grid":
-            return *poses, BilateralGrid(
-                rate=rates.grid_rate * start, final_factor=end, smoothness=rates.grid_smoothness
-            )
-        return *poses, Exposure(rate=rates.exposure_rate * start, final_factor=end)
+        affine = Exposure(rate=rates.exposure_rate * start, final_factor=end)
+        if rates.exposure_kind == "affine":
+            return *poses, affine
+        return *poses, affine, BilateralGrid(rates.grid_size, rates.grid_rate * start, end, rates.grid_smoothness)
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages, in the order of training.
@@ -330,7 +331,7 @@ class System:
             if not all(math.isfinite(number) for number in held if isinstance(number, float)):
                 wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
                 raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
-            is_rate = name.startswith(("rates.", "loss.", "corrections.")) and not isinstance(value, str)
+            is_rate = name.startswith(("rates.", "loss.", "corrections.")) and isinstance(value, float | int)
             if is_rate and value < 0:
                 raise ValueError(f"{name} must be at least 0; got {value}")
         for name, (least, most) in {**RANGES, **self.ranges}.items():
@@ -341,6 +342,10 @@ class System:
             raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
         if self.rates.means_final_factor == 0:
             raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
+        if len(self.corrections.grid_size) != 3 or min(self.corrections.grid_size) < 1:
+            raise ValueError(
+                f"corrections.grid_size must be three numbers of at least 1; got {self.corrections.grid_size}"
+            )
         if self.corrections.final_factor == 0:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
