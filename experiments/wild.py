@@ -12,7 +12,7 @@ OUT/wild.md.
 import argparse
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,9 @@ FLOATER_DEPTHS = 0.08, 0.3
 """Least and largest depth of floaters, in units of the normalised world."""
 
 
-def whole() -> a2tg.Scene:
+def whole(width: int = SIZE[0]) -> a2tg.Scene:
     """Return the unspoilt capture."""
-    return a2tg.synthetic_scene(width=SIZE[0], height=SIZE[1])
+    return a2tg.synthetic_scene(width=width, height=width * SIZE[1] // SIZE[0])
 
 
 def few_views() -> a2tg.Scene:
@@ -113,12 +113,17 @@ def before(camera: a2tg.Camera, num: int, rng: np.random.Generator) -> np.ndarra
     return points
 
 
-def with_depths() -> a2tg.Scene:
-    """Return the capture of few views with maps of inverse depth, of another scale and shift in each."""
-    scene, rng = few_views(), np.random.default_rng(0)
+def with_depths(scene: a2tg.Scene) -> a2tg.Scene:
+    """Return a capture with exact maps of inverse depth, of another scale and shift in each view."""
+    rng = np.random.default_rng(0)
     maps = [rng.uniform(0.5, 2) / depth + rng.uniform(-0.3, 0.3) for depth in exact_depths(scene)]
     views = [dataclasses.replace(view, depth=each) for view, each in zip(scene.train, maps, strict=True)]
     return dataclasses.replace(scene, train=tuple(views))
+
+
+def depth_weight(weight: float) -> dict[str, Any]:
+    """Return the options of depth priors of this weight."""
+    return {"loss": {"depth_weight": weight}}
 
 
 ROBUST = {"loss": {"robust_share": 0.3}}
@@ -131,18 +136,47 @@ CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
     "floaters": (with_floaters, {"plain": {}, "min_views 2": {"floaters": {"min_views": 2}},
                                  "near 0.3": {"floaters": {"near": 0.3}}}),
     "few views": (few_views, {"plain": {}, "min_views 2": {"floaters": {"min_views": 2}}}),
-    "depths": (with_depths, {"depth_weight 0.3": {"loss": {"depth_weight": 0.3}},
-                             "depth_weight 1": {"loss": {"depth_weight": 1.0}}}),
+    "few views, depths": (lambda: with_depths(few_views()), {f"depth_weight {weight}": depth_weight(weight)
+                                                             for weight in (0.1, 0.3, 1)}),
+    "whole, depths": (lambda: with_depths(whole()), {"depth_weight 0.3": depth_weight(0.3)}),
     "processed": (processed, {"plain": {}, "affine": {"exposure": True}, "grid": GRID}),
 }  # fmt: skip
 """Captures and, for each, the options to compare."""
 
 
+SIZES = "other sizes"
+SIZE_FIGURES = "psnr", "psnr_supersampled", "psnr_trained_there"
+SEEN_AT = (16, 32, 64, 128, 256)
+"""Widths at which the model trained at the middle one is seen."""
+
+
+def other_sizes(session: a2tg.Session) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the figures of a model seen at other widths: as it is, supersampled, and of a model trained there."""
+    models = {width: trained(whole(width), {}, session) for width in SEEN_AT}
+    base = SEEN_AT[len(SEEN_AT) // 2]
+    for width in SEEN_AT:
+        test, factor = whole(width).test, max(1, base // width)
+        settings = a2tg.RenderSettings(supersample=factor)
+        yield (
+            f"other sizes | {width} wide",
+            {
+                "psnr": a2tg.evaluate(test, models[base]).psnr,
+                "psnr_supersampled": a2tg.evaluate(test, models[base], settings=settings).psnr,
+                "psnr_trained_there": a2tg.evaluate(test, models[width]).psnr,
+            },
+        )
+
+
+def trained(scene: a2tg.Scene, options: Mapping[str, Any], session: a2tg.Session) -> a2tg.Model:
+    """Return the model of one training."""
+    system = with_changes(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), {**OPTIONS, **options}, "wild")
+    return a2tg.fit(scene, system, progress=False, session=session).model
+
+
 def measured(scene: a2tg.Scene, options: Mapping[str, Any], session: a2tg.Session) -> dict[str, float]:
     """Return the figures of one training."""
-    system = with_changes(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), {**OPTIONS, **options}, "wild")
     start = time.perf_counter()
-    model = a2tg.fit(scene, system, progress=False, session=session).model
+    model = trained(scene, options, session)
     return {
         "psnr": a2tg.evaluate(scene.test, model).psnr,
         "psnr_color_fit": a2tg.evaluate(scene.test, model, fit_colors=True).psnr,
@@ -151,34 +185,50 @@ def measured(scene: a2tg.Scene, options: Mapping[str, Any], session: a2tg.Sessio
 
 
 def table(found: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a row for each training."""
+    """Return a row for each training, and for each size at which one model is seen."""
     rows = [
         [*key.split(" | "), f"{cell['psnr']:.2f}", f"{cell['psnr_color_fit']:.2f}", f"{cell['num_gaussians']:,}"]
         for key, cell in found.items()
+        if "psnr_color_fit" in cell
     ]
-    return tables.markdown(["capture", "options", "PSNR", "after a colour fit", "Gaussians"], rows)
+    sizes = [
+        [key.partition(" | ")[2], *(f"{cell[figure]:.2f}" for figure in SIZE_FIGURES)]
+        for key, cell in found.items()
+        if "psnr_supersampled" in cell
+    ]
+    first = tables.markdown(["capture", "options", "PSNR", "after a colour fit", "Gaussians"], rows)
+    return f"{first}\n{tables.markdown(['seen at', 'as it is', 'supersampled', 'trained there'], sizes)}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of table and figures")
-    parser.add_argument("--only", default=";".join(CASES), help="captures, with semicolons between them")
+    parser.add_argument("--only", default=";".join((*CASES, SIZES)), help="captures, with semicolons between them")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "wild.json"
     found = read_json(path) if path.is_file() else {}
     session = a2tg.Session(tidy_memory)
+
+    def keep(key: str, figures: dict[str, float]) -> None:
+        found[key] = figures
+        print(key, {figure: round(value, 2) for figure, value in figures.items()}, flush=True)
+        write_json(path, found)
+        (arguments.out / "wild.md").write_text(table(found), encoding="utf-8")
+
     for name in arguments.only.split(";"):
+        if name == SIZES:
+            if not any(key.startswith(SIZES) for key in found):
+                for key, figures in other_sizes(session):
+                    keep(key, figures)
+            continue
         make, compared = CASES[name]
         scene = make()
         for label, options in compared.items():
             key = f"{name} | {label}"
             if key not in found:
-                found[key] = measured(scene, options, session)
-                print(key, {figure: round(value, 2) for figure, value in found[key].items()}, flush=True)
-                write_json(path, found)
-                (arguments.out / "wild.md").write_text(table(found), encoding="utf-8")
+                keep(key, measured(scene, options, session))
     print(table(found))
 
 

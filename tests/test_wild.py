@@ -58,7 +58,8 @@ def trained(scene):
         scene, train=(first, *scene.train[1:]), points=points.astype(np.float32), colors=colors.astype(np.float32)
     )
     system = small(
-        exposure=True, corrections={"exposure_kind": "grid", "grid_size": [4, 4, 2]}, floaters={"near": 0.2, "at": [1.0]},
+        exposure=True, corrections={"exposure_kind": "grid", "grid_size": [4, 4, 2]},
+        floaters={"near": 0.2, "at": [1.0]},
         loss={"depth_weight": 1.0, "robust_share": 0.2, "ssim_weight": 0.0},
     )  # fmt: skip
     return a2tg.fit(found, system, progress=False)

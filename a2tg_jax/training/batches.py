@@ -180,6 +180,15 @@ class Ahead:
         self._pool.shutdown(cancel_futures=True)
 
 
+def check_depths(views: tuple[View, ...]) -> None:
+    """Raise ValueError unless a view has a depth map."""
+    if all(view.depth is None for view in views):
+        raise ValueError(
+            "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
+            "into the folder depths beside images, or set it to 0"
+        )
+
+
 def check_views(views: tuple[View, ...]) -> None:
     """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
     if not views:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
@@ -30,7 +30,6 @@ from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
 from a2tg_jax.training.session import Session
-from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.start import padded
 from a2tg_jax.training.step import (
     EXPLODED,
@@ -135,7 +134,6 @@ class StageRun:
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
-        check_depths(self.views, self.stage)
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, has_depths=self.stage.has_depths)
         self.learning = LearningCheck(
             self.views,
@@ -411,15 +409,6 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         raise ValueError(
             f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
             "version, so train anew"
-        )
-
-
-def check_depths(views: tuple[View, ...], stage: Stage) -> None:
-    """Raise ValueError if a stage reads depth maps, and no view has one."""
-    if stage.has_depths and all(view.depth is None for view in views):
-        raise ValueError(
-            "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
-            "into the folder depths beside images, or set it to 0"
         )
 
 
