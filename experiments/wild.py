@@ -11,6 +11,7 @@ OUT/wild.md.
 
 import argparse
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -28,6 +29,8 @@ from a2tg_jax.training.registry import with_changes
 
 SIZE = 128, 96
 OPTIONS = {"stage1_iterations": 800, "stage2_iterations": 0, "densify": {"cap": 2_500}}
+SEEDS = 0, 1
+"""Seeds of the trainings; the captures are the same."""
 NUM_FEW, NUM_FLOATERS = 6, 400
 FLOATER_DEPTHS = 0.08, 0.3
 """Least and largest depth of floaters, in units of the normalised world."""
@@ -185,18 +188,17 @@ def measured(scene: a2tg.Scene, options: Mapping[str, Any], session: a2tg.Sessio
 
 
 def table(found: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a row for each training, and for each size at which one model is seen."""
-    rows = [
-        [*key.split(" | "), f"{cell['psnr']:.2f}", f"{cell['psnr_color_fit']:.2f}", f"{cell['num_gaussians']:,}"]
-        for key, cell in found.items()
-        if "psnr_color_fit" in cell
-    ]
-    sizes = [
-        [key.partition(" | ")[2], *(f"{cell[figure]:.2f}" for figure in SIZE_FIGURES)]
-        for key, cell in found.items()
-        if "psnr_supersampled" in cell
-    ]
-    first = tables.markdown(["capture", "options", "PSNR", "after a colour fit", "Gaussians"], rows)
+    """Return a row for each capture and its options, and one for each size at which one model is seen."""
+    rows, sizes = [], []
+    for key in dict.fromkeys(key.rpartition(" | seed ")[0] for key in found if " | seed " in key):
+        cells = [found[f"{key} | seed {seed}"] for seed in SEEDS if f"{key} | seed {seed}" in found]
+        means = [np.mean([cell[figure] for cell in cells]) for figure in ("psnr", "psnr_color_fit")]
+        apart = ", ".join(f"{cell['psnr']:.2f}" for cell in cells)
+        rows.append([*key.split(" | "), *(f"{mean:.2f}" for mean in means), apart])
+    for key, cell in found.items():
+        if key.startswith(SIZES):
+            sizes.append([key.partition(" | ")[2], *(f"{cell[figure]:.2f}" for figure in SIZE_FIGURES)])
+    first = tables.markdown(["capture", "options", "PSNR", "after a colour fit", "seeds"], rows)
     return f"{first}\n{tables.markdown(['seen at', 'as it is', 'supersampled', 'trained there'], sizes)}"
 
 
@@ -225,10 +227,10 @@ def main() -> None:
             continue
         make, compared = CASES[name]
         scene = make()
-        for label, options in compared.items():
-            key = f"{name} | {label}"
+        for label, seed in itertools.product(compared, SEEDS):
+            key = f"{name} | {label} | seed {seed}"
             if key not in found:
-                keep(key, measured(scene, options, session))
+                keep(key, measured(scene, {**compared[label], "seed": seed}, session))
     print(table(found))
 
 

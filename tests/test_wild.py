@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scenes_random import as_camera, as_gaussians, draw_scene
+from test_data_colmap import HEIGHT, WIDTH, write_scene
 from toy_system import Toy
 
 import a2tg_jax as a2tg
@@ -239,6 +240,28 @@ class TestDepthFiles:
         with pytest.raises(ValueError, match=re.escape(str(file))):
             read_depths(file)
 
+    def test_they_are_undistorted_and_resized_with_their_photographs(self, tmp_path):
+        """A step in a map of twice the size lies where that in the photograph's undistorted mask does."""
+        write_scene(tmp_path, models=("OPENCV_FISHEYE",), num_views=3)
+        (tmp_path / "depths").mkdir()
+        (tmp_path / "masks").mkdir()
+        for name in ("img_00", "img_01", "img_02"):
+            is_left = np.broadcast_to(np.arange(2 * WIDTH) < WIDTH // 2, (2 * HEIGHT, 2 * WIDTH))
+            np.save(tmp_path / f"depths/{name}.npy", np.where(is_left, 2.0, 1.0))
+            Image.fromarray(255 * is_left[::2, ::2].astype(np.uint8)).save(tmp_path / f"masks/{name}.png")
+        for view in a2tg.load_scene(tmp_path, downscale=2, test_every=0).train:
+            depth = view.depth.read()
+            assert depth.shape == view.picture.size and depth.min() == 0.5 and depth.max() == 1
+            assert np.mean((depth > 0.75) != view.mask.read()) < 0.04
+
+    def test_another_aspect_is_refused(self, tmp_path):
+        write_scene(tmp_path, num_views=3)
+        (tmp_path / "depths").mkdir()
+        np.save(tmp_path / "depths/img_00.npy", np.ones((HEIGHT, 2 * WIDTH)))
+        view = a2tg.load_scene(tmp_path, test_every=0).train[0]
+        with pytest.raises(ValueError, match="of another aspect than its photograph"):
+            view.depth.read()
+
     def test_colours_are_no_depths(self, tmp_path):
         Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "x.png")
         with pytest.raises(ValueError, match="must be greyscale"):
@@ -286,8 +309,8 @@ class TestFloaters:
     def test_what_cannot_be_is_refused(self, scene):
         with pytest.raises(ValueError, match="no stage of Toy does so"):
             Toy(floaters=a2tg.training.FloaterConfig(min_views=2)).check()
-        with pytest.raises(ValueError, match=r"corrections\.grid_size must be three numbers"):
-            small(corrections={"grid_size": [4, 4]}).check()
+        with pytest.raises(ValueError, match=r"corrections\.grid_size must be numbers of at least 1"):
+            small(corrections={"grid_size": [4, 0, 4]}).check()
         with pytest.raises(ValueError, match=r"floaters\.near must be at least 0; got -1"):
             small(floaters={"near": -1.0}).check()
 

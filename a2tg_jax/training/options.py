@@ -342,10 +342,8 @@ class System:
             raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
         if self.rates.means_final_factor == 0:
             raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
-        if len(self.corrections.grid_size) != 3 or min(self.corrections.grid_size) < 1:
-            raise ValueError(
-                f"corrections.grid_size must be three numbers of at least 1; got {self.corrections.grid_size}"
-            )
+        if min(self.corrections.grid_size) < 1:
+            raise ValueError(f"corrections.grid_size must be numbers of at least 1; got {self.corrections.grid_size}")
         if self.corrections.final_factor == 0:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
