@@ -108,15 +108,15 @@ class PhotoStore:
         views: tuple[View, ...],
         order: BatchOrder,
         last: int,
-        room: float | None = None,
         has_depths: bool = False,
+        room: float | None = None,
     ):
         """Args:
         views: of one scene.
         order: views of each iteration.
         last: the stage's last iteration.
-        room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         has_depths: whether their depth maps come along.
+        room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last, self._has_depths = views, order, last, has_depths
         plan = plan_batches(views, len(order.indices(1)), room, has_depths)

@@ -59,7 +59,8 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
     counts = jnp.ones_like(residual) if mask is None else mask.astype(residual.dtype)
     sums, nums = (_around(_patch_sums(x, side)) for x in (jax.lax.stop_gradient(residual) * counts, counts))
     patches = jnp.where(nums > 0, sums / jnp.maximum(nums, 1), jnp.nan)
-    middle, high = jnp.nanquantile(patches, jnp.stack([jnp.asarray(0.5), 1 - jnp.asarray(share)]))
+    quantiles = jnp.stack([jnp.asarray(0.5, residual.dtype), 1 - jnp.asarray(share, residual.dtype)])
+    middle, high = jnp.nanquantile(patches, quantiles)
     is_fine = ~(patches > jnp.maximum(high, factor * middle))
     found = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
     return found[:height, :width]

@@ -23,7 +23,7 @@ Background = Literal["black", "white", "random"]
 
 
 class LossTerm(Protocol):
-    """A part of the loss, a pytree of its numbers."""
+    """A part of the loss, a pytree of its numbers. One that reads depth maps has `has_depths = True`, too."""
 
     @property
     def has_geometry(self) -> bool:
