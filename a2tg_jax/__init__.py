@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from a2tg_jax.densify.clone_split import CloneSplitPrune as CloneSplitPrune
     from a2tg_jax.densify.clone_split import FillingDensity as FillingDensity
     from a2tg_jax.densify.clone_split import OpacityReset as OpacityReset
+    from a2tg_jax.densify.floaters import PruneFloaters as PruneFloaters
     from a2tg_jax.densify.pruning import Prune as Prune
     from a2tg_jax.densify.splitting import SplitByGradient as SplitByGradient
     from a2tg_jax.densify.view_dependence import AdaptDegrees as AdaptDegrees
@@ -142,6 +143,7 @@ if TYPE_CHECKING:
     from a2tg_jax.training import like as like
     from a2tg_jax.training import load_checkpoint as load_checkpoint
     from a2tg_jax.training import save_checkpoint as save_checkpoint
+    from a2tg_jax.training.bilateral import BilateralGrid as BilateralGrid
     from a2tg_jax.training.corrections import Correction as Correction
     from a2tg_jax.training.corrections import Exposure as Exposure
     from a2tg_jax.training.corrections import PoseRefinement as PoseRefinement
@@ -173,6 +175,7 @@ _NAMES = {
     "a2tg_jax.core.transform": ("transform_gaussians",),
     "a2tg_jax.data": ("Mask", "Picture", "Scene", "View", "load_scene", "run_sfm", "synthetic_scene", "view_image"),
     "a2tg_jax.densify.clone_split": ("CloneSplitPrune", "FillingDensity", "OpacityReset"),
+    "a2tg_jax.densify.floaters": ("PruneFloaters",),
     "a2tg_jax.densify.pruning": ("Prune",),
     "a2tg_jax.densify.splitting": ("SplitByGradient",),
     "a2tg_jax.densify.view_dependence": ("AdaptDegrees",),
@@ -231,6 +234,7 @@ _NAMES = {
         "load_checkpoint",
         "save_checkpoint",
     ),
+    "a2tg_jax.training.bilateral": ("BilateralGrid",),
     "a2tg_jax.training.corrections": ("Correction", "Exposure", "PoseRefinement"),
     "a2tg_jax.training.gradients": ("ViewGradients", "value_and_grad", "view_gradients"),
     "a2tg_jax.training.losses": ("normal_consistency", "photometric_loss"),

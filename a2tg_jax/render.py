@@ -42,11 +42,14 @@ from a2tg_jax.rasterize.splats import (
     Wanted,
     project_gaussians,
 )
+from a2tg_jax.rasterize.supersampling import box_mean, finer
 from a2tg_jax.rasterize.tile_pixels import PixelGrid, pixel_grid
 from a2tg_jax.rasterize.tiles import TileGrid, bounds_of, count_pairs, tile_lists
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
 HEAD_ROOM = 1.25
+IMAGES = ("color", "alpha", "depth", "normal", "distortion")
+"""Fields of `RenderOutput` that are images."""
 BATCH_ON_ACCELERATOR = 4096
 
 
@@ -74,12 +77,17 @@ class RenderSettings:
     mode; "autodiff", slower and by XLA, in any mode and to any order."""
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
+    supersample: int = 1
+    """Factor k by which views are drawn larger; each pixel is the mean over k × k. It lets a model be seen much smaller
+    than it was trained without aliasing, at k² times the cost."""
     exchange: Exchange | None = None
     """Devices that render each image together (`exchange_among`); None: one."""
 
     def __post_init__(self) -> None:
         if not self.near_plane > 0:
             raise ValueError(f"near_plane must be positive; got {self.near_plane}")
+        if type(self.supersample) is not int or self.supersample < 1:
+            raise ValueError(f"supersample must be an int, at least 1; got {self.supersample!r}")
         if isinstance(self.capacity, np.integer):
             object.__setattr__(self, "capacity", int(self.capacity))
         if self.capacity is not None and (type(self.capacity) is not int or self.capacity < 1):
@@ -252,7 +260,20 @@ def render_traced(
       num_live: number of rows that exist; may be traced.
       probe: [N, 4] zeros, at which the gradient is the statistic and the number of pixels (`compositor.composite`).
       statistic: kind of statistic (`rasterize.pixel.positional_gradient`); not used without a probe.
+
+    Raises:
+      ValueError: if a probe is given with `settings.supersample`.
     """
+    if settings.supersample > 1:
+        if probe is not None:
+            raise ValueError("supersample must be 1 where statistics of gradients are gathered")
+        factor, settings = settings.supersample, dataclasses.replace(settings, supersample=1)
+        output, num_pairs = render_traced(
+            gaussians, finer(camera, factor), rule, background, settings,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live,
+        )  # fmt: skip
+        images = {name: box_mean(getattr(output, name), factor) for name in IMAGES}
+        return output._replace(**images), num_pairs
     compositor = choose(settings.compositor, settings.tile_size)
     if camera.rays is not None:
         compositor = _for_rays(settings, compositor)
@@ -388,6 +409,7 @@ def pairs_of_view(
 ) -> int:
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
     check_rule(rule)
+    camera = finer(camera, settings.supersample)
     try:
         return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
@@ -398,6 +420,7 @@ def rows_of_view(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
 ) -> int:
     """Return the rows that a device of `settings.exchange` must be able to send to another one in a view (host)."""
+    camera = finer(camera, settings.supersample)
     return int(_jitted_rows()(gaussians, camera, rule, settings, num_live))
 
 

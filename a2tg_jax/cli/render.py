@@ -47,6 +47,9 @@ class Render:
     """Frames per second of the video."""
     size: Annotated[str | None, arg(metavar="WxH"), defaulting_to("that of the cameras")] = None
     """Width and height of the frames in pixels, such as 1280x720. Views of another aspect are cropped."""
+    supersample: int = 1
+    """Factor k by which frames are drawn larger and averaged: without aliasing where frames are smaller than the
+    photographs, at k² times the cost."""
     out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
     """Output folder."""
     model: LastModel = None
@@ -57,8 +60,12 @@ class Render:
         out = self.out or run.path / "frames"
         check_rate(self.fps)
         size = None if self.size is None else parse_size(self.size)
+        if self.supersample < 1:
+            raise ValueError(f"--supersample must be at least 1; got {self.supersample}")
         check_output(out)
-        paths = render_frames(run, out, route=self.path, num_frames=self.frames, name=self.model, size=size)
+        paths = render_frames(
+            run, out, route=self.path, num_frames=self.frames, name=self.model, size=size, supersample=self.supersample
+        )
         print(f"wrote {counted(len(paths), 'frame')} to {out}/")
         if self.path != "test":
             self._write_video(out, paths)

@@ -13,6 +13,7 @@ from a2tg_jax.data.colmap_binary import RECORDS, check_binary
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.colmap_text import check_text
 from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.depth_files import depth_map, find_depths
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
@@ -130,7 +131,8 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
         raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, file if pixels is photograph else None)
-    return Shot(image.name, viewmat_of(image), K, kept, mask, rays)
+    depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)
+    return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth)
 
 
 def _model_suffix(folder: Path) -> str | None:

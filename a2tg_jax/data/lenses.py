@@ -107,17 +107,29 @@ class Lens:
         """Return the rays of pictures of a size, as `Camera.rays` has them; None of a pinhole."""
         return None
 
+    def undistort_plane(self, plane: np.ndarray) -> np.ndarray:
+        """Return numbers [h, w] float32 of each pixel of a photograph as a pinhole would see them, at their size."""
+        if self.is_pinhole:
+            return plane
+        K, size = self.pinhole
+        scales = np.divide(plane.shape[::-1], self.size)
+        new_size = round(size[0] * scales[0]), round(size[1] * scales[1])
+        return self._sampled(plane[..., None], scaled_intrinsics(K, size, new_size), new_size)[..., 0]
+
     def _warp(self, pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Return a pinhole image with intrinsics K of the given size, sampled bilinearly from the photograph."""
+        return _straight(self._sampled(_premultiplied(pixels), K, size))
+
+    def _sampled(self, planes: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return float32 planes [h, w, C] of a pinhole image, sampled bilinearly from those of a photograph."""
         width, height = size
-        planes = _premultiplied(pixels)
         warped = np.empty((height, width, planes.shape[2]), np.float32)
         for top in range(0, height, ROWS_AT_ONCE):
             rows = warped[top : top + ROWS_AT_ONCE]
-            coordinates = self._seen_at(K, width, range(top, top + len(rows)), pixels.shape[1::-1])
+            coordinates = self._seen_at(K, width, range(top, top + len(rows)), planes.shape[1::-1])
             for channel in range(planes.shape[2]):
                 rows[..., channel] = map_coordinates(planes[..., channel], coordinates, order=1, mode="nearest")
-        return _straight(warped)
+        return warped
 
     def _seen_at(self, K: np.ndarray, width: int, rows: range, image_size: tuple[int, int]) -> np.ndarray:
         """Return array coordinates (row, column) [2, rows, width] in a photograph for some rows of a pinhole image
@@ -136,6 +148,10 @@ class KeptLens(Lens):
         """Return a photograph divided by `downscale`, and the K [3, 3] in whose image plane its rays are told."""
         new_size = downscaled_size(pixels.shape[1], pixels.shape[0], downscale)
         return resize_pixels(pixels, *new_size), scaled_intrinsics(self._matrix(), self.size, new_size)
+
+    def undistort_plane(self, plane: np.ndarray) -> np.ndarray:
+        """Return numbers [h, w] of each pixel of a photograph as they are."""
+        return plane
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays [height, width, 2] of pictures of a size, NaN where the lens has none; None of a pinhole.

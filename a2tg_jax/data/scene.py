@@ -16,6 +16,7 @@ from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_ca
 from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, png
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
@@ -48,11 +49,14 @@ class View:
     """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given, too."""
     mask: Mask | None = None
     """Mask of the pixels that count in losses and metrics; None counts all. An array [H, W] bool may be given, too."""
+    depth: DepthMap | None = None
+    """Depth map for `loss.depth_weight`; None without one. An array [H, W] of floats may be given, too."""
 
     def __post_init__(self) -> None:
-        """Convert arrays to pictures and masks."""
+        """Convert arrays to pictures, masks and depth maps."""
         object.__setattr__(self, "picture", Picture.of(self.picture))
         object.__setattr__(self, "mask", None if self.mask is None else Mask.of(self.mask))
+        object.__setattr__(self, "depth", None if self.depth is None else DepthMap.of(self.depth))
 
     @property
     def image(self) -> np.ndarray:
@@ -129,6 +133,8 @@ class Shot:
     """Mask of the pixels that count; None without a mask."""
     rays: np.ndarray | None = None
     """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None of a pinhole."""
+    depth: DepthMap | None = None
+    """Depth map; None without one."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -368,4 +374,4 @@ def _view(shot: Shot, viewmat: np.ndarray) -> View:
         has_ray = np.isfinite(shot.rays).all(axis=2)
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     mask = None if mask is None or mask.is_full else mask
-    return View(shot.name, camera, Picture.of(shot.pixels), mask)
+    return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth)

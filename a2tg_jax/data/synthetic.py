@@ -3,6 +3,8 @@
 Its patterns have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show without textures.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -144,15 +146,30 @@ def exact_points(scene: Scene) -> np.ndarray:
     Args:
       scene: a scene that `synthetic_scene` made.
     """
+    return np.concatenate([(center + t * rays).T[np.isfinite(t)] for center, rays, t in _exact_hits(scene)])
+
+
+def exact_depths(scene: Scene) -> list[np.ndarray]:
+    """Return the depth [H, W] float32 of the exact surfaces at the pixel centres of each training view, along the
+    camera's z axis in the normalised world.
+
+    Args:
+      scene: a scene that `synthetic_scene` made.
+    """
+    hits = zip(scene.train, _exact_hits(scene), strict=True)
+    return [(scene.transform.scale * t).astype(np.float32).reshape(view.picture.size) for view, (_, _, t) in hits]
+
+
+def _exact_hits(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield centre [3, 1], rays [3, P] with z = 1, and depths t [P] of the pixels of each training view, in the
+    original world."""
     shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]
-    inverse, found = scene.transform.inverse(), []
+    inverse = scene.transform.inverse()
     for camera in (view.camera for view in scene.train):
         viewmat = inverse.apply_to_viewmat(np.asarray(camera.viewmat, np.float64))
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        directions = _directions(viewmat, np.asarray(camera.K, np.float64), x, y)
-        t, _ = nearest_hits(shapes, _center(viewmat), directions)
-        found.append((_center(viewmat) + t * directions).T[np.isfinite(t)])
-    return np.concatenate(found)
+        rays = _directions(viewmat, np.asarray(camera.K, np.float64), x, y)
+        yield _center(viewmat), rays, nearest_hits(shapes, _center(viewmat), rays)[0]
 
 
 def _center(viewmat: np.ndarray) -> np.ndarray:

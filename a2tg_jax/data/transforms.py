@@ -14,6 +14,7 @@ import numpy as np
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.depth_files import depth_map, find_depths
 from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
@@ -39,7 +40,7 @@ BLENDER_HALF_SIDE = 1.3
 """Half the side of the cube that holds the objects of NeRF-synthetic scenes."""
 OPENCV_KEYS = ("k1", "k2", "p1", "p2")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
-FILE_KEYS = ("file_path", "mask_path", "ply_file_path")
+FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
 SPLIT_KEYS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
@@ -170,7 +171,16 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: 
         raise ValueError(f"{file}: {name}: its camera model {error}") from None
     mask = load_mask(_find_mask(file, frame, image_folder / image_name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, image_file if pixels is photograph else None)
-    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask, rays)
+    depth = depth_map(_find_depths(file, frame, image_folder / image_name), lens, photograph, pixels)
+    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask, rays, depth)
+
+
+def _find_depths(file: Path, frame: dict[str, Any], image: Path) -> Path | None:
+    """Return the depth map that a frame names, or else that of its image in the folder `depths` beside `images`."""
+    if frame.get("depth_file_path"):
+        return file.parent / str(frame["depth_file_path"])
+    images = file.parent / "images"
+    return find_depths(images, str(image.relative_to(images))) if image.is_relative_to(images) else None
 
 
 def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:

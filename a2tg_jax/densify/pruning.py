@@ -8,7 +8,7 @@ events use statistics of the steps; this one renders, because a weight is no gra
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,9 +42,7 @@ class Prune(HostEvent):
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        if any(not 0 < fraction <= 1 for fraction in self.at) or list(self.at) != sorted(set(self.at)):
-            raise FieldError(self, f"{{at}} must be ascending fractions above 0, up to 1; got {shortened(self.at)}")
-        return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in self.at))
+        return pruning_times(self, self.at, num_iterations)
 
     def num_after(self, num: int, num_iterations: int) -> int:
         return num if self.keep is None else min(num, self.keep)
@@ -53,15 +51,10 @@ class Prune(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
-        if model.appearance.has_degrees:
-            raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
         num, left = model.num, self._num_left(model.num)
-        order = np.argsort(-blending_weights(model, due.views)[:num], kind="stable")
-        rows = np.arange(model.gaussians.num)
-        rows[:num] = np.concatenate([np.sort(order[:left]), np.sort(order[left:])])
-        moments = gather_moments(model, moments, jnp.asarray(rows))
-        model = dataclasses.replace(gather_rows(model, jnp.asarray(rows)), num_live=jnp.asarray(left, jnp.int32))
-        return Change(model, moments, state, rows=rows)
+        is_kept = np.zeros(num, bool)
+        is_kept[np.argsort(-blending_weights(model, due.views)[:num], kind="stable")[:left]] = True
+        return kept_first(model, moments, state, is_kept)
 
     def _num_left(self, num: int) -> int:
         if self.keep is not None:
@@ -71,6 +64,26 @@ class Prune(HostEvent):
         if not 0 <= self.share < 1:
             raise FieldError(self, f"{{share}} must lie in [0, 1); got {self.share}")
         return num - round(num * float(self.share))
+
+
+def pruning_times(of: HostEvent, at: tuple[float, ...], num_iterations: int) -> tuple[int, ...]:
+    """Return the iterations at fractions of a stage, its end included.
+
+    Raises:
+      FieldError: if the fractions, the event's field `at`, are not ascending or not in (0, 1].
+    """
+    if any(not 0 < fraction <= 1 for fraction in at) or list(at) != sorted(set(at)):
+        raise FieldError(of, f"{{at}} must be ascending fractions above 0, up to 1; got {shortened(at)}")
+    return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in at))
+
+
+class Shown(NamedTuple):
+    """What N Gaussians show in some views."""
+
+    weights: np.ndarray
+    """[N] Σ α·T over the pixels of all views that count, in pixels."""
+    num_views: np.ndarray
+    """[N] number of the views in which Σ α·T is large enough."""
 
 
 def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
@@ -83,11 +96,19 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
     Raises:
       ValueError: if there is no view.
     """
+    return shown_in(model, views).weights
+
+
+def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
+    """Return how much each Gaussian shows, and in how many views it shows as much as `least` pixels (host).
+
+    Args, Raises: as of `blending_weights`.
+    """
     if not views:
         raise ValueError("views must hold at least one view; got none")
-    total = np.zeros(model.gaussians.num)
+    total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
     if not len(total):
-        return total
+        return Shown(total, num_views)
     settings = plan_render(model, [view.camera for view in views])
     # Programs are compiled for a capacity: for few of them.
     settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
@@ -98,21 +119,25 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
         cameras = [dataclasses.replace(view.camera, rays=None) for view in own]
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
         counted = jnp.asarray(counted_pixels(own), dtype)
-        total += np.asarray(_jitted()(model, stacked, rays, counted, settings), np.float64)
-    return total
+        weights, num = _jitted()(model, stacked, rays, counted, jnp.asarray(least, dtype), settings)
+        total += np.asarray(weights, np.float64)
+        num_views += np.asarray(num)
+    return Shown(total, num_views)
 
 
 @functools.cache
-def _jitted() -> Jitted[..., Array]:
-    return Jitted(_weights, static_argnums=(4,))
+def _jitted() -> Jitted[..., tuple[Array, Array]]:
+    return Jitted(_weights, static_argnums=(5,))
 
 
-def _weights(model: Model, cameras: Camera, rays: Array | None, counted: Array, settings: RenderSettings) -> Array:
-    """Return the sums over views of one size and lens. A picture is linear in the colours: this is a backward pass of
-    ones."""
+def _weights(
+    model: Model, cameras: Camera, rays: Array | None, counted: Array, least: Array, settings: RenderSettings
+) -> tuple[Array, Array]:
+    """Return the sums over views of one size and lens, and the numbers of views with at least so much. A picture is
+    linear in the colours, so this is a backward pass of ones."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
-    def of_view(total: Array, view: tuple[Camera, Array]) -> tuple[Array, None]:
+    def of_view(found: tuple[Array, Array], view: tuple[Camera, Array]) -> tuple[tuple[Array, Array], None]:
         camera, weight = view
         camera = dataclasses.replace(camera, rays=rays)
 
@@ -126,6 +151,24 @@ def _weights(model: Model, cameras: Camera, rays: Array | None, counted: Array, 
 
         color, back = jax.vjp(draw, nothing)
         (weights,) = back(jnp.broadcast_to(weight, color.shape))
-        return total + weights[:, 0], None
+        total, num = found
+        return (total + weights[:, 0], num + (weights[:, 0] >= least).astype(num.dtype)), None
 
-    return jax.lax.scan(of_view, nothing[:, 0], (cameras, counted))[0]
+    none = jnp.zeros(len(nothing), jnp.int32)
+    return jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))[0]
+
+
+def kept_first(model: Model, moments: AdamState, state: Any, is_kept: np.ndarray) -> Change:
+    """Return the change that leaves the marked ones [n] of the n Gaussians, in their order.
+
+    Raises:
+      ValueError: if Gaussians have degrees of their own.
+    """
+    if model.appearance.has_degrees:
+        raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
+    num, rows = model.num, np.arange(model.gaussians.num)
+    rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
+    moments = gather_moments(model, moments, jnp.asarray(rows))
+    left = jnp.asarray(int(is_kept.sum()), jnp.int32)
+    model = dataclasses.replace(gather_rows(model, jnp.asarray(rows)), num_live=left)
+    return Change(model, moments, state, rows=rows)

@@ -39,6 +39,17 @@ def read_npz(
             raise ValueError(shortened(str(error) or type(error).__name__, LONGEST_REASON)) from error
 
 
+def read_npy(path: str | os.PathLike[str]) -> np.ndarray:
+    """Return the array in an .npy of numbers.
+
+    Raises:
+      OSError: if the file cannot be opened.
+      ValueError: saying what is wrong, if it is damaged or not numeric.
+    """
+    with open_regular(path) as file:
+        return _read_array(file, "it", os.fstat(file.fileno()).st_size)
+
+
 def _read_arrays(archive: zipfile.ZipFile, room: int, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     for entry in archive.infolist():

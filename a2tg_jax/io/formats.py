@@ -18,7 +18,11 @@ from a2tg_jax.io.ply import load_ply, plain_gaussians, save_ply
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
 from a2tg_jax.model import Model
 
-LEARNED = {"exposure": "learned exposures", "pose": "learned motions of cameras"}
+LEARNED = {
+    "exposure": "learned exposures",
+    "bilateral_grid": "learned bilateral grids",
+    "pose": "learned motions of cameras",
+}
 """Corrections of photographs in words, by name."""
 Reader = Callable[[Path], Model | Gaussians]
 Writer = Callable[[Path, Model], None]

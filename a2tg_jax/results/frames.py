@@ -1,5 +1,6 @@
 """Frames of a finished run, and a video: its test views, or a path past the cameras, around the subject or by hand."""
 
+import dataclasses
 import re
 import shutil
 import subprocess
@@ -53,6 +54,7 @@ def render_frames(
     num_frames: int = 120,
     name: str | None = None,
     size: tuple[int, int] | None = None,
+    supersample: int = 1,
 ) -> list[Path]:
     """Write one PNG per frame and return their paths. The photographs are not needed: a model knows its cameras.
 
@@ -64,6 +66,7 @@ def render_frames(
       num_frames: length of the path.
       name: whose model is drawn; None: the last stage of the run's main system.
       size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' own.
+      supersample: factor by which frames are drawn larger and averaged (`RenderSettings.supersample`).
 
     Raises:
       FileNotFoundError: if that stage is not finished, or there is no such path.
@@ -82,7 +85,8 @@ def render_frames(
     cameras = dict(_cameras(model, route, num_frames))
     if size is not None:
         cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
-    renderer = Renderer(model, cameras=cameras.values(), settings=settings_of(planned.system), has_geometry=False)
+    settings = dataclasses.replace(settings_of(planned.system), supersample=supersample)
+    renderer = Renderer(model, cameras=cameras.values(), settings=settings, has_geometry=False)
     for file_name, camera in tqdm(cameras.items(), desc="frames", unit="frame"):
         save_picture(out / file_name, to_uint8(renderer(camera).color))
     return [out / file_name for file_name in cameras]

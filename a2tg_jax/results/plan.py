@@ -13,7 +13,7 @@ from a2tg_jax.training import Stage, System
 PACKAGE = "a2tg_jax"
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""
-STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "floaters")
 """Options of every system that reach training only through its stages."""
 
 

@@ -139,11 +139,11 @@ def growing_stage(
     params_rate: Any = 0.0,
     name: str = "gaussians",
 ) -> Stage:
-    """Return a first stage, in which the degree of spherical harmonics rises."""
+    """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
     return Stage(
         name=name,
         appearance=appearance,
-        events=events,
+        events=(*events, *system.floaters.events()),
         losses=system.loss.terms(),
         rates=system.rates,
         iterations=iterations,
@@ -166,7 +166,7 @@ def later_stage(
         name=name,
         appearance=appearance,
         events=events,
-        losses=system.loss.terms(),
+        losses=system.loss.terms(is_first=False),
         rates=system.rates,
         iterations=iterations,
         params_rate=params_rate,

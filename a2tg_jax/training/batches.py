@@ -1,7 +1,8 @@
 """Batches of views: the order of a training, and photographs on their way to the device."""
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ ROOM_AHEAD = 2**28
 MOST_AHEAD = 10
 """Largest number of prepared batches."""
 
+BYTES_PER_DEPTH = 4
 ALIGNMENT = 64
 """Alignment in bytes of memory that XLA adopts."""
 
@@ -39,6 +41,8 @@ class Photographs(NamedTuple):
     """[V, H, W] uint8, or None if the images are opaque."""
     masks: Array | None = None
     """[V, H, W] bool, True at pixels that count; None if all do."""
+    depths: Array | None = None
+    """[V, H, W] float32 depth maps, NaN where unknown; None unless asked for."""
     rays: Array | None = None
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
 
@@ -94,10 +98,13 @@ class BatchPlan(NamedTuple):
     """Number of batches prepared ahead, if the photographs do not all stay on the device."""
 
 
-def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None) -> BatchPlan:
+def plan_batches(
+    views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
+) -> BatchPlan:
     """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
-    fits = sum(view.picture.nbytes for view in views) <= (device_room() if room is None else room)
-    batch_bytes = batch_size * max(view.picture.nbytes for view in views)
+    sizes = [view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size) for view in views]
+    fits = sum(sizes) <= (device_room() if room is None else room)
+    batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
     return BatchPlan(fits and all(view.picture.is_held for view in views), batch_bytes, num_ahead)
 
@@ -112,6 +119,7 @@ class PhotoStore:
         order: BatchOrder,
         last: int,
         exchange: Exchange | None = None,
+        has_depths: bool = False,
         room: float | None = None,
     ):
         """Args:
@@ -119,14 +127,16 @@ class PhotoStore:
         order: views of each iteration.
         last: the stage's last iteration.
         exchange: devices over which the rows of pixels are spread; None: one.
+        has_depths: whether their depth maps come along.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
-        plan = plan_batches(views, len(order.indices(1)), room)
+        self._has_depths = has_depths
+        plan = plan_batches(views, len(order.indices(1)), room, has_depths)
         self.is_resident, self.num_ahead = plan.is_resident, plan.num_ahead
         self._kinds = kinds_of(views)
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
-        self._ahead = Ahead(lambda indices: stack_views([views[index] for index in indices], views), self.num_ahead)
+        self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
         """Return photographs of one kind that include those of an iteration, and their int32 indices among them.
@@ -146,11 +156,14 @@ class PhotoStore:
         """Return all photographs of a kind on the device, and the place of each view's."""
         if kind not in self._stacks:
             found = [index for index, own in enumerate(self._kinds) if own == kind]
-            stack = on_devices(stack_views([self._views[index] for index in found], self._views), self._exchange)
+            stack = on_devices(self._stacked(found, self._views), self._exchange)
             if self._exchange is None:
                 stack = jax.device_put(stack)
             self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[kind]
+
+    def _stacked(self, indices: Sequence[int], among: tuple[View, ...] | None = None) -> Photographs:
+        return stack_views([self._views[index] for index in indices], among, has_depths=self._has_depths)
 
     def close(self) -> None:
         """Ends the threads."""
@@ -168,6 +181,7 @@ def on_devices(photographs: Photographs, exchange: Exchange | None) -> Photograp
         images=in_rows(photographs.images),
         alphas=None if photographs.alphas is None else in_rows(photographs.alphas),
         masks=None if photographs.masks is None else in_rows(photographs.masks),
+        depths=None if photographs.depths is None else in_rows(photographs.depths),
         rays=photographs.rays,
     )
 
@@ -198,6 +212,15 @@ class Ahead:
         self._pool.shutdown(cancel_futures=True)
 
 
+def check_depths(views: tuple[View, ...]) -> None:
+    """Raise ValueError unless a view has a depth map."""
+    if all(view.depth is None for view in views):
+        raise ValueError(
+            "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
+            "into the folder depths beside images, or set it to 0"
+        )
+
+
 def check_views(views: tuple[View, ...]) -> None:
     """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
     if not views:
@@ -214,6 +237,11 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
                 f"got {list(view.mask.shape)}"
             )
+        if view.depth is not None and view.depth.shape != (height, width):
+            raise ValueError(
+                f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
+                f"got {list(view.depth.shape)}"
+            )
 
 
 def device_room() -> float:
@@ -222,13 +250,14 @@ def device_room() -> float:
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 
 
-def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Photographs:
+def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False) -> Photographs:
     """Return views of one image size and lens, stacked on the host.
 
     Args:
       views: those to stack.
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them. None: `views`.
+      has_depths: whether depth maps come along; NaN where a view has none.
     """
     alike = [view for view in among or views if view.picture.size == views[0].picture.size]
     pixels = [view.picture.read() for view in views]
@@ -247,7 +276,13 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None) -> Pho
         alphas=alphas,  # type: ignore[arg-type]
         masks=masks,  # type: ignore[arg-type]
         rays=views[0].camera.rays,
+        depths=_stacked([_depth(view) for view in views]) if has_depths else None,  # type: ignore[arg-type]
     )
+
+
+def _depth(view: View) -> np.ndarray:
+    """Return the depth map of a view [H, W] float32, NaN without one."""
+    return np.full(view.picture.size, np.nan, np.float32) if view.depth is None else view.depth.read()
 
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:

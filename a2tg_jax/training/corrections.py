@@ -20,6 +20,9 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.events import event
 
+MOST_READABLE = 100
+"""Largest number of numbers of a row that `learned` lists."""
+
 
 class Correction:
     """Base class of corrections; it changes nothing."""
@@ -43,6 +46,10 @@ class Correction:
     def color(self, row: Array, color: Array) -> Array:
         """Return the colours [H, W, 3] of the photograph for a render [H, W, 3]; traced."""
         return color
+
+    def penalty(self, row: Array) -> Array | None:
+        """Return what is added to the view's loss for its row, such as a smoothness; None: nothing. Traced."""
+        return None
 
     def project(self, rows: Array) -> Array:
         """Return the rows of all views [V, ...], projected to where they belong after a step; traced."""
@@ -177,6 +184,12 @@ def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], co
     return color
 
 
+def penalties(corrections: Sequence[Correction], rows: Sequence[Array]) -> list[Array]:
+    """Return what the corrections add to the loss of a view, given its row of each."""
+    found = [correction.penalty(row) for correction, row in zip(corrections, rows, strict=True)]
+    return [penalty for penalty in found if penalty is not None]
+
+
 def updated(
     correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
 ) -> CorrectionState:
@@ -227,9 +240,10 @@ def _with_neutral(correction: Correction, state: CorrectionState, num: int) -> n
 
 
 def learned(origin: Origin) -> Mapping[str, Mapping[str, list[Any]]]:
-    """Return the corrections of each training photograph, as lists of numbers: name → correction → row."""
+    """Return the corrections of each training photograph, as lists of numbers: name → correction → row.
+
+    Rows of more than `MOST_READABLE` numbers are left out.
+    """
+    known = {name: rows for name, rows in origin.corrections.items() if rows[0].size <= MOST_READABLE}
     training = [(index, name) for index, name in enumerate(origin.names) if not origin.is_test[index]]
-    return {
-        name: {correction: rows[index].tolist() for correction, rows in origin.corrections.items()}
-        for index, name in training
-    }
+    return {name: {correction: rows[index].tolist() for correction, rows in known.items()} for index, name in training}

@@ -8,11 +8,15 @@ from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
-from a2tg_jax.events import Event, FieldError, with_names
+from a2tg_jax.densify.floaters import PruneFloaters
+from a2tg_jax.events import Event, FieldError, from_options, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
+from a2tg_jax.training.bilateral import BilateralGrid
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
+from a2tg_jax.training.depth_prior import DepthKind, DepthPrior
+from a2tg_jax.training.robust import RobustPhotometric
 from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
@@ -34,29 +38,75 @@ class LossConfig:
     """Mean opacity of the live splats, or mean alpha of their pictures (3DGS-MCMC and BBSplat use 0.01)."""
     scale_weight: float = 0.0
     """Mean scale of the live Gaussians (3DGS-MCMC uses 0.01)."""
+    robust_share: float = 0.0
+    """Largest share of each photograph to leave out where it differs most from the render, such as passers-by; 0: none.
+    """
+    robust_factor: float = RobustPhotometric.factor
+    """Least residual of a patch that robust_share leaves out, as a multiple of the photograph's median."""
 
-    def terms(self) -> tuple[LossTerm, ...]:
-        """Return the loss terms whose weight is not 0."""
-        optional = (
+    depth_weight: float = 0.0
+    """Rendered inverse depth against the scene's depth maps, after scale and shift of least squares per view."""
+    depth_kind: DepthKind = "inverse"
+    """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
+
+    def terms(self, is_first: bool = True) -> tuple[LossTerm, ...]:
+        """Return the loss terms whose weight is not 0.
+
+        Args:
+          is_first: whether they are of the first stage, in whose beginning robust_share leaves out nothing.
+        """
+        optional: tuple[Term | DepthPrior, ...] = (
             Term(normals, self.normal_weight, has_geometry=True),
             Term(distortion, self.distortion_weight, has_geometry=True),
             Term(opacity, self.opacity_weight),
             Term(scale, self.scale_weight),
+            DepthPrior(self.depth_weight, self.depth_kind),
         )
-        first = Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
-        return (first, *(term for term in optional if term.weight))
+        return (self._photometric(is_first), *(term for term in optional if term.weight))
+
+    def _photometric(self, is_first: bool) -> LossTerm:
+        if self.robust_share:
+            start = RobustPhotometric.start if is_first else 0.0
+            return RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start)
+        return Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
 
 
 @dataclasses.dataclass(frozen=True)
 class CorrectionConfig:
-    """Learning rates of `exposure` and `refine_poses`."""
+    """What `exposure` and `refine_poses` learn, and how fast."""
 
+    exposure_kind: Literal["affine", "grid"] = "affine"
+    """Exposure of a photograph: an affine map of its colours, or in addition a bilateral grid of such maps, which
+    follows vignettes and local tone mapping."""
     exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
+    grid_size: tuple[int, int, int] = BilateralGrid.size
+    """Numbers of nodes of a bilateral grid along x, along y, and of luminances."""
+    grid_rate: float = BilateralGrid.rate
+    """Adam's learning rate of the bilateral grids."""
+    grid_smoothness: float = BilateralGrid.smoothness
+    """Weight of the total variation of the bilateral grids in the loss."""
     pose_rate: float = PoseRefinement.rate
     """Adam's learning rate of the camera motions, in radians and in units of the normalised world."""
     final_factor: float = Exposure.final_factor
-    """Factor of both rates at the end of the first stage, and in later stages."""
+    """Factor of these rates at the end of the first stage, and in later stages."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FloaterConfig:
+    """Pruning of floaters in the first stage (`PruneFloaters`)."""
+
+    min_views: int = 0
+    """Least number of training views in which a Gaussian must show, such as 2; others are pruned. 0: off."""
+    near: float = 0.0
+    """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
+    about 1 from what they see, such as 0.2. 0: off."""
+    at: tuple[float, ...] = PruneFloaters.at
+    """Fractions of the first stage at which floaters are pruned."""
+
+    def events(self) -> tuple[Event, ...]:
+        """Return the event; none if nothing is asked for."""
+        return (from_options(PruneFloaters, self),) if self.min_views or self.near else ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,6 +142,7 @@ class System:
     refine_poses: bool = False
     """Learn a small rigid motion of each training camera, for captures whose poses are not exact."""
     corrections: CorrectionConfig = dataclasses.field(default_factory=CorrectionConfig)
+    floaters: FloaterConfig = dataclasses.field(default_factory=FloaterConfig)
 
     name: ClassVar[str] = ""
     """Name on the command line."""
@@ -157,8 +208,12 @@ class System:
         rates, last = self.corrections, self.corrections.final_factor
         start, end = (1.0, last) if stage == 0 else (last, 1.0)
         poses = (PoseRefinement(rate=rates.pose_rate * start, final_factor=end),) if self.refine_poses else ()
-        exposures = (Exposure(rate=rates.exposure_rate * start, final_factor=end),) if self.exposure else ()
-        return (*poses, *exposures)
+        if not self.exposure:
+            return poses
+        affine = Exposure(rate=rates.exposure_rate * start, final_factor=end)
+        if rates.exposure_kind == "affine":
+            return *poses, affine
+        return *poses, affine, BilateralGrid(rates.grid_size, rates.grid_rate * start, end, rates.grid_smoothness)
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages, in the order of training.
@@ -221,11 +276,17 @@ class System:
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
+        if self.floaters.events() and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
+            raise ValueError(
+                f"floaters are to be pruned, but no stage of {type(self).__name__} does so: give its first stage the "
+                "events self.floaters.events() too"
+            )
 
     def option_of(self, event: Event, field: str) -> str | None:
         """Return the name of the option that sets a field of an event; None if the system does not tell."""
         classes = (f"{kind.__name__}.{field}" for kind in type(event).__mro__)
-        name = next((self.event_options[known] for known in classes if known in self.event_options), None)
+        options = {**SHARED_OPTIONS, **self.event_options}
+        name = next((options[known] for known in classes if known in options), None)
         return "memory_budget" if self.memory_budget is not None and name in BUDGET_OPTIONS else name
 
     def told(self, event: Event, message: str) -> str:
@@ -270,7 +331,8 @@ class System:
             if not all(math.isfinite(number) for number in held if isinstance(number, float)):
                 wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
                 raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
-            if name.startswith(("rates.", "loss.", "corrections.")) and value < 0:
+            is_rate = name.startswith(("rates.", "loss.", "corrections.")) and isinstance(value, float | int)
+            if is_rate and value < 0:
                 raise ValueError(f"{name} must be at least 0; got {value}")
         for name, (least, most) in {**RANGES, **self.ranges}.items():
             if numbers[name] is not None and not least <= numbers[name] <= most:
@@ -280,10 +342,14 @@ class System:
             raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
         if self.rates.means_final_factor == 0:
             raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
+        if min(self.corrections.grid_size) < 1:
+            raise ValueError(f"corrections.grid_size must be numbers of at least 1; got {self.corrections.grid_size}")
         if self.corrections.final_factor == 0:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
 
+SHARED_OPTIONS = {f"PruneFloaters.{name}": f"floaters.{name}" for name in ("min_views", "near", "at")}
+"""Options of every system that set a field of an event."""
 BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
 """Options whose place a memory budget takes."""
 FEW_GAUSSIANS = 100
@@ -295,6 +361,7 @@ RANGES = {
     "seed": (0, 2**31 - 1),
     "tile_size": (1, MAX_TILE_SIZE),
     "loss.ssim_weight": (0, 1),
+    "loss.robust_share": (0, 1),
 }
 """Smallest and largest value of options that every system has, both included."""
 

@@ -23,7 +23,7 @@ Background = Literal["black", "white", "random"]
 
 
 class LossTerm(Protocol):
-    """A part of the loss, a pytree of its numbers."""
+    """A part of the loss, a pytree of its numbers. One that reads depth maps has `has_depths = True`, too."""
 
     @property
     def has_geometry(self) -> bool:
@@ -92,6 +92,11 @@ class Stage:
         wanted = {event.statistic for event in self.events} - {None}
         return next(iter(wanted), None)
 
+    @property
+    def has_depths(self) -> bool:
+        """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
+        return any(getattr(term, "has_depths", False) for term in self.losses)
+
     def is_ahead(self, event: Event) -> bool:
         """Return whether an event happens at all (host)."""
         return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
@@ -145,6 +150,10 @@ class Clock(NamedTuple):
     """Times of every event; None if it happens after every iteration, or on the host."""
     largest_loss: float = math.inf
     """Largest loss; the step is not taken beyond it."""
+
+    def progress(self, iteration: Array) -> Array:
+        """Return the share of the stage that so many finished iterations are; traced."""
+        return jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)
 
 
 def _times(event: Event, num_iterations: int) -> Times | None:

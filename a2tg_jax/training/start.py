@@ -14,6 +14,7 @@ from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
+from a2tg_jax.training.batches import check_depths
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 
@@ -78,7 +79,8 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 
 
 def check_start(scene: Scene, system: System) -> None:
-    """Refuse a first stage whose events cannot work with the initial number of Gaussians.
+    """Refuse a first stage whose events cannot work with the initial number of Gaussians, and depth priors of a scene
+    without depth maps.
 
     Raises:
       ValueError: naming the options to change.
@@ -87,6 +89,8 @@ def check_start(scene: Scene, system: System) -> None:
     with system.naming_options():
         _rows_needed(first, num, system)
     system.check_number(num)
+    if any(stage.has_depths for stage in system.stages()):
+        check_depths(scene.train)
 
 
 def _rows_needed(stage: Stage, num: int, system: System) -> int:

@@ -29,6 +29,7 @@ from a2tg_jax.training.corrections import (
     corrected_camera,
     corrected_color,
     initial_corrections,
+    penalties,
     rows_of,
     updated,
 )
@@ -163,12 +164,13 @@ def attempt(
     dtype = state.model.gaussians.means.dtype
     batch = photographs.of(views)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
+    batch = batch if batch.depths is None else batch._replace(depths=batch.depths.astype(dtype))
     backgrounds = _backgrounds(keys[0], settings.background, views.shape[0], dtype)
     own = rows_of(state.corrections, rows)
     found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration, own)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
-    progress = jnp.clip(jnp.asarray(state.iteration, jnp.result_type(float)) * clock.per_iteration, 0.0, 1.0)
+    progress = clock.progress(state.iteration)
     decay = jnp.exp(clock.log_decay * progress)
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
     step = _optimized(stage, state, grads, rate)
@@ -222,14 +224,15 @@ def _gradients(
     has_geometry = any(term.has_geometry for term in stage.losses)
 
     def one_view(view: tuple[Any, ...]) -> BatchGradients:
-        viewmat, K, image, alpha, mask, background, rows = view
+        viewmat, K, image, alpha, mask, depth, background, rows = view
         photograph = _black_outside(mask, _over(image, alpha, background))
 
         def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
-            target = Target(seen.camera, photograph, background, mask)
+            target = Target(seen.camera, photograph, background, mask, depth, clock.progress(iteration - 1))
             color = corrected_color(seen.corrections, seen.rows, output.color)
             output = output._replace(color=_black_outside(mask, color))
-            value = functools.reduce(jnp.add, [term(shown, target, output) for term in stage.losses])
+            terms = [term(shown, target, output) for term in stage.losses]
+            value = functools.reduce(jnp.add, [*terms, *penalties(seen.corrections, seen.rows)])
             error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
             return value, (error, output.overflow)
 
@@ -242,7 +245,7 @@ def _gradients(
         grads = found.gaussians, found.params, found.rows
         return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
 
-    pictures = batch.images, batch.alphas, batch.masks
+    pictures = batch.images, batch.alphas, batch.masks, batch.depths
     gradients: BatchGradients = jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
     return gradients
 

@@ -26,6 +26,10 @@ class Target(NamedTuple):
     """[3]."""
     mask: Array | None = None
     """[H, W] bool, True at pixels that count; None: all. Excluded pixels of photograph and render are black."""
+    depth: Array | None = None
+    """[H, W] depth map as given, NaN where unknown; None unless a term of the stage has `has_depths`."""
+    progress: Array | float = 1.0
+    """Share of the stage that is done."""
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]

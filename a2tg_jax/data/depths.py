@@ -1,0 +1,36 @@
+"""Depth maps of photographs: read when a training asks for them."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A depth map of a view, left where it is until it is read."""
+
+    shape: tuple[int, int]
+    """(H, W)."""
+    load: Callable[[], np.ndarray] = dataclasses.field(repr=False)
+
+    @staticmethod
+    def of(values: "np.ndarray | DepthMap") -> "DepthMap":
+        """Return the map of an array [H, W] of floats, NaN where unknown; a map is returned unchanged.
+
+        Raises:
+          ValueError: if it is no such array.
+        """
+        if isinstance(values, DepthMap):
+            return values
+        if values.ndim != 2 or not np.issubdtype(values.dtype, np.floating):
+            raise ValueError(f"a depth map must be floats [H, W]; got {values.dtype} {list(values.shape)}")
+        height, width = values.shape
+        return DepthMap((height, width), lambda: values)
+
+    def read(self) -> np.ndarray:
+        """Return [H, W] float32, NaN where unknown, its largest magnitude 1 (scales are unknown anyway)."""
+        values = np.array(self.load(), np.float32)
+        values[~np.isfinite(values)] = np.nan
+        largest = np.nanmax(np.abs(values), initial=0.0)
+        return values / largest if largest > 0 else values
