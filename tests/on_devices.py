@@ -116,9 +116,17 @@ def training(folder):
         if checkpoint.iteration == 12:
             kept.append(a2tg.save_checkpoint(path, checkpoint))
 
+    path_alone = Path(folder) / "alone.npz"
+
+    def keep_alone(checkpoint):
+        if checkpoint.iteration == 12:
+            a2tg.save_checkpoint(path_alone, checkpoint)
+
     whole = fit(own, 4, on_checkpoint=keep, checkpoint_every=12)
     assert kept and len(whole.model.gaussians.means.devices()) == 1, "results lie on one device"
-    alone = fit(own, 1)
+    alone = fit(own, 1, on_checkpoint=keep_alone, checkpoint_every=12)
+    again = fit(own, 2, resume=a2tg.load_checkpoint(path_alone))
+    assert abs(psnr_of(again) - psnr_of(alone)) < 0.02
     for count in (4, 3, 1):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
