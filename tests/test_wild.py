@@ -73,8 +73,7 @@ class TestRobust:
         found = inliers(self.residual.at[24:36, 40:60].set(0.5), 0.2, 4.0)
         assert not found[24:36, 40:60].any()
         assert found.mean() > 0.9 and found[:20].all() and found[:, 64:].all()
-        assert inliers(self.residual, 0.2, 4.0).all(), "an even residual has no outliers"
-        assert inliers(self.residual.at[40, 60].set(0.5), 0.2, 4.0).all(), "nor is a single pixel one"
+        assert inliers(self.residual.at[40, 60].set(0.5), 0.2, 4.0).all(), "a single pixel is no outlier"
 
     def test_no_more_than_the_share_is_outlying(self):
         residual = jnp.where(jnp.arange(64)[:, None] < 28, 1.0, 0.01) * jnp.ones((64, 96))
@@ -123,15 +122,15 @@ class TestBilateralGrid:
 
     @pytest.mark.usefixtures("x64")
     def test_gradients_are_exact(self):
-        grid, color = RNG.normal(size=(2, 2, 2, 3, 4)), RNG.uniform(0.1, 0.4, size=(2, 3, 3))
+        numbers = np.concatenate([RNG.normal(size=96), RNG.uniform(0.1, 0.4, size=18)])
         weights = jnp.asarray(RNG.normal(size=(2, 3, 3)))
 
-        def value(grid, color):
+        def value(numbers):
+            grid, color = numbers[:96].reshape(2, 2, 2, 3, 4), numbers[96:].reshape(2, 3, 3)
             return jnp.sum(weights * sliced(grid, color)) + total_variation(grid)
 
-        of_grid, of_color = jax.grad(value, argnums=(0, 1))(jnp.asarray(grid), jnp.asarray(color))
-        np.testing.assert_allclose(of_grid, differences(lambda x: value(x, color), grid), rtol=1e-6, atol=1e-8)
-        np.testing.assert_allclose(of_color, differences(lambda x: value(jnp.asarray(grid), x), color), rtol=1e-6)
+        found = jax.jit(jax.grad(value))(jnp.asarray(numbers))
+        np.testing.assert_allclose(found, differences(value, numbers), rtol=1e-6, atol=1e-8)
 
     def test_it_begins_as_the_identity_and_holds_every_affine_map(self):
         correction, color = BilateralGrid(size=(3, 2, 4)), jnp.asarray(RNG.uniform(size=(6, 5, 3)), jnp.float32)
@@ -172,18 +171,16 @@ class TestDepthPrior:
 
     @pytest.mark.usefixtures("x64")
     def test_gradients_are_exact_with_scale_and_shift_held(self):
-        depth, alpha = RNG.uniform(1, 2, (3, 4)), RNG.uniform(0.6, 1, (3, 4))
-        prior, counts = RNG.uniform(size=(3, 4)), jnp.asarray(RNG.random((3, 4)) < 0.8)
-        inverse = jnp.where(counts, alpha / depth, 0)
-        num = float(counts.sum())
+        images = jnp.asarray(np.stack([RNG.uniform(1, 2, (3, 4)), RNG.uniform(0.6, 1, (3, 4))]))
+        prior, counts = jnp.asarray(RNG.uniform(size=(3, 4))), jnp.asarray(RNG.random((3, 4)) < 0.8)
+        inverse, num = jnp.where(counts, images[1] / images[0], 0), float(counts.sum())
         scale, shift = scale_and_shift(jnp.where(counts, prior, 0), inverse, counts)
 
-        def held(depth, alpha):
-            return jnp.sum(jnp.where(counts, jnp.abs(scale * prior + shift - alpha / depth), 0)) / num
+        def held(images):
+            return jnp.sum(jnp.where(counts, jnp.abs(scale * prior + shift - images[1] / images[0]), 0)) / num
 
-        found = jax.grad(depth_loss, argnums=(0, 1))(*map(jnp.asarray, (depth, alpha, prior)), counts)
-        np.testing.assert_allclose(found[0], differences(lambda x: held(x, alpha), depth), rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(found[1], differences(lambda x: held(depth, x), alpha), rtol=1e-6, atol=1e-9)
+        found = jax.jit(jax.grad(lambda images: depth_loss(*images, prior, counts)))(images)
+        np.testing.assert_allclose(found, differences(held, images), rtol=1e-6, atol=1e-9)
 
     def test_right_depth_costs_nothing_and_unknown_depth_neither(self):
         depth = jnp.asarray(RNG.uniform(1, 2, (5, 6)), jnp.float32)
@@ -319,14 +316,12 @@ class TestSupersampling:
     def test_a_pixel_is_the_mean_of_a_finer_view(self):
         scene = draw_scene(0)._replace(textures=None)
         model, camera = a2tg.Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
-        found = model.render(camera, settings=a2tg.RenderSettings(supersample=2))
-        fine = model.render(a2tg.resize_camera(camera, 2 * camera.width, 2 * camera.height))
+        found = a2tg.Renderer(model, settings=a2tg.RenderSettings(supersample=2))(camera)
+        fine = a2tg.Renderer(model)(a2tg.resize_camera(camera, 2 * camera.width, 2 * camera.height))
         for name in ("color", "depth", "normal"):
             image = np.asarray(getattr(fine, name))
             mean = (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2]) / 4
             np.testing.assert_allclose(getattr(found, name), mean, atol=1e-6)
-        renderer = a2tg.Renderer(model, settings=a2tg.RenderSettings(supersample=2))
-        np.testing.assert_allclose(renderer(camera).color, found.color, atol=1e-6)
 
     def test_it_must_be_a_whole_number(self):
         with pytest.raises(ValueError, match="supersample must be an int, at least 1; got 0"):
