@@ -25,6 +25,8 @@ WRITERS: Mapping[str, Callable[[Grid, Sequence[Result]], str]] = {
     "choices": _choices,
 }
 """Functions that write the tables of a grid, by kind."""
+BESIDE_PAPER = ("full", "small", "smoke")
+"""Scales whose pages have the paper's tables; the appendix shows those of `small` beside those of `long`."""
 
 
 def table_experiment(name: str, description: str, grid: str | None = None) -> Experiment:
@@ -54,8 +56,10 @@ def paper_experiment(name: str, place: str, description: str) -> Experiment:
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS)
-        lab.write(name, f"# {grid.title}\n\n{_told(lab, grid)}\n## In the paper\n\n{paper}")
+        text = f"# {grid.title}\n\n{_told(lab, grid)}"
+        if grid.scale in BESIDE_PAPER:
+            text += f"\n## In the paper\n\n{tables.paper_table(name, place, tables.QUALITY_COLUMNS)}"
+        lab.write(name, text)
 
     return Experiment(name, (name,), present, description)
 
