@@ -17,7 +17,7 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.jit import classes_of
 from a2tg_jax.data import Picture
-from a2tg_jax.host import memory
+from a2tg_jax.host import bars, memory
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
@@ -289,8 +289,17 @@ def test_the_pace_stands_above_the_bar(capsys, monkeypatch, is_shown):
     assert not is_shown or re.search(r"a-stage: \S+ ms an iteration, about \S+ for the other 80", told)
 
 
+def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch):
+    monkeypatch.setattr(bars, "PLAIN_SECONDS", 0.0)
+    assert list(bars.progress_over(list(range(25)), "frames", "frame")) == list(range(25))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "frames: 3 of 25" and lines[-1] == "frames: 25 of 25" and len(lines) == 9
+    assert list(bars.progress_over([1, 2], "frames", "frame", is_shown=False)) == [1, 2]
+    assert not capsys.readouterr().err
+
+
 def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "PLAIN_SECONDS", 0.0)
+    monkeypatch.setattr(bars, "PLAIN_SECONDS", 0.0)
     info, history = SimpleNamespace(loss=0.5, psnr=20.0), SimpleNamespace(iteration=())
     with progress.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
         for _ in range(20):

@@ -23,7 +23,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.finish.distilling import distill, pictures
+from a2tg_jax.finish.distilling import distill, likeness, pictures
 from a2tg_jax.finish.shrinking import texel_weights_of
 from a2tg_jax.finish.texel_choice import Tables, fewest_texels
 from a2tg_jax.io.ply import plain_gaussians
@@ -114,12 +114,11 @@ def least_degree(model: Model, cameras: Sequence[Camera]) -> int:
     highest = model.gaussians.sh_degree if model.bands is None else 3
     if highest == 0:
         return 0
-    wanted = pictures(model, cameras)
+    wanted = list(pictures(model, cameras))
     for degree in range(highest):
         sh = np.array(model.sh)
         sh[:, NUM_BASES[degree] :] = 0
-        found = pictures(model.with_sh(sh), cameras)
-        if np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)]) < 10 ** (-SAME_PSNR / 10):
+        if likeness(pictures(model.with_sh(sh), cameras), wanted) > SAME_PSNR:
             return degree
     return highest
 

@@ -1,7 +1,8 @@
 """Training of a plain model on pictures of another model, in place of photographs."""
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -40,10 +41,17 @@ def distill(
     return dataclasses.replace(trained, origin=wanted.origin)
 
 
-def pictures(model: Model, cameras: Sequence[Camera], background: Color | None = None) -> list[np.ndarray]:
-    """Return the pictures [H, W, 3] of a model over its own background or another, clipped to [0, 1] (host)."""
+def pictures(model: Model, cameras: Sequence[Camera], background: Color | None = None) -> Iterator[np.ndarray]:
+    """Yield the pictures [H, W, 3] of a model over its own background or another, clipped to [0, 1] (host)."""
     renderer = Renderer(model, cameras=cameras, background=background, has_geometry=False)
-    return [np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras]
+    for camera in cameras:
+        yield np.clip(np.asarray(renderer(camera).color), 0, 1)
+
+
+def likeness(found: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
+    """Return the PSNR in dB of pictures beside others, from the mean of their squared errors; at most 100."""
+    error = np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)])
+    return -10 * math.log10(max(float(error), 1e-10))
 
 
 def drawn_scene(model: Model, cameras: Sequence[Camera], background: Color) -> Scene:

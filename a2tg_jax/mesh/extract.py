@@ -6,12 +6,12 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-from tqdm import tqdm
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted
 from a2tg_jax.core.jit import Jitted
+from a2tg_jax.host.bars import progress_over
 from a2tg_jax.mesh.blocks import BlockGrid, GridFullError
 from a2tg_jax.mesh.depth_maps import DepthMap, depth_map
 from a2tg_jax.mesh.fusion import fuse
@@ -147,7 +147,7 @@ def extract_mesh(
 def _fused(renderer: Renderer, cameras: Sequence[Camera], space: Space, max_bytes: int, progress: bool) -> BlockGrid:
     """Return the voxels of all views."""
     grid = BlockGrid(max_bytes)
-    for index, camera in enumerate(tqdm(cameras, desc="fusing", unit="view", disable=not progress)):
+    for index, camera in enumerate(progress_over(cameras, "fusing", "view", is_shown=progress)):
         try:
             fuse(grid, _depths(renderer, camera), space)
         except GridFullError:

@@ -5,14 +5,12 @@ import math
 import time
 from pathlib import Path
 
-import numpy as np
-
 from a2tg_jax.appearance import Plain
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
-from a2tg_jax.finish.distilling import pictures
+from a2tg_jax.finish.distilling import likeness, pictures
 from a2tg_jax.io.formats import file_bytes, files_of, files_written, format_of, lost_by, save_splats, writer_of
 from a2tg_jax.model import Model
 from a2tg_jax.results.output import check_new, check_output
@@ -114,14 +112,13 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
     views = held_out or training
     views = views[:: -(-len(views) // MOST_VIEWS)]
-    pairs = zip(pictures(plain, views), pictures(model, views), strict=True)
-    likeness = -10 * math.log10(max(float(np.mean([np.mean((x - y) ** 2) for x, y in pairs])), 1e-10))
+    beside = likeness(pictures(plain, views), pictures(model, views))
     degree, ratio = plain.gaussians.sh_degree, plain.num_bytes / model.num_bytes
     numbers = f"{counted(model.num, 'splat')} into {plain.num:,} plain ones of SH degree {degree}"
     judged = counted(len(views), f"{'held-out' if held_out else 'training'} view")
     return (
         plain,
-        f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness:.1f} dB beside the model in {judged}",
+        f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {beside:.1f} dB beside the model in {judged}",
     )
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Literal
 
 from PIL import Image
-from tqdm import tqdm
 
 from a2tg_jax.core.cameras import Camera, crop_camera
 from a2tg_jax.core.capture import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.bars import progress_over
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
@@ -87,7 +87,7 @@ def render_frames(
         cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
     settings = dataclasses.replace(settings_of(planned.system), supersample=supersample)
     renderer = Renderer(model, cameras=cameras.values(), settings=settings, has_geometry=False)
-    for file_name, camera in tqdm(cameras.items(), desc="frames", unit="frame"):
+    for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         save_picture(out / file_name, to_uint8(renderer(camera).color))
     return [out / file_name for file_name in cameras]
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from tqdm import tqdm
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.data import view_image
+from a2tg_jax.host.bars import progress_over
 from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.mesh.atlas import check_texture
 from a2tg_jax.mesh.blocks import GridFullError
@@ -123,19 +123,24 @@ def _pictures(source: Source, kind: TextureSource) -> Iterator[Picture]:
             f"the photographs of {source.title} are missing; choose --texture renders, or give the run folder while "
             "its scene is in place"
         )
+    if any(view.camera.rays is not None for view in scene.train):
+        raise ValueError(
+            f"the photographs of {source.title} are kept behind their lens (--lens keep), and a texture needs pinholes: "
+            "choose --texture renders"
+        )
     cameras = dict(zip(origin.names, origin.cameras, strict=True))
     views = [view for view in scene.train if view.name in cameras]
     background = source.model.background
     return (
         (cameras[view.name], view_image(view, background), None if view.mask is None else view.mask.read())
-        for view in tqdm(views, desc="texture", unit="view")
+        for view in progress_over(views, "texture", "view")
     )
 
 
 def _renders(source: Source) -> Iterator[Picture]:
     cameras = training_cameras(source.model)
     renderer = Renderer(source.model, cameras=cameras, settings=source.settings, has_geometry=False)
-    for camera in tqdm(cameras, desc="texture", unit="view"):
+    for camera in progress_over(cameras, "texture", "view"):
         yield camera, np.asarray(renderer(camera).color), None
 
 

@@ -8,14 +8,13 @@ from collections.abc import Callable
 from tqdm import tqdm
 
 from a2tg_jax.core.display import in_bytes
+from a2tg_jax.host.bars import has_terminal, is_line_due
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.step import StepInfo
 
 MOMENTUM = 0.95
 TIMED_SECONDS, TIMED_STEPS = 2.0, 3
 """Smallest number of timed steps before a forecast of the duration."""
-PLAIN_SHARE, PLAIN_SECONDS = 0.1, 3.0
-"""Share of a stage, and seconds, between plain lines."""
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 """tqdm's format without its rate and remaining time, which count compilation."""
 
@@ -113,7 +112,7 @@ class ProgressBar:
         self._bar.update()
         if len(history.iteration) and not self._bar.disable:
             self._bar.set_postfix_str(self._told(history), refresh=False)
-        if self._is_plain and self._is_line_due():
+        if self._is_plain and is_line_due(self._done, self._total, *self._last_line):
             self._print(f"{self._done:,} of {self._total:,}, {self._told(history)}")
 
     def _told(self, history: History) -> str:
@@ -126,17 +125,6 @@ class ProgressBar:
             )
         return ", ".join(words)
 
-    def _is_line_due(self) -> bool:
-        """Return whether a tenth of the stage is done since the last line, and some seconds."""
-        done, at = self._last_line
-        is_next = self._done - done >= PLAIN_SHARE * self._total and time.perf_counter() - at >= PLAIN_SECONDS
-        return is_next or self._done == self._total
-
     def _print(self, text: str) -> None:
         print(f"{self._title}: {text}", file=sys.stderr, flush=True)
         self._last_line = self._done, time.perf_counter()
-
-
-def has_terminal() -> bool:
-    """Return whether stderr can redraw a line: it is a terminal or a notebook."""
-    return sys.stderr.isatty() or type(sys.stderr).__module__.startswith("ipykernel")
