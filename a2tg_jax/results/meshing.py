@@ -125,8 +125,8 @@ def _pictures(source: Source, kind: TextureSource) -> Iterator[Picture]:
         )
     if any(view.camera.rays is not None for view in scene.train):
         raise ValueError(
-            f"the photographs of {source.title} are kept behind their lens (--lens keep), and a texture needs pinholes: "
-            "choose --texture renders"
+            f"the photographs of {source.title} are kept behind their lens (--lens keep), and a texture needs those of "
+            "pinholes: choose --texture renders"
         )
     cameras = dict(zip(origin.names, origin.cameras, strict=True))
     views = [view for view in scene.train if view.name in cameras]
