@@ -178,6 +178,12 @@ def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
     return [(*view.picture.size, lens_of(view)) for view in views]
 
 
+def ray_bytes(views: Sequence[View]) -> int:
+    """Return the bytes of the rays of the views' lenses; those of one lens count once."""
+    arrays = {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
+    return sum(int(rays.nbytes) for rays in arrays.values())
+
+
 def views_by_kind(views: Sequence[View]) -> list[list[View]]:
     """Return the views of each image size and lens, both in order of appearance."""
     groups: dict[tuple[int, int, int], list[View]] = {}

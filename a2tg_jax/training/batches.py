@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from a2tg_jax.data.scene import View, kinds_of
+from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.rasterize.exchange import Exchange
 from a2tg_jax.rasterize.placement import everywhere, spread_pixels
@@ -102,11 +102,16 @@ def plan_batches(
     views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
 ) -> BatchPlan:
     """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
-    sizes = [view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size) for view in views]
-    fits = sum(sizes) <= (device_room() if room is None else room)
+    sizes = [view_bytes(view, has_depths) for view in views]
+    fits = sum(sizes) + ray_bytes(views) <= (device_room() if room is None else room)
     batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
     return BatchPlan(fits and all(view.picture.is_held for view in views), batch_bytes, num_ahead)
+
+
+def view_bytes(view: View, has_depths: bool = False) -> int:
+    """Return the bytes of a photograph, and of its depth map if that comes along."""
+    return view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size)
 
 
 class PhotoStore:

@@ -14,10 +14,10 @@ import jax
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent
 from a2tg_jax.host.cores import num_threads
-from a2tg_jax.training.batches import plan_batches
+from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.start import initial_number, no_rows, num_rows
@@ -123,7 +123,7 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
     return Bytes(
-        photographs=held_bytes(scene) + fed_bytes(scene.train, batch),
+        photographs=held_bytes(scene) + fed_bytes(scene.train, batch, stage.has_depths),
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
         gradients=STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num),
         pixels=largest * (per_pixel + VIEW_PER_PIXEL * (batch - 1)) + STEP_PER_PAIR * pairs,
@@ -131,15 +131,16 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
 
 
 def held_bytes(scene: Scene) -> int:
-    """Return the bytes of the photographs that the scene keeps in memory."""
-    return sum(view.picture.nbytes for view in (*scene.train, *scene.test) if view.picture.is_held)
+    """Return the bytes of the photographs, and of the rays of their lenses, that the scene keeps in memory."""
+    views = (*scene.train, *scene.test)
+    return sum(view.picture.nbytes for view in views if view.picture.is_held) + ray_bytes(views)
 
 
-def fed_bytes(views: Sequence[View], batch_size: int) -> float:
+def fed_bytes(views: Sequence[View], batch_size: int, has_depths: bool = False) -> float:
     """Return the bytes of the photographs that are ready for the step, all or the next batches, and of reading them."""
-    plan = plan_batches(tuple(views), batch_size)
+    plan = plan_batches(tuple(views), batch_size, has_depths=has_depths)
     if plan.is_resident:
-        return sum(view.picture.nbytes for view in views)
+        return sum(view_bytes(view, has_depths) for view in views) + ray_bytes(views)
     is_read = any(not view.picture.is_held for view in views)
     readers = min(plan.num_ahead, num_threads()) * is_read
     return (2 * plan.num_ahead + 1) * plan.batch_bytes + readers * DECODER_PER_PIXEL * largest_view(views)
