@@ -25,7 +25,7 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of
 from a2tg_jax.core.display import as_bytes, enlarged, png, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
@@ -43,8 +43,8 @@ from a2tg_jax.rasterize.splats import (
     project_gaussians,
 )
 from a2tg_jax.rasterize.supersampling import box_mean, finer
-from a2tg_jax.rasterize.tile_pixels import PixelGrid, pixel_grid
-from a2tg_jax.rasterize.tiles import TileGrid, bounds_of, count_pairs, tile_lists
+from a2tg_jax.rasterize.tile_pixels import TilePixels, tile_pixels
+from a2tg_jax.rasterize.tiles import TileGrid, count_pairs, tile_lists
 from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
 HEAD_ROOM = 1.25
@@ -301,7 +301,7 @@ def render_traced(
 
 def _composited(
     compositing: CompositingSettings, settings: RenderSettings, splats: Splats, rule: AppearanceRule, cutoff: Array,
-    jacobian: Array, probe: Array, pixels: PixelGrid | None,
+    jacobian: Array, probe: Array, pixels: TilePixels | None,
 ) -> Composited:  # fmt: skip
     """Return the image without background, of one device or of several."""
     capacity = settings.capacity or 0
@@ -327,9 +327,9 @@ def _for_rays(settings: RenderSettings, compositor: Compositor) -> Compositor:
     return "xla"
 
 
-def _pixels_of(camera: Camera, tile_size: int) -> PixelGrid | None:
+def _pixels_of(camera: Camera, tile_size: int) -> TilePixels | None:
     """Return the pixels of all tiles of a camera with rays; None for a pinhole camera."""
-    return None if camera.rays is None else pixel_grid(camera.rays, tile_size)
+    return None if camera.rays is None else tile_pixels(camera.rays, tile_size)
 
 
 def _compositing_settings(
@@ -448,7 +448,7 @@ def _count_pairs(
 ) -> Array:
     M, cutoff = _drawn(gaussians, camera, rule, num_live)
     pixels = _pixels_of(camera, tile_size)
-    bounds = bounds_of(M, cutoff, near_plane, pixels)
+    bounds = screen_bounds(M, cutoff, near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size), pixels)
 
 

@@ -169,6 +169,12 @@ def test_plain_systems_prune_and_grow_again(scene, name):
     assert (np.diff(numbers) < 0).any() and result.model.num == 30_000 // 52
 
 
+def test_times_after_the_last_growth_are_refused():
+    with pytest.raises(ValueError, match=r"prune.at must begin before the last growth, at 0.5 of the stage; got \(0.6"):
+        dataclasses.replace(a2tg.Gaussians2d(), prune=PruneConfig(share=0.3, at=(0.6, 0.7))).check()
+    dataclasses.replace(a2tg.Gaussians2dMcmc(), prune=PruneConfig(share=0.3, at=(0.6, 0.7))).check()
+
+
 def test_what_other_events_have_gathered_follows(scene):
     run = StageRun(scene, SYSTEM, 0, initial_model(scene, SYSTEM))
     first = SYSTEM.stages()[0].events[2].iterations(200)[0]

@@ -1,6 +1,7 @@
 """Cameras with a ray for each pixel: the picture of a pinhole camera where they are one, and of each ray elsewhere."""
 
 import dataclasses
+import functools
 import json
 import warnings
 
@@ -12,9 +13,13 @@ from PIL import Image
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
+from a2tg_jax.appearance import PlainRule
 from a2tg_jax.core.cameras import Camera, looking, resize_camera
 from a2tg_jax.data.scene import kinds_of
+from a2tg_jax.model import Model
+from a2tg_jax.render import pairs_of_view
 from a2tg_jax.systems.stage1 import PruneConfig
+from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.start import initial_model
 
 WIDTH, HEIGHT = 43, 30
@@ -105,6 +110,57 @@ def test_gradients_through_rays_are_those_of_finite_differences(x64, compositor)
         np.testing.assert_allclose(np.sum(np.asarray(gradient) * direction), slope, rtol=2e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("statistic", ["position", "center", "screen"])
+def test_statistics_do_not_depend_on_the_image_plane(x64, statistic):
+    """The rays of a pinhole camera, told in the image plane of a focal length four times shorter."""
+    scene = draw_scene(8, num=20)
+    camera, gaussians = as_camera(scene, "float64"), as_gaussians(scene, "float64")
+    wide = dataclasses.replace(camera, K=camera.K * jnp.asarray([[0.25], [0.25], [1.0]]))
+    in_plane = pinhole_rays(wide, np.asarray(camera.K))
+    model = Model(gaussians)
+    of_camera, of_rays = (
+        a2tg.view_gradients(
+            lambda model, output: jnp.sum(output.color**2), model, seen, statistic=statistic,
+            settings=a2tg.RenderSettings(compositor="xla"),
+        ).norms
+        for seen in (camera, in_plane)
+    )  # fmt: skip
+    assert float(of_camera.max()) > 0
+    np.testing.assert_allclose(of_rays, of_camera, rtol=1e-5, atol=1e-6 * float(of_camera.max()))
+
+
+def test_normals_of_depth_follow_the_rays():
+    """Exact depth and normals of a tilted plane, seen through a fisheye: consistent, but for differences' curvature."""
+    camera = fisheye(Camera(jnp.eye(4), jnp.asarray([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]), 40, 30))
+    normal = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+    slopes = np.concatenate([(np.asarray(camera.rays) - [20, 15]) / 30, np.ones((30, 40, 1))], axis=2)
+    depth = jnp.asarray(-4.0 / (slopes @ normal), jnp.float32)
+    normals = jnp.broadcast_to(jnp.asarray(normal, jnp.float32), (30, 40, 3))
+    error = functools.partial(normal_consistency, normals, depth, jnp.ones((30, 40)))
+    assert float(error(camera)) < 1e-5 < 1e-3 < float(error(dataclasses.replace(camera, rays=None)))
+    half = jnp.asarray(np.where(np.arange(40)[None, :, None] < 20, np.nan, np.asarray(camera.rays)))
+    gradient = jax.grad(lambda depth: normal_consistency(normals, depth, jnp.ones((30, 40)),
+                                                         dataclasses.replace(camera, rays=half)))(depth)  # fmt: skip
+    assert np.isfinite(gradient).all()
+
+
+def test_wide_lenses_make_few_pairs_more():
+    """One tile far off the axis, whose pixels are long in the image plane, widens no splat in the middle."""
+    K = jnp.asarray([[90.0, 0, 100], [0, 90, 75], [0, 0, 1]], jnp.float32)
+    camera = Camera(jnp.eye(4), K, 200, 150)
+    wide = fisheye(camera)
+    assert float(jnp.abs(wide.rays).max()) > 600  # The corner looks 80° off the axis.
+    rng = np.random.default_rng(0)
+    gaussians = dataclasses.replace(
+        as_gaussians(draw_scene(2, num=200), "float32"),
+        means=jnp.asarray(np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), np.full(200, 2.0)]), jnp.float32),
+        log_scales=jnp.full((200, 2), np.log(0.01), jnp.float32),
+    )
+    settings = a2tg.RenderSettings()
+    of_pinhole, of_rays = (pairs_of_view(gaussians, seen, PlainRule(), settings) for seen in (camera, wide))
+    assert of_pinhole > 200 and of_rays < 1.5 * of_pinhole
+
+
 def test_pixels_without_a_ray_see_the_background(x64):
     scene = draw_scene(5)
     camera = fisheye(as_camera(scene, "float64"))
@@ -189,8 +245,8 @@ def test_pixels_too_far_from_the_direction_of_view_do_not_count(tmp_path):
     has_ray = np.isfinite(view.camera.rays).all(axis=2)
     assert 0.5 < has_ray.mean() < 1
     np.testing.assert_array_equal(view.mask.read(), has_ray)
-    with pytest.raises(ValueError, match="fewer than half of the pixels a ray"):
-        a2tg.load_scene(write_fisheye(tmp_path, focal=4.0), lens="keep")
+    with pytest.raises(ValueError, match="gives 2% of the pixels a ray within 80°"):
+        a2tg.load_scene(write_fisheye(tmp_path, focal=1.5), lens="keep")
     with pytest.raises(ValueError, match="lens must be one of undistort, keep; got 'crop'"):
         a2tg.load_scene(tmp_path, lens="crop")
 

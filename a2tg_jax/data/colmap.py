@@ -15,7 +15,7 @@ from a2tg_jax.data.colmap_text import check_text
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.depth_files import depth_map, find_depths
 from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
-from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
+from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
@@ -128,7 +128,8 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
         pixels, K = lens.undistort(photograph, still_to_downscale)
         rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
-        raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
+        advice = "" if isinstance(lens, KeptLens) else "; undistort the scene with COLMAP first"
+        raise ValueError(f"{file}: its camera model {error}{advice}") from None
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, file if pixels is photograph else None)
     depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)

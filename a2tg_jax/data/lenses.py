@@ -28,6 +28,8 @@ WIDEST_ANGLE = np.deg2rad(80.0)
 FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
 _LOCK = threading.Lock()
+LEAST_SEEN = 0.05
+"""Smallest share of pixels with a ray."""
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
 
@@ -145,7 +147,7 @@ class KeptLens(Lens):
     """A calibrated camera whose photographs are kept as they are."""
 
     def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return a photograph divided by `downscale`, and the K [3, 3] in whose image plane its rays are told."""
+        """Return a photograph divided by `downscale`, and its K [3, 3]; `rays` are places in the image plane of K."""
         new_size = downscaled_size(pixels.shape[1], pixels.shape[0], downscale)
         return resize_pixels(pixels, *new_size), scaled_intrinsics(self._matrix(), self.size, new_size)
 
@@ -157,7 +159,7 @@ class KeptLens(Lens):
         """Return the rays [height, width, 2] of pictures of a size, NaN where the lens has none; None of a pinhole.
 
         Raises:
-          ValueError: if the model has no pinhole equivalent (panoramas), or fewer than half of the pixels have a ray.
+          ValueError: if the model has no pinhole equivalent (panoramas), or next to no pixel has a ray.
         """
         K = scaled_intrinsics(self._matrix(), self.size, (width, height))
         if self.is_pinhole:
@@ -187,12 +189,20 @@ def _rays(
     again = np.asarray(camera.img_from_cam(_homogeneous(np.nan_to_num(slopes))))
     is_ray = np.linalg.norm(again - places, axis=1) <= FARTHEST_FROM_RAY
     is_ray &= np.linalg.norm(slopes, axis=1) <= np.tan(WIDEST_ANGLE)  # False for NaN.
-    if 2 * np.count_nonzero(is_ray) < len(is_ray):
-        raise ValueError(f"{model} has a distortion that gives fewer than half of the pixels a ray")
+    if is_ray.mean() < LEAST_SEEN:
+        raise ValueError(
+            f"{model} gives {is_ray.mean():.0%} of the pixels a ray within {np.rad2deg(WIDEST_ANGLE):.0f}° of the "
+            "direction of view: are its parameters right?"
+        )
     rays = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
     found = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
     found.setflags(write=False)
     return found
+
+
+def forget_rays() -> None:
+    """Release the rays that scenes no longer hold, once the photographs of a scene are read."""
+    _rays.cache_clear()
 
 
 def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:

@@ -8,14 +8,14 @@ from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.frames import Frames, load_frames
-from a2tg_jax.data.lenses import LensUse
+from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
 from a2tg_jax.data.metashape import metashape_file, metashape_frames
 from a2tg_jax.data.photo_folder import check_no_video, holds_photos
 from a2tg_jax.data.polycam import polycam_folders, polycam_frames
 from a2tg_jax.data.realityscan import realityscan_files, realityscan_frames
 from a2tg_jax.data.record3d import record3d_file, record3d_frames
-from a2tg_jax.data.scene import Scene, check_test_every
+from a2tg_jax.data.scene import Scene, check_test_every, warn_of_lenses
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular
@@ -62,7 +62,11 @@ def load_scene(
         raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
     if lens not in get_args(LensUse):
         raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
-    scene = _load(Path(path), downscale, test_every, room, lens)
+    try:
+        scene = _load(Path(path), downscale, test_every, room, lens)
+    finally:
+        forget_rays()
+    warn_of_lenses(scene)
     return alpha_as_mask(scene, str(path)) if alpha == "mask" else scene
 
 

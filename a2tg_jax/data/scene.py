@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
-from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, png
+from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, in_bytes, png
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap
@@ -22,6 +22,8 @@ from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
 NUM_RANDOM_POINTS = 10_000
+MANY_LENSES = 8
+"""Number of lenses beyond which it is likely that each photograph was calibrated alone."""
 LONGEST_PREVIEW = 800
 """Longest side in pixels of the picture of a view in a notebook."""
 NUM_THUMBNAILS = 8
@@ -182,6 +184,18 @@ def ray_bytes(views: Sequence[View]) -> int:
     """Return the bytes of the rays of the views' lenses; those of one lens count once."""
     arrays = {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
     return sum(int(rays.nbytes) for rays in arrays.values())
+
+
+def warn_of_lenses(scene: Scene) -> None:
+    """Warn if most photographs have a lens of their own: the rays of each then take more memory than its pixels."""
+    views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
+    num = len({id(view.camera.rays) for view in views})
+    if num > MANY_LENSES and 2 * num > len(views):
+        warnings.warn(
+            f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
+            "calibrate photographs of one camera together, or undistort them (--lens undistort)",
+            stacklevel=3,
+        )
 
 
 def views_by_kind(views: Sequence[View]) -> list[list[View]]:

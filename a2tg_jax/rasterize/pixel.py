@@ -98,6 +98,15 @@ def _cross(a: Triple, b: Triple) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+def _in_frame(tile: TileNumbers, along_x: Array, along_y: Array) -> tuple[Array, Array]:
+    """Return a gradient by a place of the image plane as one by the place in the tile's frame."""
+    if len(tile) == 2:
+        return along_x, along_y
+    _, _, xx, xy, yx, yy = tile
+    inverse = 1 / (xx * yy - xy * yx)
+    return (yy * along_x - yx * along_y) * inverse, (xx * along_y - xy * along_x) * inverse
+
+
 def _mixed(p: Array, a: Triple, q: Array, b: Triple) -> Triple:
     return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
@@ -286,8 +295,8 @@ def positional_gradient(
 
     "position": |∂L/∂μ| per world component (A²TG).
     "screen": |∂L/∂c| per pixel axis of the projected mean c if the low-pass filter decides, else 0 (gsplat's `absgrad`
-    of 2D Gaussians).
-    "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, if the hit decides, else 0 (2DGS).
+    of 2D Gaussians). With a frame, it is by pixels of the image.
+    "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, if the hit decides, else 0 (2DGS); likewise.
 
     Args:
       statistic: kind of statistic.
@@ -312,7 +321,7 @@ def positional_gradient(
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
     # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c if the low-pass filter decides.
-    on_screen = d_mean[0] * mean[2], d_mean[1] * mean[2]
+    on_screen = _in_frame(tile, d_mean[0] * mean[2], d_mean[1] * mean[2])
     if statistic == "center":
         along_x, along_y = (jnp.where(is_ray, number, 0.0) for number in on_screen)
     else:

@@ -1,11 +1,11 @@
 """Pixels of a camera with a ray for each pixel, such as a fisheye, in frames of its tiles.
 
-`Camera.rays` places each pixel's ray in the image plane of the pinhole camera K, where splats are projected. A tile has
-the affine frame that takes that plane to the tile's own pixels best. In its frame pixels lie about where they do in the
-image, so that the low-pass filter is as wide there as for a pinhole camera, and float32 is as exact. The ray of every
-pixel is still its own: nothing but the filter is approximated.
+`Camera.rays` places each pixel's ray in the image plane of the pinhole camera K, where splats are projected. Each tile
+has an affine frame: the affine map from that plane to the tile's pixels that fits best. In its frame, pixels lie about
+where they do in the image. So the low-pass filter is as wide as for a pinhole camera, and float32 is as exact. Every
+pixel keeps its own ray: only the filter is approximated.
 
-T tiles of P pixels; C columns and R rows of tiles.
+T tiles of P pixels, in C columns.
 """
 
 from typing import NamedTuple
@@ -45,17 +45,7 @@ class TilePixels(NamedTuple):
     """[T] bound of the length in the image plane of one pixel of the image."""
 
 
-class PixelGrid(NamedTuple):
-    """Pixels of all tiles of an image."""
-
-    tiles: TilePixels
-    columns: Spans
-    """Horizontal coordinates, [C]."""
-    rows: Spans
-    """Vertical coordinates, [R]."""
-
-
-def pixel_grid(rays: Array, tile_size: int) -> PixelGrid:
+def tile_pixels(rays: Array, tile_size: int) -> TilePixels:
     """Return the pixels of all tiles.
 
     Args:
@@ -73,8 +63,7 @@ def pixel_grid(rays: Array, tile_size: int) -> PixelGrid:
     centers, jacobians = _fitted(places, is_seen, tile_size)
     frames = jnp.linalg.inv(jacobians)
     offsets = jnp.where(is_seen[:, None], places - centers[:, :, None], 0.0)
-    grid = boxes.reshape(num_rows, num_columns, 4)
-    tiles = TilePixels(
+    return TilePixels(
         centers=centers,
         frames=frames,
         offsets=jnp.einsum("tij,tjp->tip", frames, offsets, precision="highest"),
@@ -82,8 +71,6 @@ def pixel_grid(rays: Array, tile_size: int) -> PixelGrid:
         boxes=boxes,
         magnifications=jnp.sqrt(jnp.sum(jacobians**2, axis=(1, 2))),
     )
-    columns = _spans(jnp.min(grid[..., 0], axis=0), jnp.max(grid[..., 2], axis=0))
-    return PixelGrid(tiles, columns, _spans(jnp.min(grid[..., 1], axis=1), jnp.max(grid[..., 3], axis=1)))
 
 
 def _boxes(places: Array, is_seen: Array) -> Array:
@@ -114,9 +101,22 @@ def _fitted(places: Array, is_seen: Array, tile_size: int) -> tuple[Array, Array
     return centers, covariance @ jnp.linalg.inv(spread)
 
 
-def _spans(low: Array, high: Array) -> Spans:
-    """Return the spans of columns, or rows, with these smallest and largest coordinates."""
-    return Spans(jax.lax.cummax(high), jax.lax.cummin(low, reverse=True))
+def spans_of(pixels: TilePixels, num_columns: int, reach: Array) -> tuple[Spans, Spans]:
+    """Return the spans of the columns and of the rows, so many pixels of the image wider at each side.
+
+    Args:
+      pixels: of all tiles.
+      num_columns: number C of columns.
+      reach: pixels.
+    """
+    margins = (reach * pixels.magnifications)[:, None]
+    low, high = pixels.boxes[:, :2] - margins, pixels.boxes[:, 2:] + margins
+    low, high = (edge.reshape(-1, num_columns, 2) for edge in (low, high))
+    spans = []
+    for axis in range(2):  # Over the rows for the columns, over the columns for the rows.
+        begun, reached = jnp.min(low[..., axis], axis=axis), jnp.max(high[..., axis], axis=axis)
+        spans.append(Spans(jax.lax.cummax(reached), jax.lax.cummin(begun, reverse=True)))
+    return spans[0], spans[1]
 
 
 def covered(spans: Spans, low: Array, high: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.geometry import Outline, ScreenBounds, screen_bounds
-from a2tg_jax.rasterize.tile_pixels import PixelGrid, covered
+from a2tg_jax.rasterize.tile_pixels import TilePixels, covered, spans_of
 
 
 class TileGrid(NamedTuple):
@@ -47,7 +47,7 @@ class TileLists(NamedTuple):
     """Number of pairs before the outline test, as a float; the capacity must hold it."""
     overflow: Array
     """Whether the pairs did not fit; the lists are then empty."""
-    pixels: PixelGrid | None = None
+    pixels: TilePixels | None = None
     """Pixels of the tiles, if the camera has a ray for each pixel."""
 
 
@@ -60,14 +60,15 @@ class Rectangles(NamedTuple):
     counts: Array
 
 
-def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: PixelGrid | None = None) -> Rectangles:
+def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | None = None) -> Rectangles:
     """Return the tiles that each splat's box covers, or may cover if pixels have rays of their own."""
     if pixels is None:
         x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
         y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
     else:
-        x0, columns = covered(pixels.columns, bounds.left, bounds.right)
-        y0, rows = covered(pixels.rows, bounds.top, bounds.bottom)
+        spans_x, spans_y = spans_of(pixels, grid.columns, jnp.max(bounds.outline.radius, initial=0.0))
+        x0, columns = covered(spans_x, bounds.left, bounds.right)
+        y0, rows = covered(spans_y, bounds.top, bounds.bottom)
     columns = jnp.where(rows > 0, columns, jnp.int32(0))
     return Rectangles(x0, y0, columns, columns * rows)
 
@@ -86,7 +87,7 @@ def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Arra
     return begin, jnp.where(last < first, nothing, end - begin)
 
 
-def count_pairs(bounds: ScreenBounds, grid: TileGrid, pixels: PixelGrid | None = None) -> Array:
+def count_pairs(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | None = None) -> Array:
     """Return the number of pairs before the outline test, as a float, which cannot wrap."""
     return total_pairs(tile_rectangles(bounds, grid, pixels).counts)
 
@@ -144,7 +145,7 @@ def _touches(outline: Outline, distance_to_box: Callable[[Array, Array], tuple[A
 
 
 def tile_lists(
-    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: PixelGrid | None = None
+    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: TilePixels | None = None
 ) -> TileLists:
     """List the splats that touch each tile, ordered by depth, ties by index.
 
@@ -154,7 +155,7 @@ def tile_lists(
       capacity: number of pairs that fit, before the outline test; `overflow` tells if there were more.
       pixels: of the tiles, if the camera has a ray for each pixel.
     """
-    bounds, depths = bounds_of(M, cutoff, near_plane, pixels), M[:, 2, 2]
+    bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
     rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid, pixels))
     total = total_pairs(rectangles.counts)
@@ -176,27 +177,11 @@ def tile_lists(
         is_touched = outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     else:
         own = jnp.minimum(y * grid.columns + x, grid.num - 1)
-        is_touched = outline_touches_rays(per_pair, pixels.tiles.boxes[own], pixels.tiles.magnifications[own])
+        is_touched = outline_touches_rays(per_pair, pixels.boxes[own], pixels.magnifications[own])
     is_kept = (position < ends[-1]) & is_touched
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)
     return TileLists(ids, starts, total, overflow, pixels)
-
-
-def bounds_of(M: Array, cutoff: Array, near_plane: float, pixels: PixelGrid | None = None) -> ScreenBounds:
-    """Return `core.geometry.screen_bounds`, with the low-pass filter's reach in pixels that have rays of their own."""
-    bounds = screen_bounds(M, cutoff, near_plane)
-    if pixels is None:
-        return bounds
-    outline, (left, top, right, bottom) = bounds.outline, bounds[:4]
-    reach = outline.radius * jnp.max(pixels.tiles.magnifications)
-    return ScreenBounds(
-        jnp.where(left <= right, jnp.minimum(left, outline.mean_x - reach), left),
-        jnp.where(top <= bottom, jnp.minimum(top, outline.mean_y - reach), top),
-        jnp.where(left <= right, jnp.maximum(right, outline.mean_x + reach), right),
-        jnp.where(top <= bottom, jnp.maximum(bottom, outline.mean_y + reach), bottom),
-        outline,
-    )
 
 
 def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:

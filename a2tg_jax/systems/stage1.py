@@ -40,6 +40,8 @@ DENSITY_OPTIONS = {
 PRUNE_OPTIONS = {"Prune.share": "prune.share", "Prune.at": "prune.at"}
 """Option that sets a field of an event (`System.event_options`)."""
 PRUNE_RANGES: Ranges = {"prune.share": (0, 0.9)}
+LONG_STAGE = 30_000
+"""Iterations of a stage in which the times of growth are told as fractions."""
 LAST_PRUNING = 0.8
 """Latest fraction of the first stage at which Gaussians are pruned; MCMC's growth ends at 5/6."""
 DENSITY_RANGES: Ranges = {"densify.threshold": ANY_RATE, "densify.least_opacity": (0, 0.99)}
@@ -104,9 +106,9 @@ class PruneConfig:
     """Pruning of the Gaussians that show least; others grow in their place."""
 
     share: float = Prune.share
-    """Share of the Gaussians to prune each time; 0: none before the end of the stage."""
+    """Share of the Gaussians to prune each time; 0: none. `bytewise` prunes at the end of the stage in any case."""
     at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-    """Fractions of the first stage, up to 0.8. Those after the last growth are left out."""
+    """Fractions of the first stage, up to 0.8. Those after the last growth are left out: in `gaussians-2d` from 0.5."""
 
     def events(self, num_iterations: int, growth: Callable[[int], Times]) -> tuple[Event, ...]:
         """Return the event that prunes while others grow; none if the share is 0.
@@ -122,6 +124,11 @@ class PruneConfig:
             raise ValueError(
                 f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
                 f"what is pruned; got {shortened(self.at)}: lower the last, or set prune.share to 0"
+            )
+        if all(fraction * LONG_STAGE >= growth(LONG_STAGE).last_time for fraction in self.at):
+            ends = growth(LONG_STAGE).last_time / LONG_STAGE
+            raise ValueError(
+                f"prune.at must begin before the last growth, at {ends:.2g} of the stage; got {shortened(self.at)}"
             )
         last = growth(num_iterations).last_time
         at = tuple(fraction for fraction in self.at if round(fraction * num_iterations) < last)

@@ -128,6 +128,8 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
     """
     check_floats("depth", depth, (camera.height, camera.width))
     check_shape("is_valid", is_valid, depth.shape)
+    if camera.rays is not None:
+        is_valid = is_valid & jnp.all(jnp.isfinite(camera.rays), axis=2)
     points = back_project(depth, camera)
     along_x = points[1:-1, 2:] - points[1:-1, :-2]
     along_y = points[2:, 1:-1] - points[:-2, 1:-1]
@@ -166,9 +168,12 @@ def _live_mean(values: Array, num_live: Array | int) -> Array:
 
 
 def back_project(depth: Array, camera: Camera) -> Array:
-    """Return the world points [H, W, 3] of the pixel centres at depths [H, W] along the camera's z axis."""
+    """Return the world points [H, W, 3] of the pixels at depths [H, W] along the camera's z axis; those of pixels
+    without a ray have no meaning."""
     height, width = depth.shape
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
+    if camera.rays is not None:
+        x, y = jnp.moveaxis(jnp.where(jnp.isfinite(camera.rays), camera.rays, 0.0), -1, 0)
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
     rotation = camera.viewmat[:3, :3]
     points: Array = (rays @ rotation) * depth[..., None] + camera.center[None, None]

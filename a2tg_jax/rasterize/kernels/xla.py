@@ -173,7 +173,7 @@ def tiles_of_group(
     end = jnp.where(is_real, lists.starts[tile + 1], start)
     if lists.pixels is None:
         return Tiles(x, y, end), start
-    own: TilePixels = jax.tree.map(lambda leaf: leaf[tile], lists.pixels.tiles)
+    own: TilePixels = jax.tree.map(lambda leaf: leaf[tile], lists.pixels)
     own = own._replace(is_seen=own.is_seen & is_real[:, None])
     return Tiles(own.centers[:, 0], own.centers[:, 1], end, own), start
 

@@ -33,7 +33,7 @@ from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.texels import NativeTexture, Place, TexelWriter
 from a2tg_jax.rasterize.kernels.native.writer import LONG
 from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions, KernelSpec
-from a2tg_jax.rasterize.tile_pixels import PixelGrid
+from a2tg_jax.rasterize.tile_pixels import TilePixels
 
 INTEGERS = ("first", "last", "columns", "width", "height")
 FORWARD = ("ids", "starts", "splats", "regions", "texels", "pixels", "result")
@@ -70,18 +70,18 @@ def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
     return np.moveaxis(blocks, 2, 1).reshape(-1)
 
 
-def packed_pixels(spec: KernelSpec, pixels: PixelGrid | None, dtype: DTypeLike) -> Array:
+def packed_pixels(spec: KernelSpec, pixels: TilePixels | None, dtype: DTypeLike) -> Array:
     """Pack the pixels of each tile as a row: its numbers, then x, y and whether they are seen, in the order of vectors.
 
     All four parts fill whole vectors. Without rays, the result is empty.
     """
     if pixels is None:
         return jnp.zeros((1, 0), dtype)
-    tiles, lanes = pixels.tiles, num_lanes(spec)
+    lanes = num_lanes(spec)
     order = pixel_order(spec.tile_size, lanes)
-    numbers = jnp.concatenate([tiles.centers, tiles.frames.reshape(-1, 4)], axis=1)
-    x, y = (tiles.offsets[:, k, order] for k in range(2))
-    parts = numbers, x, y, tiles.is_seen[:, order].astype(dtype)
+    numbers = jnp.concatenate([pixels.centers, pixels.frames.reshape(-1, 4)], axis=1)
+    x, y = (pixels.offsets[:, k, order] for k in range(2))
+    parts = numbers, x, y, pixels.is_seen[:, order].astype(dtype)
     return jnp.concatenate([jnp.pad(part, ((0, 0), (0, -part.shape[1] % lanes))) for part in parts], axis=1)
 
 
