@@ -18,6 +18,18 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
+def pytest_addoption(parser):
+    parser.addoption("--long", action="store_true", help="run the tests marked `long`, too")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Skips tests that take long and have shorter kin, unless they are asked for."""
+    if not config.getoption("--long"):
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.skip(reason="takes long: pytest --long"))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def fresh_caches():
     """Compiled programs go with the module that needed them: a process may only have so many pieces of memory, and XLA

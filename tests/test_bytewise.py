@@ -29,7 +29,14 @@ def test_presets_can_be_trained(preset):
 
 
 @pytest.mark.parametrize(
-    "base_degree, shares", [(0, (0.1, 0.05)), (1, (0.1, 0.05)), (0, (0.2, 0.0)), (2, (0.0, 0.1)), (0, (0.0, 0.0))]
+    "base_degree, shares",
+    [
+        (0, (0.1, 0.05)),
+        pytest.param(1, (0.1, 0.05), marks=pytest.mark.long),
+        pytest.param(0, (0.2, 0.0), marks=pytest.mark.long),
+        (2, (0.0, 0.1)),
+        (0, (0.0, 0.0)),
+    ],
 )
 def test_every_mix_fills_its_bytes(scene, base_degree, shares):
     view, texture = shares

@@ -14,7 +14,10 @@ SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
 FOUR = "--xla_force_host_platform_device_count=4"
 
 
-@pytest.mark.parametrize("what", ["rendering", "overflowing", "training", "textures"])
+LONG = [pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures")]
+
+
+@pytest.mark.parametrize("what", ["rendering", "training", *LONG])
 def test_several_devices_do_what_one_does(what, tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} {FOUR}")
     command = [sys.executable, str(SCRIPT), what, str(tmp_path)]

@@ -47,6 +47,7 @@ def test_a_change_adds_what_it_draws(inner):
     np.testing.assert_allclose(later - before, drawn, atol=2e-6)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_many_steps_are_at_the_least_error():
     """That of a dense matrix, column by column, solved by numpy."""

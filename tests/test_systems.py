@@ -252,6 +252,7 @@ def test_photographs_stay_on_the_device_while_they_fit(scene):
     nothing.close()
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_where_photographs_are(scene, monkeypatch, request):
     if passes_in_its_own_process(request):
         return

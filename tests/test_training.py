@@ -92,6 +92,7 @@ def test_resumed_run_is_the_same(scene, trained, tmp_path, which):
     assert_same(resumed, result)
 
 
+@pytest.mark.long
 def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
     """Buckets with the room of another run's textures, one of them for a size that nobody has here."""
     if passes_in_its_own_process(request):

@@ -72,8 +72,10 @@ def described(value: Any) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """Return the `repr` of a dataclass that holds arrays."""
-    fields = (f"{field.name}={described(getattr(value, field.name))}" for field in dataclasses.fields(value))
+    """Return the `repr` of a dataclass that holds arrays, without optional fields that are None."""
+    found = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    left_out = {field.name for field in dataclasses.fields(value) if field.default is None}
+    fields = (f"{name}={described(own)}" for name, own in found.items() if own is not None or name not in left_out)
     return f"{type(value).__name__}({', '.join(fields)})"
 
 
