@@ -175,10 +175,22 @@ def test_metashape(tmp_path, within):
     assert load_scene(tmp_path / "cameras.xml").name == tmp_path.name
 
 
+def test_the_adjusted_lens_of_metashape_is_taken(tmp_path):
+    """Metashape writes the calibration that the adjustment began with before the one that it ended with."""
+    write_metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    xml, initial = file.read_text(), '<calibration type="frame" class="initial"><f>50</f></calibration>'
+    file.write_text(xml.replace("<calibration", f"{initial}<calibration"))
+    check_dots(load_scene(tmp_path), 0.1)
+    file.write_text(xml.replace('class="adjusted"', 'class="initial"'))
+    check_dots(load_scene(tmp_path), 0.1)
+
+
 @pytest.mark.parametrize(
     ("xml", "message"),
     [
-        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its lens has k4 or b2"),
+        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its lens has k4, p3, p4 or b2"),
+        (metashape_xml(WORLD, lens="<f>100</f><p4>0.1</p4>"), r"\.png: its lens has k4, p3, p4 or b2"),
         (metashape_xml(WORLD).replace("<f>100</f>", "<f>long</f>"), "1 numbers are expected; got long"),
         ('<!DOCTYPE x [<!ENTITY a "a">]><chunk><sensors/></chunk>', "it declares entities"),
         ("<chunk><sensors>", "cannot be read as XML"),

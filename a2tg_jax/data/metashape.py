@@ -22,6 +22,8 @@ from a2tg_jax.host.text import shortened
 
 SWITCHED_OFF = ("0", "false")
 """Values of a camera's attribute enabled that leave it out."""
+HIGHER_TERMS = ("k4", "p3", "p4")
+"""Coefficients of distortion that COLMAP's models do not have."""
 HEAD_BYTES = 1 << 16
 """Number of bytes of an XML file in which a chunk's sensors are looked for."""
 
@@ -87,9 +89,10 @@ def _placed(world: np.ndarray | None, pose: np.ndarray) -> np.ndarray:
 
 
 def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
-    """Return the intrinsics of a sensor as `transforms.json` has them. P1 and P2 are OpenCV's p2 and p1."""
+    """Return the adjusted intrinsics of a sensor as `transforms.json` has them. P1 and P2 are OpenCV's p2 and p1."""
     kind = sensor.get("type", "frame")
-    calibration = next((part for part in sensor.iter("calibration") if part.find("f") is not None), None)
+    with_focal = [part for part in sensor.iter("calibration") if part.find("f") is not None]
+    calibration = min(with_focal, key=lambda part: part.get("class") != "adjusted", default=None)
     if kind != "frame" or calibration is None:
         raise ValueError(f"{what}: is of a sensor of type {shortened(kind)} without a calibration; {UNDISTORTED}")
     size = calibration.find("resolution")
@@ -101,8 +104,8 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
     def read(name: str) -> float:
         return float(numbers_in(calibration.findtext(name, "0"), 1, what)[0])
 
-    if read("k4") or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
-        raise ValueError(f"{what}: its lens has k4 or b2, which are not known here; {UNDISTORTED}")
+    if any(map(read, HIGHER_TERMS)) or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
+        raise ValueError(f"{what}: its lens has k4, p3, p4 or b2, which are not known here; {UNDISTORTED}")
     return {
         "w": int(width), "h": int(height), "fl_x": read("f") + read("b1"), "fl_y": read("f"),
         "cx": width / 2 + read("cx"), "cy": height / 2 + read("cy"),
