@@ -1,17 +1,19 @@
 """Cameras of Metashape: the XML file of File > Export > Export Cameras, read as frames of `transforms.json`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from a2tg_jax.data.frames import Frames
+from a2tg_jax.data.frames import Frames, warn_of_missing_images
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
     UNDISTORTED,
     Element,
     image_of,
+    images_below,
     near_origin,
     numbers_in,
     read_xml,
@@ -42,27 +44,37 @@ def metashape_frames(file: Path) -> Frames:
     Raises:
       ValueError: if the file is no such XML, or a lens has a distortion that COLMAP's models do not know.
     """
-    root = read_xml(file)
-    frames = []
-    for chunk in root.iter("chunk"):
+    frames, lacking = [], []
+    below = images_below(file.parent / "images")
+    for label, sensor, pose in _posed_cameras(file):
+        image = image_of(file.parent, label, below)
+        if image is None:
+            lacking.append(label)
+            continue
+        lens = _metashape_lens(sensor, f"{file}: {label}")
+        frames.append({**lens, "file_path": image, "transform_matrix": pose @ OPENGL})
+    if not frames:
+        raise ValueError(
+            f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
+        )
+    warn_of_missing_images(file, lacking, len(frames) + len(lacking))
+    points = sorted(file.parent.glob("*.ply"))
+    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
+
+
+def _posed_cameras(file: Path) -> Iterator[tuple[str, Element, np.ndarray]]:
+    """Yield label, sensor and pose [4, 4] in the world of each camera that has a pose and is switched on."""
+    for chunk in read_xml(file).iter("chunk"):
         sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
         worlds = {part.get("id"): _world(part, file) for part in chunk.iter("component")}
         of_chunk = _world(chunk, file)
         for camera in chunk.iter("camera"):
             pose, sensor = camera.find("transform"), sensors.get(camera.get("sensor_id"))
-            image = image_of(file.parent, camera.get("label") or "")
-            if pose is None or sensor is None or image is None or camera.get("enabled") in SWITCHED_OFF:
+            if pose is None or sensor is None or camera.get("enabled") in SWITCHED_OFF:
                 continue
             world = worlds.get(camera.get("component_id"))
             placed = _placed(of_chunk if world is None else world, numbers_in(pose.text, 16, file).reshape(4, 4))
-            lens = _metashape_lens(sensor, f"{file}: {camera.get('label')}")
-            frames.append({**lens, "file_path": image, "transform_matrix": placed @ OPENGL})
-    if not frames:
-        raise ValueError(
-            f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
-        )
-    points = sorted(file.parent.glob("*.ply"))
-    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
+            yield camera.get("label") or "", sensor, placed
 
 
 def _world(part: Element, file: Path) -> np.ndarray | None:

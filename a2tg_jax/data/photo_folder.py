@@ -5,10 +5,10 @@ from collections import Counter
 from pathlib import Path
 
 from a2tg_jax.core.display import counted
+from a2tg_jax.data.images import PHOTO_SUFFIXES
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.text import as_argument
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
 FOREIGN_SUFFIXES = (".jxl", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".gif")
 """Suffixes of pictures that are not read."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
