@@ -175,10 +175,22 @@ def test_metashape(tmp_path, within):
     assert load_scene(tmp_path / "cameras.xml").name == tmp_path.name
 
 
+def test_the_adjusted_lens_of_metashape_is_taken(tmp_path):
+    """Metashape writes the calibration that the adjustment began with before the one that it ended with."""
+    write_metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    xml, initial = file.read_text(), '<calibration type="frame" class="initial"><f>50</f></calibration>'
+    file.write_text(xml.replace("<calibration", f"{initial}<calibration"))
+    check_dots(load_scene(tmp_path), 0.1)
+    file.write_text(xml.replace('class="adjusted"', 'class="initial"'))
+    check_dots(load_scene(tmp_path), 0.1)
+
+
 @pytest.mark.parametrize(
     ("xml", "message"),
     [
-        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its lens has k4 or b2"),
+        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its lens has k4, p3, p4 or b2"),
+        (metashape_xml(WORLD, lens="<f>100</f><p4>0.1</p4>"), r"\.png: its lens has k4, p3, p4 or b2"),
         (metashape_xml(WORLD).replace("<f>100</f>", "<f>long</f>"), "1 numbers are expected; got long"),
         ('<!DOCTYPE x [<!ENTITY a "a">]><chunk><sensors/></chunk>', "it declares entities"),
         ("<chunk><sensors>", "cannot be read as XML"),
@@ -222,6 +234,44 @@ def test_realityscan(tmp_path):
     (tmp_path / "0.xmp").write_text(realityscan_xmp(poses()[0], more='xcr:DistortionCoeficients="0 0 0 0 0.1 0"'))
     with pytest.raises(ValueError, match=r"0\.xmp: has the distortion model brown3 with skew, k4, t1 or t2"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("writer", [write_polycam, write_record3d, write_metashape, write_realityscan])
+def test_cameras_without_an_image_are_told(tmp_path, writer):
+    writer(tmp_path)
+    images = sorted(tmp_path.rglob("*.[jp][pn]g"))
+    images[0].unlink()
+    with pytest.warns(UserWarning, match=r"1 of 4 cameras have no image beside them, such as .*0.*: not used"):
+        scene = load_scene(tmp_path)
+    assert len(scene.train) + len(scene.test) == 3
+    for file in images[1:]:
+        file.unlink()
+    with pytest.raises(ValueError, match=r"none of its cameras has|no images rgb/0\.jpg|no photograph lies beside"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("writer", [write_metashape, write_realityscan])
+def test_photographs_in_folders_below_images(tmp_path, writer):
+    writer(tmp_path)
+    for index in range(COUNT):
+        folder = tmp_path / "images" / f"flight{index % 2}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in (*tmp_path.glob(f"{index}.*"), *tmp_path.glob(f"images/{index}.*")):
+            file.rename(folder / file.name)
+    check_dots(load_scene(tmp_path), 0.1)
+
+
+def test_points_of_another_coordinate_system_are_left_out(tmp_path):
+    """Cameras in geocentric metres, points in degrees or near the origin, as Metashape exports them by default."""
+    translation = WORLD[1]
+    write_metashape(tmp_path)
+    xml = metashape_xml(WORLD).replace(numbers(translation), numbers(translation + np.array([4e6, 0, 5e6])))
+    (tmp_path / "cameras.xml").write_text(xml)
+    with pytest.warns(UserWarning) as told:
+        scene = load_scene(tmp_path)
+    texts = " ".join(str(warning.message) for warning in told)
+    assert "the points beside it lie far from its cameras" in texts and "was moved to 40000" in texts
+    assert "starting from" in texts and np.abs(scene.points).max() < 100
 
 
 def test_a_world_of_a_map_is_moved(tmp_path):

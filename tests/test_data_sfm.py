@@ -13,7 +13,7 @@ from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import find_photos
 from a2tg_jax.data.sfm_database import join_rig, list_images
-from a2tg_jax.data.staging import _prefixes, stage
+from a2tg_jax.data.staging import _link, _prefixes, stage
 from a2tg_jax.results.camera_picture import save_camera_picture
 
 
@@ -125,6 +125,25 @@ def test_heic_photographs_become_jpeg(tmp_path):
     assert abs(np.asarray(Image.open(tmp_path / "work/photos/0.HEIC.jpg")).mean() - 99) < 3
 
 
+def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
+    """A photograph that is written anew, here one in a format of its own, may get the name of another."""
+    names = ["a.bmp", "a.bmp.jpg", "A.BMP.JPG", "a.bmp~2.jpg"]
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for index, name in enumerate(names):
+        image = Image.fromarray(np.full((12, 16, 3), 60 * index, np.uint8))
+        image.save(photos / name, format="JPEG" if index else "PPM")
+    before = {file.name: file.read_bytes() for file in photos.iterdir()}
+    (group,) = staged([photos], tmp_path / "work").groups
+    assert {file.name: file.read_bytes() for file in photos.iterdir()} == before
+    folder = tmp_path / "work" / "photos"
+    assert sorted(file.name for file in folder.iterdir()) == list(group.names)
+    assert len({name.casefold() for name in group.names}) == 4
+    assert sorted(round(np.asarray(Image.open(folder / name)).mean() / 60) for name in group.names) == [0, 1, 2, 3]
+    with pytest.raises(FileExistsError):
+        _link(photos / "a.bmp", folder / group.names[0])
+
+
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd):
     save_photos(tmp_path / "photos", 4, 128, 96)
     with contextlib.suppress(ValueError):  # The phases count, not what they find.
@@ -164,6 +183,7 @@ def test_sources_of_one_name_are_told_apart(tmp_path):
     names = [path.as_posix() for path in (tmp_path / "x/a", tmp_path / "y/a", tmp_path / "b")]
     assert _prefixes([Path(name) for name in names]) == ["a/", "a~2/", "b/"]
     assert _prefixes([tmp_path]) == [""]
+    assert _prefixes([Path("x/a~2"), Path("x/a"), Path("y/a")]) == ["a~2/", "a/", "a~3/"]
 
 
 def test_the_picture_of_the_cameras(tmp_path):

@@ -147,6 +147,41 @@ def test_nothing_is_written_outside_the_folder(server, tmp_path, name):
     assert not (tmp_path / "scenes/outside.txt").exists()
 
 
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE])
+def test_links_in_archives_are_refused(server, tmp_path, kind):
+    """Even Pythons that know no filters write nothing through a link, and the archive is not fetched anew."""
+    archive = archive_of(server, {}, "set.tar.gz")
+    with tarfile.open(server.folder / "set.tar.gz", "w:gz") as packed:
+        link = tarfile.TarInfo("garden")
+        link.type, link.linkname = kind, "../.."
+        packed.addfile(link)
+        packed.addfile(tarfile.TarInfo("garden/outside.txt"))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="the member 'garden' is a link or a device, which may lead outside"):
+            fetch(archive, tmp_path / "scenes")
+    assert server.firsts == [0] and not list((tmp_path / "scenes/360_v2").iterdir())
+
+
+def test_what_came_from_elsewhere_is_not_overwritten(server, tmp_path):
+    archive, own = archive_of(server, {"garden/": "", "garden/a.txt": "new"}), tmp_path / "scenes/360_v2/garden/a.txt"
+    own.parent.mkdir(parents=True)
+    own.write_text("my own")
+    for _ in range(2):
+        with pytest.raises(
+            FileExistsError, match=r"a\.txt: exists already and is not what set\.zip has there; move it"
+        ):
+            fetch(archive, tmp_path / "scenes")
+    assert own.read_text() == "my own" and server.firsts == [0]
+    (tmp_path / "scenes/archives/set.zip.unpacking").touch()  # As an unpacking leaves it that was interrupted.
+    assert fetch(archive, tmp_path / "scenes") and own.read_text() == "new"
+
+
+def test_what_an_earlier_version_unpacked_is_left_alone(server, tmp_path):
+    (tmp_path / "archives").mkdir()
+    (tmp_path / "archives" / "set.unpacked").touch()
+    assert not fetch(archive_of(server, {"a.txt": "a"}), tmp_path) and server.firsts == []
+
+
 def test_tar_archives(server, tmp_path):
     fetch(archive_of(server, {"scan24/a.txt": "a"}, "set.tar.gz"), tmp_path / "scenes")
     assert (tmp_path / "scenes/360_v2/scan24/a.txt").read_text() == "a"

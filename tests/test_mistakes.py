@@ -77,7 +77,7 @@ MISTAKES = {
     # Places and files
     "train nowhere --out new": "nowhere",
     "train photos --out new": "for plain photographs, run `a2tg sfm photos SCENE` first",
-    "train bad.toml --out new": "bad.toml is not a scene folder",
+    "train bad.toml --out new": "bad.toml: is neither a transforms.json nor an XML file of Metashape's cameras",
     "train synthetic --out bad.toml/run": "run cannot be made, for",
     "train scene --out scene/run": "overlap: choose an output folder",
     f"{SYNTHETIC[:-3]}photo.png": "photo.png is a file",
@@ -142,6 +142,7 @@ MISTAKES = {
     "sfm": "PHOTOS is missing: a folder of photographs",
     "sfm photos": "SCENE is missing: the new scene folder comes last, or after --out",
     "sfm photos many": "many holds photographs, but the scene folder comes last; name that by --out SCENE",
+    "sfm many .": ". holds photographs, but the scene folder comes last",
     "sfm many new --frames 2": "--frames must be at least 3; got 2",
     "download mipnerf": "there is no data set 'mipnerf'; did you mean mipnerf360?",
 }  # fmt: skip

@@ -100,3 +100,13 @@ def test_panoramas_become_a_rig(tmp_path, panorama, choice):
     assert (len(cameras), len(frames), found.num_places, len(found.names)) == (8, 3, 3, 24)
     assert all(len(frame.data_ids) == 8 for frame in frames)
     assert all(camera.model.name == "PINHOLE" and camera.has_prior_focal_length for camera in cameras)
+
+
+def test_views_of_panoramas_have_names_of_their_own(tmp_path, panorama):
+    (tmp_path / "panorama").mkdir()
+    for name in ("0.png", "0.png.jpg", "panorama/flat.png"):
+        pixels = panorama[::16, ::16] if name[0] == "0" else panorama[:10, :15]
+        Image.fromarray(pixels).save(tmp_path / name)
+    found = staged([tmp_path], tmp_path / "work", "yes")
+    assert len(set(found.names)) == 17 and found.rigs[0].folder == "panorama~2"
+    assert all((found.folder / name).is_file() for name in found.names)

@@ -86,7 +86,8 @@ class Sfm:
         if len(self.sources) < 2:
             raise ValueError("SCENE is missing: the new scene folder comes last, or after --out")
         *sources, out = self.sources
-        if is_video(out) or holds_photos(out):
+        has_model = (out / "sparse").exists()  # Such a folder is refused as one that exists already.
+        if is_video(out) or (holds_photos(out) and not has_model):
             raise ValueError(f"{out} holds photographs, but the scene folder comes last; name that by --out SCENE")
         return sources, out
 

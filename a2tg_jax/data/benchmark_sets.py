@@ -1,4 +1,4 @@
-"""Benchmark data sets: what they hold, and where their authors, or mirrors of the same bytes, offer them."""
+"""Benchmark data sets: what they hold, and where their authors, or mirrors, offer them."""
 
 from typing import NamedTuple
 

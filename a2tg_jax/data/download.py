@@ -9,7 +9,6 @@ import urllib.error
 import urllib.request
 import zipfile
 import zlib
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,11 +50,12 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
 
     Raises:
       OSError: if the address cannot be read or the disk has no room; what came stays, and the next call continues.
+      FileExistsError: if another file has the name of one in the archive, and was not left by an earlier call.
       ValueError: if the checksum is another, the archive is damaged, or it would write outside its folder.
     """
     file = scenes / "archives" / archive.url.partition("?")[0].rpartition("/")[2]
-    done = file.with_name(f"{file.name}.unpacked")
-    if done.is_file():
+    done, begun = (file.with_name(f"{file.name}.{state}") for state in ("unpacked", "unpacking"))
+    if done.is_file() or file.with_suffix(".unpacked").is_file():  # The second is what earlier versions wrote.
         return False
     file.parent.mkdir(parents=True, exist_ok=True)
     if not file.is_file():
@@ -64,11 +64,12 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
         file.unlink()
         raise ValueError(f"{archive.url}: its SHA-256 is not {archive.sha256}; the file was deleted, call again")
     try:
-        unpack(file, scenes / archive.folder, progress=progress)
+        unpack(file, scenes / archive.folder, begun, progress=progress)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as error:
         file.unlink()
         raise ValueError(f"{file} is damaged, and was deleted: call again to fetch it anew ({error})") from error
     done.touch()
+    begun.unlink()
     file.unlink()
     return True
 
@@ -146,26 +147,37 @@ def _keep_version(path: Path, etag: str | None) -> None:
         path.unlink(missing_ok=True)
 
 
-def unpack(file: Path, folder: Path, *, progress: bool = True) -> None:
+def unpack(file: Path, folder: Path, begun: Path, *, progress: bool = True) -> None:
     """Unpack a zip or tar archive.
 
+    Args:
+      file: the archive.
+      folder: where its members are written.
+      begun: a file that is made before the first of them; if it is there, files of other sizes are replaced.
+      progress: show a progress bar.
+
     Raises:
-      OSError: if the disk has no room for its members.
-      ValueError: if a member's name leads outside the folder.
+      OSError: if the disk has no room for its members, or there is another file of the name of one.
+      ValueError: if a member leads outside the folder, as links and devices may.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if tarfile.is_tarfile(file):
         with tarfile.open(file) as opened:
             members = [member for member in opened.getmembers() if _is_wanted(member.name)]
-            _check_members(file, folder, [member.name for member in members], sum(member.size for member in members))
-            with suppress(AttributeError):  # Pythons before 3.11.4 know no filters.
+            odd = next((member.name for member in members if not (member.isfile() or member.isdir())), None)
+            if odd is not None:
+                raise ValueError(f"{file}: the member {odd!r} is a link or a device, which may lead outside {folder}")
+            sizes = [member.size if member.isfile() else None for member in members]
+            _check_members(file, folder, [member.name for member in members], sizes, begun)
+            if hasattr(tarfile, "data_filter"):  # Pythons before 3.11.4 know no filters.
                 opened.extraction_filter = tarfile.data_filter
             for member in tqdm(members, desc="unpacking", unit="file", disable=not progress):
                 opened.extract(member, folder)
         return
     with zipfile.ZipFile(file) as opened_zip:
         infos = [info for info in opened_zip.infolist() if _is_wanted(info.filename)]
-        _check_members(file, folder, [info.filename for info in infos], sum(info.file_size for info in infos))
+        sizes = [None if info.is_dir() else info.file_size for info in infos]
+        _check_members(file, folder, [info.filename for info in infos], sizes, begun)
         for info in tqdm(infos, desc="unpacking", unit="file", disable=not progress):
             opened_zip.extract(info, folder)
 
@@ -174,11 +186,18 @@ def _is_wanted(name: str) -> bool:
     return LEFT_OUT not in Path(name).parts
 
 
-def _check_members(file: Path, folder: Path, names: list[str], num_bytes: int) -> None:
-    for name in names:
-        if not (folder / name).resolve().is_relative_to(folder.resolve()):
+def _check_members(file: Path, folder: Path, names: list[str], sizes: list[int | None], begun: Path) -> None:
+    """Check names and sizes (None for folders) of the members of an archive, then make the file `begun`."""
+    for name, num_bytes in zip(names, sizes, strict=True):
+        target = folder / name
+        if not target.resolve().is_relative_to(folder.resolve()):
             raise ValueError(f"{file}: the member {name!r} would be written outside {folder}")
-    _check_room(folder, num_bytes, str(file))
+        if num_bytes is not None and not begun.is_file() and target.exists() and _size(target) != num_bytes:
+            raise FileExistsError(
+                f"{target}: exists already and is not what {file.name} has there; move it away, or choose another --out"
+            )
+    _check_room(folder, sum(num_bytes or 0 for num_bytes in sizes), str(file))
+    begun.touch()
 
 
 def _check_room(folder: Path, num_bytes: int, what: str) -> None:

@@ -1,7 +1,8 @@
 """Scenes of other programs, read as frames of `transforms.json`."""
 
 import dataclasses
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture, Shelf
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, scene_name
 from a2tg_jax.data.transforms import check_meta, read_shots
+from a2tg_jax.host.text import shortened
 
 
 class Frames(NamedTuple):
@@ -44,6 +46,13 @@ def load_frames(
         shots = [_masked(shot, made.counted) for shot in shots]
     folder = made.file.resolve().parent
     return assemble_scene(scene_name(folder), *every_kth(shots, test_every), made.cloud, source=str(made.file))
+
+
+def warn_of_missing_images(file: Path, lacking: Sequence[str], num_cameras: int) -> None:
+    """Warn if some cameras have no image, whose names or numbers are given."""
+    if lacking:
+        message = f"{file}: {len(lacking)} of {num_cameras} cameras have no image beside them, such as "
+        warnings.warn(f"{message}{shortened(lacking[0])}: not used", stacklevel=3)
 
 
 def _masked(shot: Shot, counted: Callable[[np.ndarray], np.ndarray]) -> Shot:

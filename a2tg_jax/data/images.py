@@ -1,7 +1,7 @@
 """Finding and resizing photographs. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4]."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
@@ -12,8 +12,8 @@ from PIL import Image
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
-"""Suffixes tried, in order, for image paths without one."""
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
+"""Suffixes of photographs; capital letters do as well."""
 LONGEST_NAME = 1000
 """Largest number of letters in an image's path below its folder."""
 MAX_ASPECT_ERROR = 0.01
@@ -39,13 +39,25 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
     smaller = folder.with_name(f"{folder.name}_{downscale}")
     if downscale > 1 and smaller.is_dir():
         folder, downscale = smaller, 1
-    for candidate in (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)):
+    for candidate in (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name)):
         if is_regular(candidate):
             return candidate, downscale
     raise FileNotFoundError(
         f"{folder / name}: no such image, but the scene has a camera for it; "
         f"put the image there or remove the camera from the model"
     )
+
+
+def named_image(folder: Path, name: str) -> Path | None:
+    """Return the image of a name, with or without its suffix, or None."""
+    own = [folder / name] if Path(name).suffix.lower() in PHOTO_SUFFIXES else []
+    return next((file for file in (*own, *_with_suffixes(folder, name)) if name and is_regular(file)), None)
+
+
+def _with_suffixes(folder: Path, name: str) -> Iterator[Path]:
+    for suffix in PHOTO_SUFFIXES:
+        yield folder / f"{name}{suffix}"
+        yield folder / f"{name}{suffix.upper()}"
 
 
 def check_inside(folder: Path, name: str) -> None:

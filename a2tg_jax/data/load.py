@@ -21,6 +21,11 @@ from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import as_argument
 
+NO_SCENE_FILE = (
+    "is neither a transforms.json nor an XML file of Metashape's cameras (File > Export > Export Cameras); "
+    "give one of these, or the scene's folder"
+)
+
 
 def load_scene(
     path: str | os.PathLike[str],
@@ -116,7 +121,7 @@ def _load_file(path: Path, options: dict[str, Any]) -> Scene:
         return load_transforms(path, **options)
     if metashape_file(path) is not None:
         return load_frames(metashape_frames(path), **options)
-    raise FileNotFoundError(f"{path}: {told}" if told else f"{path} is not a scene folder, and no transforms.json")
+    raise FileNotFoundError(f"{path}: {told or NO_SCENE_FILE}")
 
 
 def _frames(path: Path) -> Callable[[], Frames] | None:

@@ -1,17 +1,19 @@
 """Cameras of Metashape: the XML file of File > Export > Export Cameras, read as frames of `transforms.json`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from a2tg_jax.data.frames import Frames
+from a2tg_jax.data.frames import Frames, warn_of_missing_images
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
     UNDISTORTED,
     Element,
     image_of,
+    images_below,
     near_origin,
     numbers_in,
     read_xml,
@@ -22,6 +24,8 @@ from a2tg_jax.host.text import shortened
 
 SWITCHED_OFF = ("0", "false")
 """Values of a camera's attribute enabled that leave it out."""
+HIGHER_TERMS = ("k4", "p3", "p4")
+"""Coefficients of distortion that COLMAP's models do not have."""
 HEAD_BYTES = 1 << 16
 """Number of bytes of an XML file in which a chunk's sensors are looked for."""
 
@@ -40,27 +44,37 @@ def metashape_frames(file: Path) -> Frames:
     Raises:
       ValueError: if the file is no such XML, or a lens has a distortion that COLMAP's models do not know.
     """
-    root = read_xml(file)
-    frames = []
-    for chunk in root.iter("chunk"):
+    frames, lacking = [], []
+    below = images_below(file.parent / "images")
+    for label, sensor, pose in _posed_cameras(file):
+        image = image_of(file.parent, label, below)
+        if image is None:
+            lacking.append(label)
+            continue
+        lens = _metashape_lens(sensor, f"{file}: {label}")
+        frames.append({**lens, "file_path": image, "transform_matrix": pose @ OPENGL})
+    if not frames:
+        raise ValueError(
+            f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
+        )
+    warn_of_missing_images(file, lacking, len(frames) + len(lacking))
+    points = sorted(file.parent.glob("*.ply"))
+    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
+
+
+def _posed_cameras(file: Path) -> Iterator[tuple[str, Element, np.ndarray]]:
+    """Yield label, sensor and pose [4, 4] in the world of each camera that has a pose and is switched on."""
+    for chunk in read_xml(file).iter("chunk"):
         sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
         worlds = {part.get("id"): _world(part, file) for part in chunk.iter("component")}
         of_chunk = _world(chunk, file)
         for camera in chunk.iter("camera"):
             pose, sensor = camera.find("transform"), sensors.get(camera.get("sensor_id"))
-            image = image_of(file.parent, camera.get("label") or "")
-            if pose is None or sensor is None or image is None or camera.get("enabled") in SWITCHED_OFF:
+            if pose is None or sensor is None or camera.get("enabled") in SWITCHED_OFF:
                 continue
             world = worlds.get(camera.get("component_id"))
             placed = _placed(of_chunk if world is None else world, numbers_in(pose.text, 16, file).reshape(4, 4))
-            lens = _metashape_lens(sensor, f"{file}: {camera.get('label')}")
-            frames.append({**lens, "file_path": image, "transform_matrix": placed @ OPENGL})
-    if not frames:
-        raise ValueError(
-            f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
-        )
-    points = sorted(file.parent.glob("*.ply"))
-    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
+            yield camera.get("label") or "", sensor, placed
 
 
 def _world(part: Element, file: Path) -> np.ndarray | None:
@@ -87,9 +101,10 @@ def _placed(world: np.ndarray | None, pose: np.ndarray) -> np.ndarray:
 
 
 def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
-    """Return the intrinsics of a sensor as `transforms.json` has them. P1 and P2 are OpenCV's p2 and p1."""
+    """Return the adjusted intrinsics of a sensor as `transforms.json` has them. P1 and P2 are OpenCV's p2 and p1."""
     kind = sensor.get("type", "frame")
-    calibration = next((part for part in sensor.iter("calibration") if part.find("f") is not None), None)
+    with_focal = [part for part in sensor.iter("calibration") if part.find("f") is not None]
+    calibration = min(with_focal, key=lambda part: part.get("class") != "adjusted", default=None)
     if kind != "frame" or calibration is None:
         raise ValueError(f"{what}: is of a sensor of type {shortened(kind)} without a calibration; {UNDISTORTED}")
     size = calibration.find("resolution")
@@ -101,8 +116,8 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
     def read(name: str) -> float:
         return float(numbers_in(calibration.findtext(name, "0"), 1, what)[0])
 
-    if read("k4") or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
-        raise ValueError(f"{what}: its lens has k4 or b2, which are not known here; {UNDISTORTED}")
+    if any(map(read, HIGHER_TERMS)) or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
+        raise ValueError(f"{what}: its lens has k4, p3, p4 or b2, which are not known here; {UNDISTORTED}")
     return {
         "w": int(width), "h": int(height), "fl_x": read("f") + read("b1"), "fl_y": read("f"),
         "cx": width / 2 + read("cx"), "cy": height / 2 + read("cy"),

@@ -1,14 +1,16 @@
 """Plain photographs in a folder: which are read, which are skipped, and what to do about those."""
 
+import itertools
 import warnings
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from a2tg_jax.core.display import counted
+from a2tg_jax.data.images import PHOTO_SUFFIXES
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.text import as_argument
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
 FOREIGN_SUFFIXES = (".jxl", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".gif")
 """Suffixes of pictures that are not read."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -23,9 +25,9 @@ def is_video(path: Path) -> bool:
 
 
 def holds_photos(folder: Path) -> bool:
-    """Return whether a folder has enough photographs directly in it."""
-    photos = [file for file in folder.iterdir() if file.suffix.lower() in PHOTO_SUFFIXES] if folder.is_dir() else []
-    return len(photos) >= LEAST_PHOTOS
+    """Return whether a folder has enough photographs in it or below it."""
+    photos = (file for file in _files_below(folder) if file.suffix.lower() in PHOTO_SUFFIXES)
+    return len(list(itertools.islice(photos, LEAST_PHOTOS))) == LEAST_PHOTOS
 
 
 def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
@@ -40,7 +42,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
         raise ValueError(f"{folder}: {told_of_capture(folder) or 'is a file; give its folder'}")
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs")
-    files = sorted(file.relative_to(folder) for file in folder.rglob("*") if file.is_file() and file.name[0] != ".")
+    files = sorted(file.relative_to(folder) for file in _files_below(folder))
     photos = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
     others = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
@@ -51,6 +53,10 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     if pictures:
         warnings.warn(f"{folder}: {_skipped(folder, pictures)}", stacklevel=3)
     return photos
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    return (file for file in folder.rglob("*") if file.name[0] != "." and file.is_file())
 
 
 def check_no_video(path: Path) -> None:

@@ -3,34 +3,43 @@
 import dataclasses
 import re
 import warnings
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from a2tg_jax.data.frames import Frames
-from a2tg_jax.data.images import check_inside
+from a2tg_jax.data.images import PHOTO_SUFFIXES, check_inside, named_image
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 Element = ElementTree.Element
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic")
 LARGEST_SKEW = 0.5
-"""Largest skew in pixels over an image that is taken for none."""
+"""Largest skew, in pixels over an image, that is ignored."""
 FARTHEST = 1e3
 """Largest distance of the cameras' middle from the origin, in units of their spread, that keeps the origin."""
+FARTHEST_POINTS = 100.0
+"""Largest distance of the points' median from the cameras' middle, in units of the cameras' spread."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Change of a camera's frame between OpenCV and OpenGL."""
 UNDISTORTED = "export undistorted images in COLMAP's format instead"
 
 
 def near_origin(frames: Frames) -> Frames:
-    """Return frames with poses as lists. The origin of a map's world is moved to the cameras, with a warning."""
+    """Return frames with poses as lists. The origin of a map's world is moved to the cameras, and points far
+    from them are left out, with a warning each."""
     poses = np.stack([frame["transform_matrix"] for frame in frames.frames])
     middle = np.rint(np.median(poses[:, :3, 3], axis=0))
     spread = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
+    if frames.cloud is not None and not _are_near(frames.cloud.points, middle, FARTHEST_POINTS * spread):
+        warnings.warn(
+            f"{frames.file}: the points beside it lie far from its cameras, in another coordinate system: not used",
+            stacklevel=2,
+        )
+        frames = frames._replace(cloud=None)
     if np.linalg.norm(middle) > FARTHEST * spread > 0:
         poses[:, :3, 3] -= middle
         if frames.cloud is not None:
@@ -41,28 +50,31 @@ def near_origin(frames: Frames) -> Frames:
     return frames._replace(frames=moved)
 
 
-def image_of(folder: Path, label: str) -> str | None:
-    """Return the path, below the folder, of the image of a camera's label: a path of any machine, or a name."""
+def _are_near(points: np.ndarray, middle: np.ndarray, farthest: float) -> bool:
+    """Return whether the median of points [P, 3] is near a place, or cannot be told."""
+    finite = points[np.isfinite(points).all(axis=-1)]
+    return not len(finite) or not farthest or bool(np.linalg.norm(np.median(finite, axis=0) - middle) <= farthest)
+
+
+def images_below(folder: Path) -> dict[str, Path]:
+    """Return the images in all folders below a folder, by name and by name without suffix, as far as that is unique."""
+    found: dict[str, set[Path]] = defaultdict(set)
+    for file in folder.rglob("*"):
+        if file.suffix.lower() in PHOTO_SUFFIXES and is_regular(file):
+            found[file.name].add(file)
+            found[file.stem].add(file)
+    return {name: next(iter(files)) for name, files in found.items() if len(files) == 1}
+
+
+def image_of(folder: Path, label: str, below: Mapping[str, Path]) -> str | None:
+    """Return the path, from the folder, of the image of a camera's label: a path of any machine, or a name.
+
+    It is looked for in `images`, in the folder itself, and then among the images `below`.
+    """
     name = re.split(r"[/\\]", label)[-1]
     check_inside(folder, name)
-    for base in (folder / "images", folder):
-        found = named_image(base, name)
-        if found is not None:
-            return found.relative_to(folder).as_posix()
-    return None
-
-
-def named_image(folder: Path, name: str) -> Path | None:
-    """Return the image of a name, with or without its suffix, or None."""
-    return next((file for file in _candidates(folder, name) if name and is_regular(file)), None)
-
-
-def _candidates(folder: Path, name: str) -> Iterator[Path]:
-    if Path(name).suffix.lower() in SUFFIXES:
-        yield folder / name
-    for suffix in SUFFIXES:
-        yield folder / f"{name}{suffix}"
-        yield folder / f"{name}{suffix.upper()}"
+    found = named_image(folder / "images", name) or named_image(folder, name) or below.get(name)
+    return None if found is None else found.relative_to(folder).as_posix()
 
 
 def read_xml(file: Path) -> Element:

@@ -10,15 +10,14 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 
 from a2tg_jax.data.decoding import read_depth, read_pixels
-from a2tg_jax.data.frames import Frames
-from a2tg_jax.data.images import map_in_threads
+from a2tg_jax.data.frames import Frames, warn_of_missing_images
+from a2tg_jax.data.images import map_in_threads, named_image
 from a2tg_jax.data.scene import PointCloud
 from a2tg_jax.host.json_text import read_object
 from a2tg_jax.host.regular_files import is_regular
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and images of the keyframes; those after Polycam's optimisation come first."""
-SUFFIXES = (".jpg", ".jpeg", ".png")
 INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 NUM_POINTS = 50_000
 """Number of points taken from all depth maps."""
@@ -43,15 +42,13 @@ def polycam_frames(cameras: Path, images: Path) -> Frames:
     Corrected images have a black border where undistortion found nothing, which is masked.
 
     Raises:
-      ValueError: if a file is no JSON object, or lacks a number of the pose.
+      ValueError: if a file is no JSON object, or lacks a number of the pose, or no camera has an image.
     """
-    frames = []
+    frames, lacking = [], []
     for file in sorted(cameras.glob("*.json")):
-        image = next(
-            (images / f"{file.stem}{suffix}" for suffix in SUFFIXES if is_regular(images / f"{file.stem}{suffix}")),
-            None,
-        )
+        image = named_image(images, file.stem)
         if image is None:
+            lacking.append(file.name)
             continue
         values = read_object(file)
         missing = [name for name in _number_names() if not isinstance(values.get(name), int | float)]
@@ -60,6 +57,11 @@ def polycam_frames(cameras: Path, images: Path) -> Frames:
         rows = [[values[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
         frame: dict[str, Any] = {key: values[name] for key, name in INTRINSICS.items()}
         frames.append({**frame, "file_path": f"{images.name}/{image.name}", "transform_matrix": rows})
+    if not frames:
+        raise ValueError(
+            f"{cameras}: none of its cameras has an image of its name in {images}; export the raw data again"
+        )
+    warn_of_missing_images(cameras, lacking, len(frames) + len(lacking))
     cloud = _depth_points(images.parent, frames)
     return Frames(cameras, frames, cloud, counted=_within_border if images.name.startswith("corrected") else None)
 

@@ -17,7 +17,7 @@ def photo_bar(phase: str, num_photos: int, progress: bool) -> tqdm:
 
 @contextmanager
 def clock(phase: str, progress: bool) -> Iterator[None]:
-    """Show a phase that tells no progress with the time since its start."""
+    """Show the time since the start of a phase whose progress cannot be counted."""
     ended = threading.Event()
     with tqdm(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar:
 

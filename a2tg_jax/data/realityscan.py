@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.frames import Frames
+from a2tg_jax.data.frames import Frames, warn_of_missing_images
+from a2tg_jax.data.images import named_image
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
     UNDISTORTED,
-    named_image,
     near_origin,
     numbers_in,
     read_xml,
@@ -26,9 +26,9 @@ FILM_WIDTH = 36.0
 
 
 def realityscan_files(path: Path) -> list[Path]:
-    """Return XMP files with RealityScan's poses in a folder or its folder images."""
-    for folder in (path, path / "images"):
-        files = [file for file in sorted(folder.glob("*.xmp")) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
+    """Return XMP files with RealityScan's poses in a folder, or anywhere below its folder images."""
+    for found in (path.glob("*.xmp"), (path / "images").rglob("*.xmp")):
+        files = [file for file in sorted(found) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         if files:
             return files
     return []
@@ -40,10 +40,11 @@ def realityscan_frames(path: Path, files: list[Path]) -> Frames:
     Raises:
       ValueError: if a file is no such XMP, or a lens has a distortion that COLMAP's models do not know.
     """
-    frames = []
+    frames, lacking = [], []
     for file in files:
         image = named_image(file.parent, file.stem)
         if image is None:
+            lacking.append(file.name)
             continue
         values = _xcr_values(file)
         pose = np.eye(4)
@@ -54,6 +55,7 @@ def realityscan_frames(path: Path, files: list[Path]) -> Frames:
         frames.append({**lens, "file_path": image.relative_to(path).as_posix(), "transform_matrix": pose @ OPENGL})
     if not frames:
         raise ValueError(f"{path}: no photograph lies beside an XMP file of its name; put them together")
+    warn_of_missing_images(path / "*.xmp", lacking, len(files))
     return near_origin(Frames(path / "*.xmp", frames))
 
 

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.data.frames import Frames
+from a2tg_jax.data.frames import Frames, warn_of_missing_images
+from a2tg_jax.data.images import PHOTO_SUFFIXES
 from a2tg_jax.host.json_text import MOST_BYTES, read_object
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 METADATA = ("metadata", "metadata.json")
 IMAGE_FOLDERS = ("rgb", "rgbd", ".")
-SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
 def record3d_file(path: Path) -> Path | None:
@@ -35,7 +35,8 @@ def record3d_frames(file: Path) -> Frames:
     intrinsics = _record3d_intrinsics(file, values, len(poses))
     size: dict[str, Any] = {key: values[key] for key in ("w", "h") if key in values}
     frames = []
-    for number, image in _numbered_images(file.parent):
+    images = _numbered_images(file.parent)
+    for number, image in sorted(images.items()):
         if number < len(poses):
             if not np.linalg.norm(poses[number, :4]) > 0:
                 raise ValueError(f"{file}: pose {number} has a quaternion of length 0")
@@ -47,6 +48,8 @@ def record3d_frames(file: Path) -> Frames:
             frames.append({**lens, "file_path": name, "transform_matrix": pose.tolist()})
     if not frames:
         raise ValueError(f"{file}: no images rgb/0.jpg, rgb/1.jpg, … lie beside it; export RGB frames with Record3D")
+    lacking = sorted(set(range(len(poses))) - set(images))
+    warn_of_missing_images(file, [str(number) for number in lacking], len(poses))
     return Frames(file, frames)
 
 
@@ -62,13 +65,13 @@ def _record3d_intrinsics(file: Path, values: dict[str, Any], count: int) -> list
     return [[float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]] * count
 
 
-def _numbered_images(folder: Path) -> list[tuple[int, Path]]:
-    """Return the images that are named by their number, sorted by it."""
+def _numbered_images(folder: Path) -> dict[int, Path]:
+    """Return the images that are named by their number."""
     for base in (folder / name for name in IMAGE_FOLDERS):
-        images = [file for file in base.glob("*") if file.suffix.lower() in SUFFIXES and file.stem.isdecimal()]
+        images = [file for file in base.glob("*") if file.suffix.lower() in PHOTO_SUFFIXES and file.stem.isdecimal()]
         if images:
-            return sorted((int(file.stem), file) for file in images)
-    return []
+            return {int(file.stem): file for file in sorted(images, reverse=True)}
+    return {}
 
 
 def _matrix(value: Any, width: int, what: str) -> np.ndarray:

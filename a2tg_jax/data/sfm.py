@@ -126,7 +126,7 @@ def _check_new(out: Path) -> None:
 
 
 def _map(staged: Staged, work: Path, seed: int, progress: bool, tell: Callable[[str], None]) -> Any:
-    """Return the largest reconstruction of the matched photographs, or None. Several ones are told."""
+    """Return the largest reconstruction of the matched photographs, or None. A line tells the sizes of several."""
     colmap = pycolmap()
     options = colmap.IncrementalPipelineOptions(
         random_seed=seed, num_threads=1, min_model_size=MIN_REGISTERED, ba_use_gpu=False

@@ -3,11 +3,12 @@
 Folders, videos and panoramas may be mixed. Photographs that need no change are linked.
 """
 
+import itertools
 import os
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal, NamedTuple
 
 from PIL import Image
@@ -116,7 +117,8 @@ def stage(
     photos = map_in_threads(lambda file: _look(*file, panorama), files)
     flat = [photo for photo in photos if not photo.is_panorama]
     groups = _stage_flat(flat, folder)
-    rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tell)
+    tops = {name.partition("/")[0] for group in groups for name in group.names}
+    rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tops, tell)
     num_turned = sum(photo.facts.is_turned for photo in photos)
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
@@ -127,12 +129,24 @@ def _prefixes(sources: Sequence[Path]) -> list[str]:
     """Return what names of each source begin with: nothing for a single source, else its own name, made unique."""
     if len(sources) == 1:
         return [""]
-    prefixes: list[str] = []
-    for source in sources:
-        stem = source.resolve().stem if is_video(source) else source.resolve().name
-        same = sum(prefix.rstrip("/").partition("~")[0] == stem for prefix in prefixes)
-        prefixes.append(f"{stem}~{same + 1}/" if same else f"{stem}/")
-    return prefixes
+    stems = [source.stem if is_video(source) else source.name for source in map(Path.resolve, sources)]
+    return [f"{stem}/" for stem in _made_unique([stem or "photos" for stem in stems])]
+
+
+def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
+    """Return names with ~2, ~3, … where an earlier one, one of `others` or a folder of any is the same.
+
+    Names that differ in case only are the same, because they are on some disks.
+    """
+    taken = {str(folder).casefold() for name in names for folder in PurePosixPath(name).parents}
+    taken |= {other.casefold() for other in others}
+    unique = []
+    for path in map(PurePosixPath, names):
+        tried = (path.with_name(f"{path.stem}~{number}{path.suffix}") for number in itertools.count(2))
+        name = next(str(name) for name in itertools.chain([path], tried) if str(name).casefold() not in taken)
+        taken.add(name.casefold())
+        unique.append(name)
+    return unique
 
 
 def _look(source: int, file: Path, name: str, panorama: Panorama) -> _Photo:
@@ -145,49 +159,58 @@ def _look(source: int, file: Path, name: str, panorama: Panorama) -> _Photo:
 
 def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
     """Link or write anew photographs that are no panoramas, and group them by source, size and lens."""
-    names = map_in_threads(lambda photo: _place(photo, folder), photos)
+    names = _made_unique([_wanted_name(photo) for photo in photos])
+    map_in_threads(lambda pair: _place(pair[0], folder / pair[1]), list(zip(photos, names, strict=True)))
     grouped: dict[tuple[int, tuple[int, int], tuple[str, ...]], list[str]] = defaultdict(list)
     for photo, name in zip(photos, names, strict=True):
         grouped[photo.source, photo.facts.size, photo.facts.lens].append(name)
     return tuple(CameraGroup(tuple(sorted(members)), key[1]) for key, members in grouped.items())
 
 
-def _place(photo: _Photo, folder: Path) -> str:
-    """Link a photograph into the folder, or write it anew if it is turned or COLMAP cannot read it; return its name."""
-    is_read = photo.facts.format in COLMAP_FORMATS
-    suffix = Path(photo.name).suffix.lower()
-    name = photo.name
-    if not is_read:
-        name += ".jpg"
-    elif photo.facts.is_turned and suffix not in (".jpg", ".jpeg", ".png"):
-        name += ".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg"
-    target = folder / name
+def _wanted_name(photo: _Photo) -> str:
+    """Return a photograph's name in the folder: with another suffix if it will be written in another format."""
+    if photo.facts.format not in COLMAP_FORMATS:
+        return f"{photo.name}.jpg"
+    if photo.facts.is_turned and Path(photo.name).suffix.lower() not in (".jpg", ".jpeg", ".png"):
+        return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
+    return photo.name
+
+
+def _place(photo: _Photo, target: Path) -> None:
+    """Link a photograph to a new place, or write it anew if it is turned or COLMAP cannot read it."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    if is_read and not photo.facts.is_turned:
+    if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
         _link(photo.file, target)
-    else:
-        save_upright(photo.file, target, QUALITY)
-    return name
+        return
+    partial = target.with_name(f".{target.name}")  # No photograph is named so, and a link is replaced, not followed.
+    save_upright(photo.file, partial, QUALITY)
+    os.replace(partial, target)
 
 
 def _link(file: Path, target: Path) -> None:
     """Make a file appear at another place, without a copy if the file system can."""
     try:
         os.link(file.resolve(), target)
+    except FileExistsError:
+        raise
     except OSError:
         shutil.copyfile(file, target)
 
 
-def _stage_panoramas(photos: list[_Photo], folder: Path, tell: Callable[[str], None]) -> tuple[Rig, ...]:
-    """Cut panoramas into views, and return a rig for each of their sizes."""
+def _stage_panoramas(
+    photos: list[_Photo], folder: Path, tops: Iterable[str], tell: Callable[[str], None]
+) -> tuple[Rig, ...]:
+    """Cut panoramas into views, and return a rig for each of their sizes, in a folder of none of the names `tops`."""
     by_size: dict[tuple[int, int], list[_Photo]] = defaultdict(list)
     for photo in photos:
         by_size[photo.facts.size].append(photo)
     rigs = []
-    for number, (size, members) in enumerate(by_size.items()):
-        name = f"panorama{number or ''}"
-        map_in_threads(lambda photo, name=name: _cut(photo, folder / name), members)  # type: ignore[misc]
-        rigs.append(_rig(name, size, members))
+    folders = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
+    for name, (size, members) in zip(folders, by_size.items(), strict=True):
+        views = _made_unique([_view_name(photo) for photo in members])
+        pairs = list(zip(members, views, strict=True))
+        map_in_threads(lambda pair, name=name: _cut(pair[0], folder / name, pair[1]), pairs)  # type: ignore[misc]
+        rigs.append(_rig(name, size, sorted(views)))
         side, _ = view_size(size[0])
         tell(
             f"{counted(len(members), 'panorama')} of {size[0]}x{size[1]}, each cut into {len(directions())} views of "
@@ -196,11 +219,11 @@ def _stage_panoramas(photos: list[_Photo], folder: Path, tell: Callable[[str], N
     return tuple(rigs)
 
 
-def _cut(photo: _Photo, folder: Path) -> None:
+def _cut(photo: _Photo, folder: Path, view: str) -> None:
     """Write the views of one panorama."""
     pixels = read_pixels(photo.file)[..., :3]
     for direction in directions():
-        target = folder / direction.name / _view_name(photo)
+        target = folder / direction.name / view
         target.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
 
@@ -209,11 +232,10 @@ def _view_name(photo: _Photo) -> str:
     return f"{photo.name}.jpg" if Path(photo.name).suffix.lower() not in (".jpg", ".jpeg") else photo.name
 
 
-def _rig(name: str, size: tuple[int, int], members: Iterable[_Photo]) -> Rig:
+def _rig(name: str, size: tuple[int, int], views: Sequence[str]) -> Rig:
     side, focal = view_size(size[0])
-    names = sorted(_view_name(photo) for photo in members)
     groups = tuple(
-        CameraGroup(tuple(f"{name}/{direction.name}/{view}" for view in names), (side, side), focal)
+        CameraGroup(tuple(f"{name}/{direction.name}/{view}" for view in views), (side, side), focal)
         for direction in directions()
     )
     return Rig(name, directions(), groups)
