@@ -81,7 +81,7 @@ class CorrectionConfig:
     exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
     grid_size: tuple[int, int, int] = BilateralGrid.size
-    """Numbers of nodes of a bilateral grid along x, along y, and of luminances."""
+    """Numbers of nodes of a bilateral grid along x, along y, and of luminances, each up to 64."""
     grid_rate: float = BilateralGrid.rate
     """Adam's learning rate of the bilateral grids."""
     grid_smoothness: float = BilateralGrid.smoothness
@@ -342,8 +342,10 @@ class System:
             raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
         if self.rates.means_final_factor == 0:
             raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
-        if min(self.corrections.grid_size) < 1:
-            raise ValueError(f"corrections.grid_size must be numbers of at least 1; got {self.corrections.grid_size}")
+        if not all(1 <= number <= LARGEST_GRID for number in self.corrections.grid_size):
+            raise ValueError(
+                f"corrections.grid_size must be numbers in 1..{LARGEST_GRID}; got {self.corrections.grid_size}"
+            )
         if self.corrections.final_factor == 0:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
@@ -352,6 +354,8 @@ SHARED_OPTIONS = {f"PruneFloaters.{name}": f"floaters.{name}" for name in ("min_
 """Options of every system that set a field of an event."""
 BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
 """Options whose place a memory budget takes."""
+LARGEST_GRID = 64
+"""Largest number of nodes of a bilateral grid along each of its axes."""
 FEW_GAUSSIANS = 100
 """Number of Gaussians below which a memory budget is likely to be a mistake."""
 RANGES = {
