@@ -155,6 +155,11 @@ class TestBilateralGrid:
         assert np.abs(grids[: len(scene.train)] - np.eye(3, 4)).max() > 1e-4
         assert all(set(found) == {"exposure"} for found in learned(origin).values())
 
+    @pytest.mark.parametrize("size", [[4, 0, 4], [4, 4, 65]])
+    def test_grids_of_other_sizes_are_refused(self, size):
+        with pytest.raises(ValueError, match=r"corrections\.grid_size must be numbers in 1\.\.64; got"):
+            small(corrections={"grid_size": size}).check()
+
 
 class TestDepthPrior:
     @pytest.mark.usefixtures("x64")
@@ -291,6 +296,23 @@ class TestFloaters:
         )
         np.testing.assert_array_equal(are_near(points, scene.train[:1], 0.2), [True, False, False, False])
 
+    def test_what_stands_close_before_a_fisheye(self, scene):
+        """Its rays lie far outside the picture in the plane of K; some of its pixels have none."""
+        view = scene.train[0]
+        width, height = view.camera.width, view.camera.height
+        column, row = np.meshgrid(np.linspace(-2 * width, 3 * width, width), np.linspace(-height, 2 * height, height))
+        rays = np.stack([column, row], axis=2)
+        rays[0, 0] = np.nan
+        wide = dataclasses.replace(view, camera=dataclasses.replace(view.camera, rays=jnp.asarray(rays)))
+        pixels = np.asarray([[-1.5, 0.5], [2.5, 1.5], [3.5, 0.5], [0.5, -1.5]]) * (width, height)
+        K, viewmat = np.asarray(view.camera.K), np.asarray(view.camera.viewmat)
+        seen = 0.1 * np.concatenate([pixels, np.ones((4, 1))], axis=1) @ np.linalg.inv(K).T
+        points = (seen - viewmat[:3, 3]) @ viewmat[:3, :3]
+        np.testing.assert_array_equal(are_near(points, [wide], 0.2), [True, True, False, False])
+        np.testing.assert_array_equal(are_near(points, [view], 0.2), False)
+        unseen = dataclasses.replace(wide, camera=dataclasses.replace(wide.camera, rays=jnp.full_like(rays, np.nan)))
+        assert not are_near(points, [unseen], 0.2).any()
+
     def test_a_training_without_them(self, scene, trained):
         model = trained.model
         assert len(scene.points) / 2 < model.num <= len(scene.points)
@@ -303,11 +325,9 @@ class TestFloaters:
         events = [event for stage in asked.stages() for event in stage.events]
         assert sum(isinstance(event, a2tg.PruneFloaters) for event in events) == 1
 
-    def test_what_cannot_be_is_refused(self, scene):
+    def test_what_cannot_be_is_refused(self):
         with pytest.raises(ValueError, match="no stage of Toy does so"):
             Toy(floaters=a2tg.training.FloaterConfig(min_views=2)).check()
-        with pytest.raises(ValueError, match=r"corrections\.grid_size must be numbers of at least 1"):
-            small(corrections={"grid_size": [4, 0, 4]}).check()
         with pytest.raises(ValueError, match=r"floaters\.near must be at least 0; got -1"):
             small(floaters={"near": -1.0}).check()
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View
 from a2tg_jax.densify.pruning import kept_first, pruning_times, shown_in
@@ -53,12 +54,25 @@ class PruneFloaters(HostEvent):
 
 
 def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarray:
-    """Return [N] whether a point [N, 3] lies within the picture of a view, less than `near` before its camera."""
+    """Return [N] whether a point [N, 3] lies within the picture of a view, less than `near` before its camera.
+
+    The picture of a lens that is no pinhole is the smallest rectangle in the image plane that holds all its rays.
+    """
     found = np.zeros(len(means), bool)
     for camera in (view.camera for view in views):
         viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
         x, y, z = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
         depth = np.where(z > 0, z, np.nan)
         column, row, _ = K @ np.stack([x / depth, y / depth, np.ones_like(z)])
-        found |= (z < near) & (column >= 0) & (column <= camera.width) & (row >= 0) & (row <= camera.height)
+        (left, top), (right, bottom) = _bounds(camera)
+        found |= (z < near) & (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
     return found
+
+
+def _bounds(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest (x, y) of a picture in the image plane of K, in its pixels."""
+    if camera.rays is None:
+        return np.zeros(2), np.asarray([camera.width, camera.height])
+    rays = np.asarray(camera.rays, np.float64).reshape(-1, 2)
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    return rays.min(axis=0, initial=np.inf), rays.max(axis=0, initial=-np.inf)
