@@ -322,8 +322,20 @@ class TestFloaters:
     def test_every_system_prunes_them_if_asked(self, name):
         asked = dataclasses.replace(a2tg.find_system(name), floaters=a2tg.training.FloaterConfig(min_views=2))
         asked.check()
-        events = [event for stage in asked.stages() for event in stage.events]
-        assert sum(isinstance(event, a2tg.PruneFloaters) for event in events) == 1
+        (stage,) = (each for each in asked.stages() if any(isinstance(e, a2tg.PruneFloaters) for e in each.events))
+        (event,) = (event for event in stage.events if isinstance(event, a2tg.PruneFloaters))
+        (growth,) = (other.times(stage.iterations) for other in stage.events if other.most_gaussians is not None)
+        assert 0 < event.iterations(stage.iterations)[-1] < growth.last_time, "others grow in their place"
+
+    def test_they_are_pruned_while_others_grow(self):
+        system, late = a2tg.Gaussians2d(), a2tg.training.FloaterConfig(near=0.2, at=(0.5, 0.8))
+        floaters = dataclasses.replace(late, at=(0.3, 0.4, 0.5))
+        (stage,) = dataclasses.replace(system, floaters=floaters).stages()
+        assert stage.events[-1].at == (0.3, 0.4)
+        with pytest.raises(ValueError, match=r"floaters\.at must hold a fraction before the last growth, which is at"):
+            dataclasses.replace(system, floaters=late).check()
+        (stage,) = small(floaters={"near": 0.2, "at": [0.5, 1.0]}).stages()
+        assert stage.events[-1].at == (0.5, 1.0), "nothing grows"
 
     def test_what_cannot_be_is_refused(self):
         with pytest.raises(ValueError, match="no stage of Toy does so"):

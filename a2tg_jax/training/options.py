@@ -4,12 +4,13 @@ import contextlib
 import dataclasses
 import math
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.densify.floaters import PruneFloaters
-from a2tg_jax.events import Event, FieldError, from_options, with_names
+from a2tg_jax.densify.pruning import during_growth
+from a2tg_jax.events import Event, FieldError, StepEvent, from_options, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
@@ -102,11 +103,40 @@ class FloaterConfig:
     """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
     about 1 from what they see, such as 0.2. 0: off."""
     at: tuple[float, ...] = PruneFloaters.at
-    """Fractions of the first stage at which floaters are pruned."""
+    """Fractions of the first stage at which floaters are pruned. Those after the last growth are left out."""
 
-    def events(self) -> tuple[Event, ...]:
-        """Return the event; none if nothing is asked for."""
-        return (from_options(PruneFloaters, self),) if self.min_views or self.near else ()
+    @property
+    def is_asked(self) -> bool:
+        """Whether floaters are to be pruned."""
+        return bool(self.min_views or self.near)
+
+    def events(self, num_iterations: int, others: Sequence[Event] = ()) -> tuple[Event, ...]:
+        """Return the event; none if nothing is asked for.
+
+        Args:
+          num_iterations: length of the stage.
+          others: events of the stage, some of which may add Gaussians.
+
+        Raises:
+          ValueError: if no fraction is left.
+        """
+        if not self.is_asked:
+            return ()
+        event = from_options(PruneFloaters, self)
+        event.iterations(num_iterations)
+        growing = (each for each in others if isinstance(each, StepEvent) and each.most_gaussians is not None)
+        times = [found for each in growing if (found := each.times(num_iterations)).num_times]
+        if not times:
+            return (event,)
+        last = max(times, key=lambda found: found.last_time)
+        at = during_growth(self.at, num_iterations, last)
+        if not at:
+            raise FieldError(
+                event,
+                f"{{at}} must hold a fraction before the last growth, which is at iteration {last.last_time:,} of "
+                f"{num_iterations:,}, for others grow in the place of what is pruned; got {shortened(self.at)}",
+            )
+        return (dataclasses.replace(event, at=at),)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -276,10 +306,10 @@ class System:
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
-        if self.floaters.events() and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
+        if self.floaters.is_asked and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
             raise ValueError(
                 f"floaters are to be pruned, but no stage of {type(self).__name__} does so: give its first stage the "
-                "events self.floaters.events() too"
+                "events self.floaters.events(iterations, events) too"
             )
 
     def option_of(self, event: Event, field: str) -> str | None:
