@@ -25,6 +25,7 @@ from a2tg_jax.training.bilateral import BilateralGrid, sliced, total_variation
 from a2tg_jax.training.corrections import exposed, learned
 from a2tg_jax.training.depth_prior import DepthPrior, depth_loss, scale_and_shift
 from a2tg_jax.training.robust import RobustPhotometric, inliers
+from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import Photometric
 
 RNG = np.random.default_rng(0)
@@ -340,8 +341,29 @@ class TestFloaters:
     def test_what_cannot_be_is_refused(self):
         with pytest.raises(ValueError, match="no stage of Toy does so"):
             Toy(floaters=a2tg.training.FloaterConfig(min_views=2)).check()
-        with pytest.raises(ValueError, match=r"floaters\.near must be at least 0; got -1"):
-            small(floaters={"near": -1.0}).check()
+        with pytest.raises(ValueError, match=r"corrections\.exposure_kind is 'grid', .*: turn exposure on"):
+            small(corrections={"exposure_kind": "grid"}).check()
+
+    @pytest.mark.parametrize(
+        "options, message",
+        [
+            ({"near": -1.0}, r"floaters\.near must be at least 0; got -1"),
+            ({"min_views": 1}, r"floaters\.min_views must be at least 2 views, or 0 for off; got 1"),
+            ({"min_views": -2}, r"floaters\.min_views must be at least 2 views, or 0 for off; got -2"),
+            ({"near": 0.2, "at": []}, r"floaters\.at must hold at least one fraction of the stage; got none"),
+        ],
+    )
+    def test_numbers_out_of_range_are_refused(self, options, message):
+        with pytest.raises(ValueError, match=message):
+            small(floaters=options).check()
+
+    def test_pruning_that_would_leave_nothing_is_told(self, scene):
+        system = small()
+        model = initial_model(scene, system)
+        moments = adam_init((model.gaussians, model.params))
+        with pytest.warns(UserWarning, match=r"no floaters are pruned, for 0 of 150 Gaussians .* --floaters\.near"):
+            change = a2tg.PruneFloaters(min_views=0, near=100.0).apply(Due(views=scene.train), model, moments, ())
+        assert change.model.num == model.num
 
 
 class TestSupersampling:

@@ -1,5 +1,6 @@
 """Pruning of floaters: Gaussians that matter in too few training views, or that hang close before a camera."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,8 +23,7 @@ class PruneFloaters(HostEvent):
     """
 
     min_views: int = static(default=2)
-    """Least number of views in which a Gaussian must show, by Σ α·T of `least`; 0 or 1: those that show nowhere stay,
-    too."""
+    """Least number of views in which a Gaussian must show, by Σ α·T of `least`, at least 2; 0: none."""
     near: float = static(default=0.0)
     """Least depth before every camera that sees it, in units of the normalised world; 0: none."""
     least: float = static(default=1.0)
@@ -32,9 +32,12 @@ class PruneFloaters(HostEvent):
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        if self.min_views < 0 or self.near < 0:
-            name, value = ("min_views", self.min_views) if self.min_views < 0 else ("near", self.near)
-            raise FieldError(self, f"{{{name}}} must be at least 0; got {value}")
+        if self.min_views < 0 or self.min_views == 1:
+            raise FieldError(self, f"{{min_views}} must be at least 2 views, or 0 for off; got {self.min_views}")
+        if self.near < 0:
+            raise FieldError(self, f"{{near}} must be at least 0; got {self.near}")
+        if not self.at:
+            raise FieldError(self, "{at} must hold at least one fraction of the stage; got none")
         return pruning_times(self, self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
@@ -43,12 +46,17 @@ class PruneFloaters(HostEvent):
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         num = model.num
         is_kept = np.ones(num, bool)
-        if self.min_views > 1:
+        if self.min_views:
             needed = min(self.min_views, len(due.views))
             is_kept &= shown_in(model, due.views, self.least).num_views[:num] >= needed
         if self.near > 0:
             is_kept &= ~are_near(np.asarray(model.gaussians.means)[:num], due.views, self.near)
-        if is_kept.sum() < 2:  # A model of nothing cannot be trained.
+        if is_kept.sum() < 2:
+            warnings.warn(
+                f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "
+                "2: lower --floaters.near or --floaters.min-views",
+                stacklevel=2,
+            )
             is_kept[:] = True
         return kept_first(model, moments, state, is_kept)
 

@@ -98,7 +98,7 @@ class FloaterConfig:
     """Pruning of floaters in the first stage (`PruneFloaters`)."""
 
     min_views: int = 0
-    """Least number of training views in which a Gaussian must show, such as 2; others are pruned. 0: off."""
+    """Least number of training views in which a Gaussian must show, at least 2; others are pruned. 0: off."""
     near: float = 0.0
     """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
     about 1 from what they see, such as 0.2. 0: off."""
@@ -300,6 +300,15 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in stages:
             stage.check()
+        self._check_learned(stages)
+
+    def _check_learned(self, stages: Sequence[Stage]) -> None:
+        """Refuse corrections and pruning that are asked for and would do nothing."""
+        if self.corrections.exposure_kind != "affine" and not self.exposure:
+            raise ValueError(
+                f"corrections.exposure_kind is {self.corrections.exposure_kind!r}, but nothing is learned of it: "
+                "turn exposure on"
+            )
         if (self.exposure or self.refine_poses) and not any(stage.corrections for stage in stages):
             name = "exposure" if self.exposure else "refine_poses"
             raise ValueError(
