@@ -256,9 +256,14 @@ def iterations_at(
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 
-def static(*, default: Any = dataclasses.MISSING) -> Any:
-    """Return a field of an event (or loss term) that chooses shapes or code, and is not traced."""
-    return dataclasses.field(default=default, metadata={"static": True})
+def static(*, default: Any = dataclasses.MISSING, is_addition: bool = False) -> Any:
+    """Return a field of an event (or loss term) that chooses shapes or code, and is not traced.
+
+    Args:
+      default: of the field.
+      is_addition: whether trainings of earlier versions, which did not know the field, are those with its default.
+    """
+    return dataclasses.field(default=default, metadata={"static": True, "is_addition": is_addition})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))

@@ -9,22 +9,21 @@ Each training is kept in OUT/wild.json as soon as it is measured, so that a seco
 OUT/wild.md.
 """
 
-import argparse
 import dataclasses
+import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
+from lab.kept import KeptFigures, parser_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_depths
 from a2tg_jax.host.memory import tidy_memory
-from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training.registry import with_changes
 
 SIZE = 128, 96
@@ -153,21 +152,22 @@ SEEN_AT = (16, 32, 64, 128, 256)
 """Widths at which the model trained at the middle one is seen."""
 
 
-def other_sizes(session: a2tg.Session) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the figures of a model seen at other widths: as it is, supersampled, and of a model trained there."""
-    models = {width: trained(whole(width), {}, session) for width in SEEN_AT}
-    base = SEEN_AT[len(SEEN_AT) // 2]
+def measure_sizes(kept: KeptFigures, session: a2tg.Session) -> None:
+    """Measure how one model is seen at other widths."""
+    model_of = functools.cache(lambda width: trained(whole(width), {}, session))
     for width in SEEN_AT:
-        test, factor = whole(width).test, max(1, base // width)
-        settings = a2tg.RenderSettings(supersample=factor)
-        yield (
-            f"other sizes | {width} wide",
-            {
-                "psnr": a2tg.evaluate(test, models[base]).psnr,
-                "psnr_supersampled": a2tg.evaluate(test, models[base], settings=settings).psnr,
-                "psnr_trained_there": a2tg.evaluate(test, models[width]).psnr,
-            },
-        )
+        kept.measure(f"{SIZES} | {width} wide", functools.partial(seen_at, width, model_of))
+
+
+def seen_at(width: int, model_of: Callable[[int], a2tg.Model]) -> dict[str, float]:
+    """Return the figures of a model at another width: as it is, supersampled, and of a model trained there."""
+    base, test = SEEN_AT[len(SEEN_AT) // 2], whole(width).test
+    settings = a2tg.RenderSettings(supersample=max(1, base // width))
+    return {
+        "psnr": a2tg.evaluate(test, model_of(base)).psnr,
+        "psnr_supersampled": a2tg.evaluate(test, model_of(base), settings=settings).psnr,
+        "psnr_trained_there": a2tg.evaluate(test, model_of(width)).psnr,
+    }
 
 
 def trained(scene: a2tg.Scene, options: Mapping[str, Any], session: a2tg.Session) -> a2tg.Model:
@@ -203,35 +203,21 @@ def table(found: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of table and figures")
+    parser = parser_of(__doc__)
     parser.add_argument("--only", default=";".join((*CASES, SIZES)), help="captures, with semicolons between them")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "wild.json"
-    found = read_json(path) if path.is_file() else {}
-    session = a2tg.Session(tidy_memory)
-
-    def keep(key: str, figures: dict[str, float]) -> None:
-        found[key] = figures
-        print(key, {figure: round(value, 2) for figure, value in figures.items()}, flush=True)
-        write_json(path, found)
-        (arguments.out / "wild.md").write_text(table(found), encoding="utf-8")
-
+    kept, session = KeptFigures(arguments.out, "wild", table), a2tg.Session(tidy_memory)
     for name in arguments.only.split(";"):
         if name == SIZES:
-            if not any(key.startswith(SIZES) for key in found):
-                for key, figures in other_sizes(session):
-                    keep(key, figures)
+            measure_sizes(kept, session)
             continue
         make, compared = CASES[name]
         scene = make()
         for label, seed in itertools.product(compared, SEEDS):
-            key = f"{name} | {label} | seed {seed}"
-            if key not in found:
-                keep(key, measured(scene, {**compared[label], "seed": seed}, session))
-    print(table(found))
+            options = {**compared[label], "seed": seed}
+            kept.measure(f"{name} | {label} | seed {seed}", functools.partial(measured, scene, options, session))
+    print(kept.table())
 
 
 if __name__ == "__main__":

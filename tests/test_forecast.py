@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from toy_system import Toy
@@ -33,8 +34,10 @@ from a2tg_jax.results.forecast import (
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, progress
+from a2tg_jax.training.bilateral import sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.options import CorrectionConfig
 from a2tg_jax.training.progress import Pace
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
@@ -130,6 +133,21 @@ def test_more_of_anything_takes_more():
     assert run_of(scene_of(2400, 1600), geometry).peak[1].total > run_of(scene_of(2400, 1600), system).peak[1].total
 
 
+def test_bilateral_grids_are_counted():
+    scene, system = scene_of(480, 360), a2tg.Gaussians2dMcmc(exposure=True)
+    few, many = (
+        dataclasses.replace(system, corrections=CorrectionConfig("grid", grid_size=size))
+        for size in ((4, 4, 4), (16, 16, 8))
+    )
+    plain, small, large = (next(forecast_stages(scene, each)).bytes.corrections for each in (system, few, many))
+    assert large - small == 8 * len(scene.train) * 48 * (16 * 16 * 8 - 4 * 4 * 4)
+    gradient = jax.jit(jax.grad(lambda grid, color: jnp.sum(sliced(grid, color) ** 2), argnums=(0, 1)))
+    shapes = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((4, 4, 4, 3, 4), (360, 480, 3)))
+    said = gradient.lower(*shapes).compile().memory_analysis().temp_size_in_bytes
+    assert 0.75 < (small - plain - 8 * len(scene.train) * 48 * 64) / said < 1.33
+    assert "corrections" in run_of(scene, many).told(8e9) and "corrections" not in run_of(scene, Toy()).told(8e9)
+
+
 def test_photographs_on_disk_take_what_is_read_ahead():
     scene = scene_of(1200, 800, num_views=40)
     on_disk = tuple(dataclasses.replace(v, picture=dataclasses.replace(v.picture, is_held=False)) for v in scene.train)
@@ -150,6 +168,7 @@ def forecast_with(**sizes):
         ("model", "--densify.cap"),
         ("gradients", "--batch-size"),
         ("pixels", "--downscale"),
+        ("corrections", "--corrections.grid-size or --downscale"),
         ("program", "--max-memory"),
     ],
 )

@@ -143,7 +143,7 @@ def test_batches_are_made_in_order_once_and_not_too_many():
         return indices
 
     ahead = Ahead(load, 2)
-    for iteration in (1, 2, 3, 4):
+    for iteration in (1, 2, 3, 4, 5):
         wanted = {key: (key,) for key in range(iteration, min(iteration + 2, 5) + 1)}
         assert ahead.first(wanted) == (iteration,)
     ahead.close()

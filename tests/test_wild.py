@@ -25,6 +25,7 @@ from a2tg_jax.training.bilateral import BilateralGrid, sliced, total_variation
 from a2tg_jax.training.corrections import exposed, learned
 from a2tg_jax.training.depth_prior import DepthPrior, depth_loss, scale_and_shift
 from a2tg_jax.training.robust import RobustPhotometric, inliers
+from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import Photometric
 
 RNG = np.random.default_rng(0)
@@ -154,6 +155,11 @@ class TestBilateralGrid:
         assert grids.shape == (5, 2, 4, 4, 3, 4)
         assert np.abs(grids[: len(scene.train)] - np.eye(3, 4)).max() > 1e-4
         assert all(set(found) == {"exposure"} for found in learned(origin).values())
+
+    @pytest.mark.parametrize("size", [[4, 0, 4], [4, 4, 65]])
+    def test_grids_of_other_sizes_are_refused(self, size):
+        with pytest.raises(ValueError, match=r"corrections\.grid_size must be numbers in 1\.\.64; got"):
+            small(corrections={"grid_size": size}).check()
 
 
 class TestDepthPrior:
@@ -291,6 +297,23 @@ class TestFloaters:
         )
         np.testing.assert_array_equal(are_near(points, scene.train[:1], 0.2), [True, False, False, False])
 
+    def test_what_stands_close_before_a_fisheye(self, scene):
+        """Its rays lie far outside the picture in the plane of K; some of its pixels have none."""
+        view = scene.train[0]
+        width, height = view.camera.width, view.camera.height
+        column, row = np.meshgrid(np.linspace(-2 * width, 3 * width, width), np.linspace(-height, 2 * height, height))
+        rays = np.stack([column, row], axis=2)
+        rays[0, 0] = np.nan
+        wide = dataclasses.replace(view, camera=dataclasses.replace(view.camera, rays=jnp.asarray(rays)))
+        pixels = np.asarray([[-1.5, 0.5], [2.5, 1.5], [3.5, 0.5], [0.5, -1.5]]) * (width, height)
+        K, viewmat = np.asarray(view.camera.K), np.asarray(view.camera.viewmat)
+        seen = 0.1 * np.concatenate([pixels, np.ones((4, 1))], axis=1) @ np.linalg.inv(K).T
+        points = (seen - viewmat[:3, 3]) @ viewmat[:3, :3]
+        np.testing.assert_array_equal(are_near(points, [wide], 0.2), [True, True, False, False])
+        np.testing.assert_array_equal(are_near(points, [view], 0.2), False)
+        unseen = dataclasses.replace(wide, camera=dataclasses.replace(wide.camera, rays=jnp.full_like(rays, np.nan)))
+        assert not are_near(points, [unseen], 0.2).any()
+
     def test_a_training_without_them(self, scene, trained):
         model = trained.model
         assert len(scene.points) / 2 < model.num <= len(scene.points)
@@ -300,16 +323,47 @@ class TestFloaters:
     def test_every_system_prunes_them_if_asked(self, name):
         asked = dataclasses.replace(a2tg.find_system(name), floaters=a2tg.training.FloaterConfig(min_views=2))
         asked.check()
-        events = [event for stage in asked.stages() for event in stage.events]
-        assert sum(isinstance(event, a2tg.PruneFloaters) for event in events) == 1
+        (stage,) = (each for each in asked.stages() if any(isinstance(e, a2tg.PruneFloaters) for e in each.events))
+        (event,) = (event for event in stage.events if isinstance(event, a2tg.PruneFloaters))
+        (growth,) = (other.times(stage.iterations) for other in stage.events if other.most_gaussians is not None)
+        assert 0 < event.iterations(stage.iterations)[-1] < growth.last_time, "others grow in their place"
 
-    def test_what_cannot_be_is_refused(self, scene):
+    def test_they_are_pruned_while_others_grow(self):
+        system, late = a2tg.Gaussians2d(), a2tg.training.FloaterConfig(near=0.2, at=(0.5, 0.8))
+        floaters = dataclasses.replace(late, at=(0.3, 0.4, 0.5))
+        (stage,) = dataclasses.replace(system, floaters=floaters).stages()
+        assert stage.events[-1].at == (0.3, 0.4)
+        with pytest.raises(ValueError, match=r"floaters\.at must hold a fraction before the last growth, which is at"):
+            dataclasses.replace(system, floaters=late).check()
+        (stage,) = small(floaters={"near": 0.2, "at": [0.5, 1.0]}).stages()
+        assert stage.events[-1].at == (0.5, 1.0), "nothing grows"
+
+    def test_what_cannot_be_is_refused(self):
         with pytest.raises(ValueError, match="no stage of Toy does so"):
             Toy(floaters=a2tg.training.FloaterConfig(min_views=2)).check()
-        with pytest.raises(ValueError, match=r"corrections\.grid_size must be numbers of at least 1"):
-            small(corrections={"grid_size": [4, 0, 4]}).check()
-        with pytest.raises(ValueError, match=r"floaters\.near must be at least 0; got -1"):
-            small(floaters={"near": -1.0}).check()
+        with pytest.raises(ValueError, match=r"corrections\.exposure_kind is 'grid', .*: turn exposure on"):
+            small(corrections={"exposure_kind": "grid"}).check()
+
+    @pytest.mark.parametrize(
+        "options, message",
+        [
+            ({"near": -1.0}, r"floaters\.near must be at least 0; got -1"),
+            ({"min_views": 1}, r"floaters\.min_views must be at least 2 views, or 0 for off; got 1"),
+            ({"min_views": -2}, r"floaters\.min_views must be at least 2 views, or 0 for off; got -2"),
+            ({"near": 0.2, "at": []}, r"floaters\.at must hold at least one fraction of the stage; got none"),
+        ],
+    )
+    def test_numbers_out_of_range_are_refused(self, options, message):
+        with pytest.raises(ValueError, match=message):
+            small(floaters=options).check()
+
+    def test_pruning_that_would_leave_nothing_is_told(self, scene):
+        system = small()
+        model = initial_model(scene, system)
+        moments = adam_init((model.gaussians, model.params))
+        with pytest.warns(UserWarning, match=r"no floaters are pruned, for 0 of 150 Gaussians .* --floaters\.near"):
+            change = a2tg.PruneFloaters(min_views=0, near=100.0).apply(Due(views=scene.train), model, moments, ())
+        assert change.model.num == model.num
 
 
 class TestSupersampling:

@@ -67,7 +67,7 @@ class CloneSplitPrune(StepEvent):
     """Smallest opacity; fainter Gaussians are pruned."""
     largest_share: float = 0.1
     """Largest size as a share of scene_scale; larger Gaussians are pruned after the first reset of opacities."""
-    shares_opacity: bool = static(default=False)
+    shares_opacity: bool = static(default=False, is_addition=True)
     """Whether a Gaussian and its clone share the opacity, 1 − √(1 − o) each (Rota Bulò et al., 2024)."""
 
     impossible: ClassVar[str] = "adaptive density control would prune every Gaussian: lower {least_opacity}"

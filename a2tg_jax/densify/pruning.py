@@ -20,7 +20,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.data import View, counted_pixels, views_by_kind
-from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, gather_moments, gather_rows, static
+from a2tg_jax.events import Change, Due, FieldError, HostEvent, Times, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings, render_traced
@@ -75,6 +75,11 @@ def pruning_times(of: HostEvent, at: tuple[float, ...], num_iterations: int) -> 
     if any(not 0 < fraction <= 1 for fraction in at) or list(at) != sorted(set(at)):
         raise FieldError(of, f"{{at}} must be ascending fractions above 0, up to 1; got {shortened(at)}")
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in at))
+
+
+def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> tuple[float, ...]:
+    """Return the fractions of a stage before its last growth, so that others grow in the place of what is pruned."""
+    return tuple(fraction for fraction in at if round(fraction * num_iterations) < growth.last_time)
 
 
 class Shown(NamedTuple):

@@ -52,6 +52,7 @@ OPTIONS = {
     "model": "{limits}, --memory-budget or --sh-degree",
     "gradients": "{limits}, --memory-budget, --batch-size or --sh-degree",
     "pixels": "--downscale",
+    "corrections": "--corrections.grid-size or --downscale",
 }
 """Options to change, by what needs most of the memory; `limits` are those of the systems' number of Gaussians."""
 
@@ -77,9 +78,9 @@ class RunForecast:
     def told(self, limit: float) -> str:
         """Return the forecast as lines of text."""
         phase, needed = self.peak
-        parts = ", ".join(f"{name} {in_bytes(size)}" for name, size in needed._asdict().items())
+        told = f"{phase}: {_told_parts(needed)}"
         lines = [
-            f"memory: about {in_bytes(needed.total)} at the peak ({phase}: {parts}); {in_bytes(limit)} may be used",
+            f"memory: about {in_bytes(needed.total)} at the peak ({told}); {in_bytes(limit)} may be used",
             f"disk: about {in_bytes(self.disk_bytes)} in the run folder",
         ]
         if self.seconds:
@@ -103,15 +104,14 @@ class RunForecast:
         if needed.total <= limit:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
-        parts = ", ".join(f"{name} {in_bytes(size)}" for name, size in needed._asdict().items())
         advice = (
             f"change {self._told_options(largest)}, or"
             if largest != "program"
             else (f"the program itself takes about {in_bytes(needed.program)} of it:")
         )
         raise ValueError(
-            f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {parts}), and {in_bytes(limit)} "
-            f"may be used: {advice} allow more with --max-memory"
+            f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {_told_parts(needed)}), and "
+            f"{in_bytes(limit)} may be used: {advice} allow more with --max-memory"
         )
 
     def _told_options(self, largest: str) -> str:
@@ -235,6 +235,12 @@ def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) ->
     num_pictures = 3 + max(1, len(plan.chains) - 1)
     kept = sum((KEPT_STATES * STATES + 1) * stage.model_bytes for stage in stages)
     return kept + PICTURE_PER_PIXEL * num_pictures * pixels
+
+
+def _told_parts(needed: Bytes) -> str:
+    """Return the parts of the memory in words; corrections only if there are any."""
+    parts = needed._asdict()
+    return ", ".join(f"{name} {in_bytes(size)}" for name, size in parts.items() if size or name != "corrections")
 
 
 def _between(seconds: float) -> str:

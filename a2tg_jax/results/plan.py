@@ -161,8 +161,10 @@ def _described(value: Any) -> Any:
 
 
 def _is_absent(field: dataclasses.Field[Any], value: Any) -> bool:
-    """Return whether it is a tuple that is empty, as it is by default."""
-    return isinstance(value, tuple) and not value and field.default == ()
+    """Return whether it is a tuple that is empty, as it is by default, or an addition (`events.static`) not asked
+    for."""
+    is_addition = field.metadata.get("is_addition", False)
+    return (isinstance(value, tuple) and not value and field.default == ()) or (is_addition and value == field.default)
 
 
 def _name_of(value: Any) -> str:

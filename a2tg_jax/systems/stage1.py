@@ -7,7 +7,7 @@ from typing import Any
 
 from a2tg_jax.appearance import Appearance, Plain
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity, OpacityReset
-from a2tg_jax.densify.pruning import Prune
+from a2tg_jax.densify.pruning import Prune, during_growth
 from a2tg_jax.events import Event, Times, from_options, iterations_at
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
@@ -125,13 +125,12 @@ class PruneConfig:
                 f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
                 f"what is pruned; got {shortened(self.at)}: lower the last, or set prune.share to 0"
             )
-        if all(fraction * LONG_STAGE >= growth(LONG_STAGE).last_time for fraction in self.at):
+        if not during_growth(self.at, LONG_STAGE, growth(LONG_STAGE)):
             ends = growth(LONG_STAGE).last_time / LONG_STAGE
             raise ValueError(
                 f"prune.at must begin before the last growth, at {ends:.2g} of the stage; got {shortened(self.at)}"
             )
-        last = growth(num_iterations).last_time
-        at = tuple(fraction for fraction in self.at if round(fraction * num_iterations) < last)
+        at = during_growth(self.at, num_iterations, growth(num_iterations))
         return (from_options(Prune, self, at=at),) if at else ()
 
 
@@ -150,7 +149,7 @@ def growing_stage(
     return Stage(
         name=name,
         appearance=appearance,
-        events=(*events, *system.floaters.events()),
+        events=(*events, *system.floaters.events(iterations, events)),
         losses=system.loss.terms(),
         rates=system.rates,
         iterations=iterations,

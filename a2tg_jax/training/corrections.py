@@ -29,6 +29,8 @@ class Correction:
 
     name: ClassVar[str]
     """Name, unique in its stage; files use it for the rows."""
+    bytes_per_pixel: ClassVar[float] = 0
+    """Bytes of a step's own buffers for each pixel, gradients included, for forecasts."""
 
     @property
     def neutral(self) -> np.ndarray:

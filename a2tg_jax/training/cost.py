@@ -18,6 +18,7 @@ from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.training.batches import plan_batches, view_bytes
+from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.start import initial_number, no_rows, num_rows
@@ -38,6 +39,9 @@ GEOMETRY_PER_PIXEL = 72
 """Further bytes if a term of the loss reads depth or normals."""
 STATISTIC_PER_ROW = 480
 """Further bytes if events gather a statistic and change rows inside the step."""
+CORRECTION_COPIES = 8
+"""Copies of the rows of a correction: what the stage began with, rows and moments before and after a step, gradients.
+"""
 VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
 """Bytes of each view of a batch, beside its gradient of the model."""
 PAIRS_PER_TILE = 90
@@ -60,6 +64,8 @@ class Bytes(NamedTuple):
     """Gradients and other arrays that a step makes for each Gaussian."""
     pixels: float = 0
     """Renders, loss and tile lists."""
+    corrections: float = 0
+    """Rows of the corrections of photographs, their moments, and what a step makes to apply them."""
 
     @property
     def total(self) -> float:
@@ -114,7 +120,7 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
     Args:
       scene: its photographs.
       system: batch size and tiles.
-      stage: its losses.
+      stage: its losses and corrections.
       num: rows.
       model_bytes: of the model.
     """
@@ -127,7 +133,15 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
         gradients=STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num),
         pixels=largest * (per_pixel + VIEW_PER_PIXEL * (batch - 1)) + STEP_PER_PAIR * pairs,
+        corrections=correction_bytes(stage.corrections, len(scene.train), largest),
     )
+
+
+def correction_bytes(corrections: Sequence[Correction], num_views: int, num_pixels: int) -> float:
+    """Return the bytes of the corrections of so many training views, the largest of which has so many pixels."""
+    per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in corrections)
+    per_pixel = sum(correction.bytes_per_pixel for correction in corrections)
+    return CORRECTION_COPIES * num_views * per_view + num_pixels * per_pixel
 
 
 def held_bytes(scene: Scene) -> int:

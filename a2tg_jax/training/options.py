@@ -4,12 +4,13 @@ import contextlib
 import dataclasses
 import math
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.densify.floaters import PruneFloaters
-from a2tg_jax.events import Event, FieldError, from_options, with_names
+from a2tg_jax.densify.pruning import during_growth
+from a2tg_jax.events import Event, FieldError, StepEvent, from_options, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
@@ -81,7 +82,7 @@ class CorrectionConfig:
     exposure_rate: float = Exposure.rate
     """Adam's learning rate of the affine maps of colours."""
     grid_size: tuple[int, int, int] = BilateralGrid.size
-    """Numbers of nodes of a bilateral grid along x, along y, and of luminances."""
+    """Numbers of nodes of a bilateral grid along x, along y, and of luminances, each up to 64."""
     grid_rate: float = BilateralGrid.rate
     """Adam's learning rate of the bilateral grids."""
     grid_smoothness: float = BilateralGrid.smoothness
@@ -97,16 +98,45 @@ class FloaterConfig:
     """Pruning of floaters in the first stage (`PruneFloaters`)."""
 
     min_views: int = 0
-    """Least number of training views in which a Gaussian must show, such as 2; others are pruned. 0: off."""
+    """Least number of training views in which a Gaussian must show, at least 2; others are pruned. 0: off."""
     near: float = 0.0
     """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
     about 1 from what they see, such as 0.2. 0: off."""
     at: tuple[float, ...] = PruneFloaters.at
-    """Fractions of the first stage at which floaters are pruned."""
+    """Fractions of the first stage at which floaters are pruned. Those after the last growth are left out."""
 
-    def events(self) -> tuple[Event, ...]:
-        """Return the event; none if nothing is asked for."""
-        return (from_options(PruneFloaters, self),) if self.min_views or self.near else ()
+    @property
+    def is_asked(self) -> bool:
+        """Whether floaters are to be pruned."""
+        return bool(self.min_views or self.near)
+
+    def events(self, num_iterations: int, others: Sequence[Event] = ()) -> tuple[Event, ...]:
+        """Return the event; none if nothing is asked for.
+
+        Args:
+          num_iterations: length of the stage.
+          others: events of the stage, some of which may add Gaussians.
+
+        Raises:
+          ValueError: if no fraction is left.
+        """
+        if not self.is_asked:
+            return ()
+        event = from_options(PruneFloaters, self)
+        event.iterations(num_iterations)
+        growing = (each for each in others if isinstance(each, StepEvent) and each.most_gaussians is not None)
+        times = [found for each in growing if (found := each.times(num_iterations)).num_times]
+        if not times:
+            return (event,)
+        last = max(times, key=lambda found: found.last_time)
+        at = during_growth(self.at, num_iterations, last)
+        if not at:
+            raise FieldError(
+                event,
+                f"{{at}} must hold a fraction before the last growth, which is at iteration {last.last_time:,} of "
+                f"{num_iterations:,}, for others grow in the place of what is pruned; got {shortened(self.at)}",
+            )
+        return (dataclasses.replace(event, at=at),)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -270,16 +300,25 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in stages:
             stage.check()
+        self._check_learned(stages)
+
+    def _check_learned(self, stages: Sequence[Stage]) -> None:
+        """Refuse corrections and pruning that are asked for and would do nothing."""
+        if self.corrections.exposure_kind != "affine" and not self.exposure:
+            raise ValueError(
+                f"corrections.exposure_kind is {self.corrections.exposure_kind!r}, but nothing is learned of it: "
+                "turn exposure on"
+            )
         if (self.exposure or self.refine_poses) and not any(stage.corrections for stage in stages):
             name = "exposure" if self.exposure else "refine_poses"
             raise ValueError(
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
-        if self.floaters.events() and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
+        if self.floaters.is_asked and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
             raise ValueError(
                 f"floaters are to be pruned, but no stage of {type(self).__name__} does so: give its first stage the "
-                "events self.floaters.events() too"
+                "events self.floaters.events(iterations, events) too"
             )
 
     def option_of(self, event: Event, field: str) -> str | None:
@@ -342,8 +381,10 @@ class System:
             raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
         if self.rates.means_final_factor == 0:
             raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
-        if min(self.corrections.grid_size) < 1:
-            raise ValueError(f"corrections.grid_size must be numbers of at least 1; got {self.corrections.grid_size}")
+        if not all(1 <= number <= LARGEST_GRID for number in self.corrections.grid_size):
+            raise ValueError(
+                f"corrections.grid_size must be numbers in 1..{LARGEST_GRID}; got {self.corrections.grid_size}"
+            )
         if self.corrections.final_factor == 0:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
@@ -352,6 +393,8 @@ SHARED_OPTIONS = {f"PruneFloaters.{name}": f"floaters.{name}" for name in ("min_
 """Options of every system that set a field of an event."""
 BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
 """Options whose place a memory budget takes."""
+LARGEST_GRID = 64
+"""Largest number of nodes of a bilateral grid along each of its axes."""
 FEW_GAUSSIANS = 100
 """Number of Gaussians below which a memory budget is likely to be a mistake."""
 RANGES = {
