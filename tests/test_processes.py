@@ -1,6 +1,7 @@
 """Several processes that train together: those of this machine (`on_processes`), and connections without a training."""
 
 import signal
+import socket
 import threading
 import time
 from multiprocessing import AuthenticationError
@@ -49,13 +50,15 @@ def three(monkeypatch):
     monkeypatch.setattr(liveness, "GRACE", 0.0)
     listener, port, key = listen()
     found = {}
-    accepting = threading.Thread(target=lambda: found.update(accept(listener, 3)))
+    accepting = threading.Thread(target=lambda: found.update(accept(listener, key, 3)))
     accepting.start()
+    silent = socket.create_connection(("127.0.0.1", port))
     with pytest.raises((AuthenticationError, EOFError, OSError)):
         connect("127.0.0.1", port, b"a stranger's", 1)
     others = [connect("127.0.0.1", port, key, number) for number in (1, 2)]
     accepting.join(10)
-    return [found, *others], [[], [], []]
+    with silent:
+        yield [found, *others], [[], [], []]
 
 
 def watched(three, numbers):

@@ -5,6 +5,7 @@ after it stay idle (`step.TrainState.status`); the loop mends the cause and laun
 """
 
 import dataclasses
+import functools
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -21,7 +22,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import Exchange, spread
-from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, readable
+from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, of_first, readable
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -354,7 +355,8 @@ class StageRun:
                 due = event.iterations(self.stage.iterations)
                 if iteration not in due:
                     continue
-                told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
+                agreed = functools.partial(of_first, self.exchange)
+                told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes, agreed)
                 change = event.apply(told, self.state.model, self.state.moments, state)
                 self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
                 if change.rows is not None:
