@@ -159,7 +159,9 @@ def _initialize(place: Place) -> None:
             shutdown_timeout_seconds=LEAVE_SECONDS,
         )
     except (ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(f"--coordinator {place.coordinator}: {error}") from error
+        is_alone = is_auto and "coordinator_address" in str(error)
+        reason = "no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" if is_alone else error
+        raise ValueError(f"--coordinator {place.coordinator}: {reason}") from error
 
 
 def _give_up(coordinator: str) -> NoReturn:

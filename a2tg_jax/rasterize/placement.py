@@ -61,7 +61,8 @@ def of_first(exchange: Exchange | None, tree: Any) -> Any:
     def of_leaf(x: Any) -> np.ndarray:
         x = np.ascontiguousarray(x)
         told = multihost_utils.broadcast_one_to_all(x.reshape(-1).view(np.uint8))  # As bytes: JAX may round numbers.
-        return np.asarray(told, np.uint8).view(x.dtype).reshape(x.shape)
+        same: np.ndarray = np.asarray(told, np.uint8).view(x.dtype).reshape(x.shape)
+        return same
 
     return jax.tree.map(of_leaf, tree)
 

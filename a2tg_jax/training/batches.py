@@ -226,6 +226,16 @@ def check_depths(views: tuple[View, ...]) -> None:
         )
 
 
+def check_lenses(views: tuple[View, ...], num_devices: int) -> None:
+    """Raise ValueError if photographs behind a lens are to be trained on by several devices."""
+    view = next((view for view in views if view.camera.rays is not None), None)
+    if view is not None and num_devices > 1:
+        raise ValueError(
+            f"view {view.name} keeps its lens, which one device trains: leave out --devices and --coordinator, or say "
+            "--lens undistort"
+        )
+
+
 def check_views(views: tuple[View, ...]) -> None:
     """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
     if not views:
