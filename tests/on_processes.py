@@ -36,6 +36,8 @@ SYSTEMS = {
     ),
     "mcmc": lambda length: system(Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length),
 }
+SHORT = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60", "--stage1-iterations", "20")
+"""Options of a training of seconds, in which process 0 prunes for all."""
 RUN = ("synthetic", "--preset", "smoke", "--downscale", "4", "--stage1-iterations", "20000", "--densify.cap", "60")
 
 
