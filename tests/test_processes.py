@@ -11,26 +11,43 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from on_processes import ended, free_port, pair, started, survivor_of
+from on_processes import SHORT, ended, free_port, pair, started, survivor_of, trainings
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host import liveness
 from a2tg_jax.host.liveness import Liveness, accept, connect, listen
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.host.processes import LOST, is_of_collectives
 from a2tg_jax.io.archive import write_archive
+from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results import together
-from a2tg_jax.results.folder import RunFolder, resuming_command
-from a2tg_jax.results.record import RunRecord, SceneSource
+from a2tg_jax.results.folder import RunFolder, create_run, resuming_command
+from a2tg_jax.results.history import read_history
+from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.training import Session
 
 SECONDS = 0.3
 
 
 def test_two_processes_train_as_one(tmp_path):
-    told = ended(pair(["--length", "8", "--folder", str(tmp_path)]))
-    assert "by 2 processes" in told[0] and told[1] == ""
+    """By the command line: two stages, a pruning, the growth of textures."""
+    run = RunFolder(tmp_path / "run")
+    assert ended(trainings(run.path, SHORT, (), ()))[1] == ""
+    record = read_record(run)
+    alone = a2tg.fit(record.scene.load(), record.system, progress=False)
+    for name, stage in zip(record.plan.main, alone.stages, strict=True):
+        history, model = read_history(run.history(name)), load_model(run.model(name))
+        np.testing.assert_allclose(history.loss, stage.history.loss, rtol=1e-3)
+        assert model.num_bytes == stage.model.num_bytes
+
+
+def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
+    first, other = trainings(tmp_path / "run", SHORT, (), ("--seed", "1"))
+    told, _ = [process.communicate(timeout=120)[1] for process in (first, other)]
+    assert "process 1 of 2 failed: this process has other options than the first" in told
+    assert first.returncode == LOST
 
 
 @pytest.mark.parametrize(("victim", "number"), [(0, signal.SIGKILL), (1, signal.SIGSTOP)])
@@ -173,6 +190,16 @@ def test_digests_differ_where_training_would():
     other_seed = digests(dataclasses.replace(record, system=dataclasses.replace(system, seed=1)))
     differing = [[a != b for a, b in zip(found, digests(), strict=True)] for found in (other_seed, on_two)]
     assert differing == [[True, False, False], [False, True, False]]
+
+
+def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("/there"), "gaussians-2d-mcmc", a2tg.Gaussians2dMcmc()))
+    train = train_defaults(["--resume", "--out", str(run.path), "--coordinator", "h:1"])
+    train = dataclasses.replace(train, scene=str(tmp_path), out=run.path)
+    assert train._resumed(run, is_written=False).scene.path == str(tmp_path)
+    with pytest.raises(ValueError, match="was trained on /there, not on"):
+        train._resumed(run)
 
 
 def test_a_lack_of_memory_is_no_lost_connection():

@@ -94,7 +94,7 @@ class Team:
         """End this process, which waits inside XLA, with one line."""
         if reason:
             with contextlib.suppress(ValueError, OSError):
-                print(f"a2tg: error: {reason}; {self.advice()}", file=sys.stderr)
+                print("; ".join(filter(None, (f"a2tg: error: {reason}", self.advice()))), file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(LOST)
