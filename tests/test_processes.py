@@ -22,25 +22,25 @@ from a2tg_jax.host.machine import Devices
 from a2tg_jax.host.processes import LOST, is_of_collectives
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
+from a2tg_jax.rasterize import placement
 from a2tg_jax.results import together
 from a2tg_jax.results.folder import RunFolder, create_run, resuming_command
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
-from a2tg_jax.training import Session
+from a2tg_jax.training import Session, fit_stage
 
 SECONDS = 0.3
 
 
 def test_two_processes_train_as_one(tmp_path):
-    """By the command line: two stages, a pruning, the growth of textures."""
+    """By the command line, in two stages with a pruning and the growth of textures; the first is compared."""
     run = RunFolder(tmp_path / "run")
     assert ended(trainings(run.path, SHORT, (), ()))[1] == ""
     record = read_record(run)
-    alone = a2tg.fit(record.scene.load(), record.system, progress=False)
-    for name, stage in zip(record.plan.main, alone.stages, strict=True):
-        history, model = read_history(run.history(name)), load_model(run.model(name))
-        np.testing.assert_allclose(history.loss, stage.history.loss, rtol=1e-3)
-        assert model.num_bytes == stage.model.num_bytes
+    first, _ = record.plan.main
+    alone = fit_stage(record.scene.load(), record.system, 0, progress=False)
+    np.testing.assert_allclose(read_history(run.history(first)).loss, alone.history.loss, rtol=1e-3)
+    assert load_model(run.model(first)).num_bytes == alone.model.num_bytes
 
 
 def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
@@ -200,6 +200,16 @@ def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
     assert train._resumed(run, is_written=False).scene.path == str(tmp_path)
     with pytest.raises(ValueError, match="was trained on /there, not on"):
         train._resumed(run)
+
+
+def test_numbers_of_the_first_process_keep_their_bits(monkeypatch):
+    own = (np.array([1 / 3, 2.0]), np.arange(4)[::2], np.ones((2, 2), np.float32))
+    assert placement.of_first(None, own) is own
+    told = []
+    monkeypatch.setattr(placement.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
+    found = placement.of_first(SimpleNamespace(is_of_processes=True), own)
+    jax.tree.map(np.testing.assert_array_equal, found, own)
+    assert [x.dtype for x in found] == [x.dtype for x in own] and set(told) == {np.dtype(np.uint8)}
 
 
 def test_a_lack_of_memory_is_no_lost_connection():
