@@ -27,6 +27,10 @@ from a2tg_jax.texture import Shape
 T = TypeVar("T")
 
 
+def _as_it_is(tree: Any) -> Any:
+    return tree
+
+
 class Times(NamedTuple):
     """Every so many iterations, from 1, between a first and a last, both included. Host numbers, or traced."""
 
@@ -100,6 +104,9 @@ class Due:
     """Training views, with the cameras that the scene gives."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
     """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
+    agreed: Callable[[Any], Any] = _as_it_is
+    """Function that returns the arrays that the first of several processes has. Sums of renders need it, because GPUs
+    may round them differently each time; all processes call it."""
 
 
 class EventInfo(NamedTuple):

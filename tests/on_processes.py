@@ -1,6 +1,6 @@
 """Trains on several processes of this machine and compares with one; kills and stops processes of trainings.
 
-python tests/on_processes.py --processes 4           longer than `test_processes`, with more systems
+python tests/on_processes.py --processes 4           with gradients and more systems than `test_processes`
 python tests/on_processes.py --losses                a process of a training is killed or stopped in every way
 
 `test_processes` calls it with the number of one process, which it then is.
@@ -36,7 +36,11 @@ SYSTEMS = {
     ),
     "mcmc": lambda length: system(Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length),
 }
-RUN = ("synthetic", "--preset", "smoke", "--downscale", "4", "--stage1-iterations", "20000", "--densify.cap", "60")
+SMALL = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
+PRUNING = ("--floaters.min-views", "2", "--floaters.at", "0.5")
+"""Options with which process 0 prunes for all."""
+SHORT = (*SMALL, *PRUNING, "--texture.upscale-at", "0.5", "--stage1-iterations", "20", "--stage2-iterations", "10")
+LONG = (*SMALL, "--stage1-iterations", "20000")
 
 
 def free_port():
@@ -50,6 +54,13 @@ def pair(arguments, count=2):
     """Processes that run this script with some arguments and the place of each."""
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", str(count), "--process-id"]
     return [started([__file__, *arguments, *place, str(number)]) for number in range(count)]
+
+
+def trainings(out, flags, *own):
+    """Processes of the command line that train together, each with some flags of its own."""
+    words = ["-m", "a2tg_jax.cli", "train", "synthetic", "--out", str(out), *flags]
+    place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", str(len(own)), "--process-id"]
+    return [started([*words, *place, str(number), *each]) for number, each in enumerate(own)]
 
 
 def started(arguments):
@@ -123,9 +134,7 @@ def losses(seconds=8.0):
 
 
 def _lost_in_training(victim, number, seconds, out):
-    place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2"]
-    words = ["-m", "a2tg_jax.cli", "train", *RUN, "--out", str(out), "--heartbeat-timeout-seconds", str(seconds)]
-    processes = [started([*words, *place, "--process-id", str(index)]) for index in range(2)]
+    processes = trainings(out, (*LONG, "--heartbeat-timeout-seconds", str(seconds)), (), ())
     while not list(out.glob("checkpoints/*.npz")):
         assert all(process.poll() is None for process in processes)
         time.sleep(0.1)

@@ -33,6 +33,7 @@ from a2tg_jax.results.forecast import (
 )
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
+from a2tg_jax.systems.stage1 import PruneConfig
 from a2tg_jax.training import SYSTEMS, progress
 from a2tg_jax.training.bilateral import sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
@@ -238,6 +239,22 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
     found = run_of(scene, system)
     assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
     assert found.peak[1].program == 0 and found.seconds == 0
+
+
+def test_the_state_must_fit_on_one_of_several_devices_if_events_gather_it(monkeypatch):
+    monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
+    scene, capped = scene_of(24, 16), a2tg.McmcConfig(cap=10**6)
+    plain, pruned = (a2tg.Gaussians2dMcmc(densify=capped, prune=PruneConfig(share=share)) for share in (0.0, 0.1))
+    assert set(run_of(scene, plain).gathered.values()) == {0}
+    found = run_of(scene, pruned)
+    assert max(found.gathered.values()) == 2 * 3 * 232 * 10**6
+    with pytest.raises(ValueError, match=r"gather the whole state of .* on one device: .* change --densify.cap"):
+        found.check_one_device(1e9)
+    tell_forecast(scene, plan_run({"a": pruned}), None, 2)
+    monkeypatch.setattr(RunForecast, "check", lambda found, limit: None)
+    with pytest.raises(ValueError, match="leave these events out"):
+        tell_forecast(scene, plan_run({"a": pruned}), 10**9, 2)
+    tell_forecast(scene, plan_run({"a": pruned}), 10**9)
 
 
 def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):

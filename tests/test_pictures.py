@@ -14,7 +14,7 @@ from small_values import assert_same
 from a2tg_jax import Gaussians2dMcmc, McmcConfig, fit, load_scene, synthetic_scene
 from a2tg_jax.data import photo_store as pictures
 from a2tg_jax.data.photo_store import Picture, Shelf
-from a2tg_jax.training import loop
+from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore, stack_views
 
 SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=McmcConfig(cap=70))
@@ -102,6 +102,18 @@ def test_memory_takes_as_many_photographs_as_it_has_room_for(tmp_path):
     store = PhotoStore(scene.train, BatchOrder(scene.train, 1, 0), 12)
     assert not store.is_resident
     store.close()
+
+
+@pytest.mark.parametrize("room", [None, 0])
+def test_photographs_stay_on_no_device_if_one_process_lacks_the_room(tmp_path, monkeypatch, room):
+    """Where another process has no room, where this one has none, and where both have some."""
+    scene, told = load(write_scene(tmp_path / "scene")), []
+    for other in (False, True):
+        monkeypatch.setattr(batches, "asked_by_any", lambda _, own, other=other: told.append(own) or own or other)
+        store = PhotoStore(scene.train, BatchOrder(scene.train, 1, 0), 12, room=room)
+        store.close()
+        assert store.is_resident == (room is None and not other)
+    assert told == [room == 0] * 2
 
 
 def test_all_batches_have_opacities_and_masks_where_one_has(tmp_path):

@@ -1,27 +1,53 @@
 """Several processes that train together: those of this machine (`on_processes`), and connections without a training."""
 
+import dataclasses
 import signal
+import socket
 import threading
 import time
 from multiprocessing import AuthenticationError
+from types import SimpleNamespace
 
+import jax
+import numpy as np
 import pytest
-from on_processes import ended, free_port, pair, started, survivor_of
+from on_processes import SHORT, ended, free_port, pair, started, survivor_of, trainings
 
+import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host import liveness
 from a2tg_jax.host.liveness import Liveness, accept, connect, listen
 from a2tg_jax.host.machine import Devices
-from a2tg_jax.host.processes import LOST
+from a2tg_jax.host.processes import LOST, is_of_collectives
 from a2tg_jax.io.archive import write_archive
-from a2tg_jax.results.folder import RunFolder, resuming_command
+from a2tg_jax.io.model_file import load_model
+from a2tg_jax.rasterize import placement
+from a2tg_jax.results import together
+from a2tg_jax.results.folder import RunFolder, create_run, resuming_command
+from a2tg_jax.results.history import read_history
+from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
+from a2tg_jax.training import Session, fit_stage
 
 SECONDS = 0.3
 
 
 def test_two_processes_train_as_one(tmp_path):
-    told = ended(pair(["--length", "8", "--folder", str(tmp_path)]))
-    assert "by 2 processes" in told[0] and told[1] == ""
+    """By the command line, in two stages with a pruning and the growth of textures; the first is compared."""
+    run = RunFolder(tmp_path / "run")
+    assert ended(trainings(run.path, SHORT, (), ()))[1] == ""
+    record = read_record(run)
+    first, _ = record.plan.main
+    alone = fit_stage(record.scene.load(), record.system, 0, progress=False)
+    np.testing.assert_allclose(read_history(run.history(first)).loss, alone.history.loss, rtol=1e-3)
+    assert load_model(run.model(first)).num_bytes == alone.model.num_bytes
+
+
+def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
+    first, other = trainings(tmp_path / "run", SHORT, (), ("--seed", "1"))
+    told, _ = [process.communicate(timeout=120)[1] for process in (first, other)]
+    assert "process 1 of 2 failed: this process has other options than the first" in told
+    assert first.returncode == LOST
 
 
 @pytest.mark.parametrize(("victim", "number"), [(0, signal.SIGKILL), (1, signal.SIGSTOP)])
@@ -36,10 +62,22 @@ def test_a_lost_process_is_noticed(victim, number):
 
 
 def test_a_process_that_does_not_come_is_told():
-    place = f"p.Place('127.0.0.1:{free_port()}', 2, 0, 60.0)"
-    code = f"from a2tg_jax.host import processes as p; p.JOIN_SECONDS = 1; p.joined({place}).__enter__()"
+    """And before, that there is no cluster."""
+    code = f"""
+import os, sys
+from a2tg_jax.host import processes as p
+os.environ["A2TG_DEBUG"] = "1"
+try:
+    p.joined(p.Place("auto", None, None, 60.0)).__enter__()
+except ValueError as error:
+    print(error, file=sys.stderr)
+del os.environ["A2TG_DEBUG"]
+p.JOIN_SECONDS = 1
+p.joined(p.Place("127.0.0.1:{free_port()}", 2, 0, 60.0)).__enter__()
+"""
     alone = started(["-c", code])
     told = alone.communicate(timeout=120)[1]
+    assert "--coordinator auto: no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" in told
     assert alone.returncode == LOST and "not all processes have joined --coordinator 127.0.0.1:" in told
 
 
@@ -49,13 +87,15 @@ def three(monkeypatch):
     monkeypatch.setattr(liveness, "GRACE", 0.0)
     listener, port, key = listen()
     found = {}
-    accepting = threading.Thread(target=lambda: found.update(accept(listener, 3)))
+    accepting = threading.Thread(target=lambda: found.update(accept(listener, key, 3)))
     accepting.start()
+    silent = socket.create_connection(("127.0.0.1", port))
     with pytest.raises((AuthenticationError, EOFError, OSError)):
         connect("127.0.0.1", port, b"a stranger's", 1)
     others = [connect("127.0.0.1", port, key, number) for number in (1, 2)]
     accepting.join(10)
-    return [found, *others], [[], [], []]
+    with silent:
+        yield [found, *others], [[], [], []]
 
 
 def watched(three, numbers):
@@ -123,6 +163,63 @@ def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
     assert resuming_command(run, Devices(1, 2)) == f"a2tg train --out {tmp_path} --resume {by_two}"
 
 
+def test_digests_differ_where_training_would():
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=20)
+    system, session = a2tg.Gaussians2dMcmc(), Session()
+    record = RunRecord(SceneSource("here"), "gaussians-2d-mcmc", system)
+    view, *others = scene.train
+
+    def digests(record=record, session=session, view=view, **changes):
+        return together.digests_of(record, dataclasses.replace(scene, train=(view, *others), **changes), session)
+
+    def changed(**values):
+        return dataclasses.replace(view, **values)
+
+    same = dataclasses.replace(record, scene=SceneSource("there"))
+    assert digests() == digests(same) == digests(session=None)
+    size = view.picture.size
+    camera = dataclasses.replace(view.camera, viewmat=view.camera.viewmat + np.float32(1e-6))
+    fisheye = dataclasses.replace(view.camera, rays=np.zeros((*size, 2), np.float32))
+    views = [changed(camera=camera), changed(camera=fisheye), changed(mask=np.ones(size, bool)), changed(name="other"),
+             changed(depth=np.ones(size, np.float32)), changed(picture=np.zeros((*size, 4), np.uint8))]  # fmt: skip
+    scenes = [digests(view=each) for each in views]
+    scenes += [digests(points=scene.points + np.float32(1e-6)), digests(colors=scene.colors * 0.5), digests(scale=9.0)]
+    assert all(found[:2] == digests()[:2] and found[2] != digests()[2] for found in scenes)
+    mesh = SimpleNamespace(devices=np.array([SimpleNamespace(process_index=0, id=index) for index in range(2)]))
+    on_two = digests(session=SimpleNamespace(exchange=SimpleNamespace(mesh=mesh)))
+    other_seed = digests(dataclasses.replace(record, system=dataclasses.replace(system, seed=1)))
+    differing = [[a != b for a, b in zip(found, digests(), strict=True)] for found in (other_seed, on_two)]
+    assert differing == [[True, False, False], [False, True, False]]
+
+
+def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("/there"), "gaussians-2d-mcmc", a2tg.Gaussians2dMcmc()))
+    train = train_defaults(["--resume", "--out", str(run.path), "--coordinator", "h:1"])
+    train = dataclasses.replace(train, scene=str(tmp_path), out=run.path)
+    assert train._resumed(run, is_written=False).scene.path == str(tmp_path)
+    with pytest.raises(ValueError, match="was trained on /there, not on"):
+        train._resumed(run)
+
+
+def test_numbers_of_the_first_process_keep_their_bits(monkeypatch):
+    own = (np.array([1 / 3, 2.0]), np.arange(4)[::2], np.ones((2, 2), np.float32))
+    assert placement.of_first(None, own) is own
+    told = []
+    monkeypatch.setattr(placement.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
+    found = placement.of_first(SimpleNamespace(is_of_processes=True), own)
+    jax.tree.map(np.testing.assert_array_equal, found, own)
+    assert [x.dtype for x in found] == [x.dtype for x in own] and set(told) == {np.dtype(np.uint8)}
+
+
+def test_a_lack_of_memory_is_no_lost_connection():
+    lost = ("Gloo all-reduce failed: Connection closed by peer", "NCCL operation failed", "UNAVAILABLE: task is gone")
+    assert all(is_of_collectives(jax.errors.JaxRuntimeError(text)) for text in lost)
+    assert is_of_collectives(ValueError(lost[0])) and not is_of_collectives(ValueError("no scene"))
+    text = "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes."
+    assert not is_of_collectives(jax.errors.JaxRuntimeError(text))
+
+
 @pytest.mark.parametrize(
     ("flags", "told"),
     [
@@ -131,7 +228,13 @@ def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
         ("--coordinator h --num-processes 2 --process-id 0", "--coordinator must be HOST:PORT or auto; got 'h'"),
         ("--coordinator h:1 --num-processes 2 --process-id 2", "--process-id must be from 0 to 1"),
         ("--coordinator auto --view", "--view shows the training of one process"),
-        ("--coordinator auto --heartbeat-timeout-seconds 0", "--heartbeat-timeout-seconds must be positive; got 0"),
+        ("--coordinator auto --heartbeat-timeout-seconds 0", "--heartbeat-timeout-seconds must be positive and finite"),
+        ("--coordinator auto --heartbeat-timeout-seconds nan", "must be positive and finite; got nan"),
+        ("--coordinator auto --heartbeat-timeout-seconds inf", "must be positive and finite; got inf"),
+        ("--heartbeat-timeout-seconds 9", "--heartbeat-timeout-seconds wants --coordinator HOST:PORT"),
+        ("--coordinator auto --num-processes -3", "--num-processes must be at least 1; got -3"),
+        ("--coordinator auto --process-id -1", "--process-id must be at least 0; got -1"),
+        ("--coordinator [::1]:7700 --num-processes 2 --process-id 0", "host name or an IPv4 address, not IPv6"),
     ],
 )
 def test_wrong_places_are_told(tmp_path, capsys, flags, told):

@@ -60,7 +60,7 @@ def seen_from(camera, mask=None) -> View:
     return View("black.png", camera, np.zeros((camera.height, camera.width, 3), np.uint8), mask)
 
 
-def pruned(event: Prune):
+def pruned(event: Prune, **told):
     """What an event makes of a model with rows to spare, whose moments are the rows' numbers."""
     model, _, statistics = some_state()
     camera = a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
@@ -69,7 +69,7 @@ def pruned(event: Prune):
     by_row = lambda x: jnp.broadcast_to(numbers.reshape(-1, *[1] * (x.ndim - 1)), x.shape)  # noqa: E731
     mu, nu = jax.tree.map(by_row, moments.mu), jax.tree.map(lambda x: 2 * by_row(x), moments.nu)
     moments = dataclasses.replace(moments, mu=mu, nu=nu)
-    change = event.apply(Due(views=[seen_from(camera)]), model, moments, ())
+    change = event.apply(Due(views=[seen_from(camera)], **told), model, moments, ())
     return model, camera, statistics, change
 
 
@@ -98,6 +98,11 @@ def test_so_many_are_kept_as_were_asked_for():
     assert pruned(Prune(keep=120))[-1].model.num == 120
     model, _, _, change = pruned(Prune(keep=1_000))
     assert change.model.num == model.num
+
+
+def test_the_weights_are_those_of_the_first_process():
+    change = pruned(Prune(keep=10), agreed=lambda weights: np.arange(len(weights)))[-1]
+    np.testing.assert_array_equal(np.diff(change.rows[:10]), 1)
 
 
 def test_degrees_stay_with_their_gaussians():

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import warnings
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from a2tg_jax.data.scene import kinds_of
 from a2tg_jax.model import Model
 from a2tg_jax.render import pairs_of_view
 from a2tg_jax.systems.stage1 import PruneConfig
+from a2tg_jax.training.batches import check_lenses
+from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.start import initial_model
 
@@ -248,6 +251,15 @@ def test_pixels_too_far_from_the_direction_of_view_do_not_count(tmp_path):
         a2tg.load_scene(write_fisheye(tmp_path, focal=1.5), lens="keep")
     with pytest.raises(ValueError, match="lens must be one of undistort, keep; got 'crop'"):
         a2tg.load_scene(tmp_path, lens="crop")
+
+
+def test_one_device_trains_through_lenses(kept):
+    check_lenses(kept.train, 1)
+    with pytest.raises(ValueError, match=r"keeps its lens, .*: leave out --devices .* --lens undistort"):
+        check_lenses(kept.train, 2)
+    session = SimpleNamespace(exchange=SimpleNamespace(num=2))
+    with pytest.raises(ValueError, match="--devices"):
+        StageRun(kept, a2tg.Gaussians2dMcmc(), 0, None, session=session)
 
 
 @pytest.mark.filterwarnings("ignore:training does not learn")

@@ -1,12 +1,16 @@
 """The flags that say which of several processes this one is."""
 
+import math
 import re
 
 from a2tg_jax.host.processes import AUTO, Place
 
+HEARTBEAT_TIMEOUT = 60.0
+"""Default of --heartbeat-timeout-seconds."""
+
 
 def place_of(
-    coordinator: str | None, num_processes: int | None, process_id: int | None, seconds: float
+    coordinator: str | None, num_processes: int | None, process_id: int | None, seconds: float | None
 ) -> Place | None:
     """Return the place of this process; None if it is the only one.
 
@@ -20,26 +24,37 @@ def place_of(
     flags = {"--num-processes": num_processes, "--process-id": process_id}
     given = [flag for flag, value in flags.items() if value is not None]
     if coordinator is None:
+        given += [] if seconds is None else ["--heartbeat-timeout-seconds"]
         if given:
             raise ValueError(f"{given[0]} wants --coordinator HOST:PORT, the address of the first process")
         return None
-    if seconds <= 0:
-        raise ValueError(f"--heartbeat-timeout-seconds must be positive; got {seconds:g}")
+    seconds = HEARTBEAT_TIMEOUT if seconds is None else seconds
+    if not 0 < seconds < math.inf:
+        raise ValueError(f"--heartbeat-timeout-seconds must be positive and finite; got {seconds:g}")
     if coordinator != AUTO:
         missing = [flag for flag in flags if flag not in given]
         if missing:
             raise ValueError(f"--coordinator HOST:PORT also wants {' and '.join(missing)}")
-        if not re.fullmatch(r".+:\d+", coordinator):
-            raise ValueError(f"--coordinator must be HOST:PORT or auto; got {coordinator!r}")
-        _check_number(num_processes or 0, process_id or 0)
+        _check_address(coordinator)
+    _check_number(num_processes, process_id)
     return Place(coordinator, num_processes, process_id, seconds)
 
 
-def _check_number(num_processes: int, process_id: int) -> None:
-    """Raise ValueError unless there is a process of that number among so many."""
-    if num_processes < 1:
+def _check_address(coordinator: str) -> None:
+    """Raise ValueError unless the text is HOST:PORT."""
+    if not re.fullmatch(r".+:\d+", coordinator):
+        raise ValueError(f"--coordinator must be HOST:PORT or auto; got {coordinator!r}")
+    if ":" in coordinator.rpartition(":")[0]:
+        raise ValueError(f"--coordinator wants a host name or an IPv4 address, not IPv6; got {coordinator!r}")
+
+
+def _check_number(num_processes: int | None, process_id: int | None) -> None:
+    """Raise ValueError unless there is a process of that number among so many; None: the cluster says it."""
+    if num_processes is not None and num_processes < 1:
         raise ValueError(f"--num-processes must be at least 1; got {num_processes}")
-    if not 0 <= process_id < num_processes:
+    if process_id is not None and process_id < 0:
+        raise ValueError(f"--process-id must be at least 0; got {process_id}")
+    if num_processes is not None and process_id is not None and process_id >= num_processes:
         raise ValueError(
             f"--process-id must be from 0 to {num_processes - 1}, one less than --num-processes; got {process_id}"
         )

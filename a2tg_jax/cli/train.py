@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
-from a2tg_jax.cli.place import place_of
+from a2tg_jax.cli.place import HEARTBEAT_TIMEOUT, place_of
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.core.display import counted
 from a2tg_jax.data.lenses import LensUse
@@ -44,6 +44,7 @@ from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import SYSTEMS, Session, System, find_system
+from a2tg_jax.training.batches import check_lenses
 
 BASELINE = "gaussians-2d-mcmc"
 DEFAULT_PRESET = "paper"
@@ -154,8 +155,8 @@ class Train:
     """Number of processes, with --coordinator HOST:PORT."""
     process_id: Annotated[int | None, defaulting_to("that of the cluster", "I")] = None
     """Number of this process, from 0, with --coordinator HOST:PORT. The first one, 0, writes the run folder."""
-    heartbeat_timeout_seconds: Annotated[float, arg(metavar="SECONDS")] = 60.0
-    """Time after which a process that is silent counts as lost and the others stop."""
+    heartbeat_timeout_seconds: Annotated[float | None, defaulting_to(f"{HEARTBEAT_TIMEOUT:g}", "SECONDS")] = None
+    """Time after which a process that is silent counts as lost and the others stop, with --coordinator."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
@@ -208,6 +209,7 @@ class Train:
         with opened(self.out) as run:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
+            check_lenses(scene.train, session.num_devices)
             tell_forecast(scene, record.plan, most, session.num_devices)
             result = go_on(
                 run,
@@ -231,8 +233,13 @@ class Train:
         return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init)
 
     def _resumed(self, run: RunFolder, *, is_written: bool = True) -> RunRecord:
-        """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it."""
+        """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it.
+
+        Unless it is written, this process follows another one, on whose machine the scene may have another path.
+        """
         kept, asked = read_record(run), self.record
+        if not is_written:
+            kept = dataclasses.replace(kept, scene=dataclasses.replace(kept.scene, path=asked.scene.path))
         if asked.scene.path != kept.scene.path:
             raise ValueError(f"{run.path} was trained on {kept.scene.path}, not on {asked.scene.path}")
         changed = changed_numbers(asked, kept)

@@ -48,7 +48,7 @@ class PruneFloaters(HostEvent):
         is_kept = np.ones(num, bool)
         if self.min_views:
             needed = min(self.min_views, len(due.views))
-            is_kept &= shown_in(model, due.views, self.least).num_views[:num] >= needed
+            is_kept &= due.agreed(shown_in(model, due.views, self.least).num_views)[:num] >= needed
         if self.near > 0:
             is_kept &= ~are_near(np.asarray(model.gaussians.means)[:num], due.views, self.near)
         if is_kept.sum() < 2:

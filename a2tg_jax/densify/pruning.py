@@ -52,8 +52,9 @@ class Prune(HostEvent):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         num, left = model.num, self._num_left(model.num)
+        weights = due.agreed(blending_weights(model, due.views))
         is_kept = np.zeros(num, bool)
-        is_kept[np.argsort(-blending_weights(model, due.views)[:num], kind="stable")[:left]] = True
+        is_kept[np.argsort(-weights[:num], kind="stable")[:left]] = True
         return kept_first(model, moments, state, is_kept)
 
     def _num_left(self, num: int) -> int:

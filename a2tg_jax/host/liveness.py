@@ -6,11 +6,13 @@ because a training waits for a lost process inside XLA and cannot be interrupted
 
 import contextlib
 import os
+import queue
+import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
 from multiprocessing import AuthenticationError
-from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.connection import Client, Connection, answer_challenge, deliver_challenge
 
 BEATS = 5
 """Number of signs of life within the time after which a silent process is lost."""
@@ -18,6 +20,8 @@ GRACE = 2.0
 """Seconds in which a process that fails with the others can tell its own error."""
 INTERRUPTED_GRACE = 300.0
 """Seconds in which a process that is interrupted with the others can write its last checkpoint."""
+LOOK_SECONDS = 0.1
+"""Seconds between two looks at who has arrived."""
 ALIVE, BYE, FAILED, INTERRUPTED, LOST, QUIT = b".", b"b", b"f", b"i", b"l", b"q"
 """Kinds of messages; a text follows FAILED and LOST."""
 Told = Callable[[str], None]
@@ -104,18 +108,32 @@ class Liveness:
             self._on_end(reason)
 
 
-def accept(listener: Listener, count: int) -> dict[int, Connection]:
+def accept(listener: socket.socket, key: bytes, count: int) -> dict[int, Connection]:
     """Return the connections of processes 1 to `count` - 1, each of which first sends its number.
 
-    Strangers, who do not know the key, are turned away.
+    Strangers, who do not know the key or say nothing, are turned away and keep nobody waiting.
     """
+    arrived: queue.SimpleQueue[tuple[int, Connection]] = queue.SimpleQueue()
     found: dict[int, Connection] = {}
-    while len(found) < count - 1:
-        with contextlib.suppress(AuthenticationError, EOFError, OSError):
-            connection = listener.accept()
-            found[int.from_bytes(connection.recv_bytes(), "big")] = connection
-    listener.close()
+    with listener:
+        listener.settimeout(LOOK_SECONDS)
+        while len(found) < count - 1:
+            with contextlib.suppress(OSError):  # TimeoutError is one.
+                guest = listener.accept()[0]
+                threading.Thread(target=_admit, args=(guest, key, arrived), daemon=True).start()
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    found.update([arrived.get_nowait()])
     return found
+
+
+def _admit(guest: socket.socket, key: bytes, arrived: "queue.SimpleQueue[tuple[int, Connection]]") -> None:
+    """Add the connection of a guest who knows the key."""
+    with contextlib.suppress(AuthenticationError, EOFError, OSError):
+        connection = Connection(guest.detach())
+        deliver_challenge(connection, key)
+        answer_challenge(connection, key)
+        arrived.put((int.from_bytes(connection.recv_bytes(), "big"), connection))
 
 
 def connect(host: str, port: int, key: bytes, number: int) -> dict[int, Connection]:
@@ -125,8 +143,7 @@ def connect(host: str, port: int, key: bytes, number: int) -> dict[int, Connecti
     return {0: connection}
 
 
-def listen() -> tuple[Listener, int, bytes]:
-    """Return a listener on a free port, that port, and a key that only those who know it can connect with."""
-    key = os.urandom(32)
-    listener = Listener(("", 0), authkey=key, backlog=64)
-    return listener, int(listener.address[1]), key
+def listen() -> tuple[socket.socket, int, bytes]:
+    """Return a listener on a free port, that port, and a key for those who may connect."""
+    listener = socket.create_server(("", 0), backlog=64)
+    return listener, int(listener.getsockname()[1]), os.urandom(32)

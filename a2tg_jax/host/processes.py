@@ -15,6 +15,7 @@ from jax.experimental import multihost_utils
 
 from a2tg_jax.host.liveness import Liveness, accept, connect, listen
 from a2tg_jax.host.operating_system import own_output_only, wait_in_abort
+from a2tg_jax.host.text import shortened
 
 JOIN_SECONDS = 300
 """Time in which all processes must have started."""
@@ -24,6 +25,8 @@ AUTO = "auto"
 LOST = 75
 """Exit code after another process was lost: training can go on from its last checkpoint."""
 LONGEST_HOST = 255
+MOST_TOLD = 300
+"""Largest number of characters of another process's error."""
 
 
 class Place(NamedTuple):
@@ -44,6 +47,8 @@ class Team:
         self.index, self.count, self._seconds = jax.process_index(), jax.process_count(), seconds
         self.advice: Callable[[], str] = str
         """Function that tells how to go on after a process is lost."""
+        self.has_met = False
+        """Whether all are training, so that an interruption of one stops all after the same iteration."""
         self._liveness: Liveness | None = None
 
     @property
@@ -56,7 +61,7 @@ class Team:
         own = listen() if self.is_first else None
         host = own_address(coordinator).encode() if own else b""
         told = broadcast(b"".join([own[1].to_bytes(4, "big"), own[2], host]) if own else b"")
-        others = accept(own[0], self.count) if own else connect(
+        others = accept(own[0], own[2], self.count) if own else connect(
             told[36:].decode(), int.from_bytes(told[:4], "big"), told[4:36], self.index
         )  # fmt: skip
         self._liveness = Liveness(others, self.count, self._seconds, self._end)
@@ -76,19 +81,20 @@ class Team:
             return
         if is_of_collectives(error):
             time.sleep(2 * self._seconds)  # `_end` comes first.
-        elif isinstance(error, KeyboardInterrupt):
+        elif isinstance(error, KeyboardInterrupt) and self.has_met:
             liveness.interrupt()
         elif self.is_first:
             liveness.quit()
         else:
-            liveness.fail(str(error))
+            is_interrupted = isinstance(error, KeyboardInterrupt)
+            liveness.fail("it was interrupted" if is_interrupted else shortened(str(error), MOST_TOLD))
             time.sleep(self._seconds)
 
     def _end(self, reason: str) -> NoReturn:
         """End this process, which waits inside XLA, with one line."""
         if reason:
             with contextlib.suppress(ValueError, OSError):
-                print(f"a2tg: error: {reason}; {self.advice()}", file=sys.stderr)
+                print("; ".join(filter(None, (f"a2tg: error: {reason}", self.advice()))), file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(LOST)
@@ -153,7 +159,9 @@ def _initialize(place: Place) -> None:
             shutdown_timeout_seconds=LEAVE_SECONDS,
         )
     except (ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(f"--coordinator {place.coordinator}: {error}") from error
+        is_alone = is_auto and "coordinator_address" in str(error)
+        reason = "no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" if is_alone else error
+        raise ValueError(f"--coordinator {place.coordinator}: {reason}") from error
 
 
 def _give_up(coordinator: str) -> NoReturn:
@@ -176,7 +184,10 @@ def broadcast(data: bytes) -> bytes:
 
 
 def is_of_collectives(error: BaseException) -> bool:
-    """Return whether an error was raised because processes could not reach each other."""
+    """Return whether an error was raised because processes could not reach each other. A lack of memory is a process's
+    own."""
+    if "RESOURCE_EXHAUSTED" in str(error):
+        return False
     return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error) or "NCCL" in str(error)
 
 

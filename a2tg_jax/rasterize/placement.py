@@ -52,6 +52,21 @@ def asked_by_any(exchange: Exchange | None, is_asked: bool) -> bool:
     return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
 
 
+def of_first(exchange: Exchange | None, tree: Any) -> Any:
+    """Return the first process's arrays in all processes, on the host; all of them call it with arrays of the same
+    shapes. With one process they stay."""
+    if exchange is None or not exchange.is_of_processes:
+        return tree
+
+    def of_leaf(x: Any) -> np.ndarray:
+        x = np.ascontiguousarray(x)
+        told = multihost_utils.broadcast_one_to_all(x.reshape(-1).view(np.uint8))  # As bytes: JAX may round numbers.
+        same: np.ndarray = np.asarray(told, np.uint8).view(x.dtype).reshape(x.shape)
+        return same
+
+    return jax.tree.map(of_leaf, tree)
+
+
 def check_same(exchange: Exchange | None, tree: Any, what: str) -> None:
     """Raise ValueError unless all processes have the same arrays (host); all of them call it."""
     if exchange is None or not exchange.is_of_processes:

@@ -69,6 +69,8 @@ class RunForecast:
     """Training time on CPUs; 0 if it cannot be estimated."""
     limits: tuple[str, ...] = ()
     """Names of the options that limit the number of Gaussians."""
+    gathered: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Bytes on one of several devices at the events on the host, by stage; 0 without such."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -114,6 +116,20 @@ class RunForecast:
             f"{in_bytes(limit)} may be used: {advice} allow more with --max-memory"
         )
 
+    def check_one_device(self, limit: float) -> None:
+        """Raise if one of several devices has no room for the events on the host, which need the whole state.
+
+        Raises:
+          ValueError: naming the options to change.
+        """
+        phase, needed = max(self.gathered.items(), key=lambda item: item[1], default=("", 0.0))
+        if needed > limit:
+            raise ValueError(
+                f"pruning and the growth of textures gather the whole state of {phase} on one device: that takes about "
+                f"{in_bytes(needed)}, and {in_bytes(limit)} may be used: change {self._told_options('model')}, or "
+                "leave these events out"
+            )
+
     def _told_options(self, largest: str) -> str:
         """Return the options to change if this part of the memory is the largest."""
         own = (f"--{name.replace('_', '-')}" for name in self.limits if name != "memory_budget")
@@ -139,7 +155,8 @@ def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
     systems = {id(planned.system): planned.system for planned in plan.stages}.values()
     limits = tuple(dict.fromkeys(name for system in systems for name in system.limits()))
     disk = _disk_bytes(scene, plan, list(stages.values()))
-    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits)
+    gathered = {name: stage.gathered_bytes for name, stage in stages.items()}
+    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, gathered)
 
 
 def quick_downscale(longest_side: int) -> int:
@@ -216,6 +233,8 @@ def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None, num_devic
     """
     found, limit = forecast_run(scene, plan), allowed_memory(max_memory, num_devices)
     found.check(limit)
+    if num_devices > 1:
+        found.check_one_device(allowed_memory(max_memory))
     print(found.told(limit), flush=True)
 
 

@@ -18,6 +18,7 @@ from a2tg_jax.results.output import check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training import System
+from a2tg_jax.training.batches import check_lenses
 from a2tg_jax.training.start import check_start, initial_number
 
 STATE_SIZE = 3
@@ -47,6 +48,7 @@ def check_new_run(
         check_init(Path(record.init), out, record.system)
     check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory))
+    check_lenses(scene.train, num_devices)
     for system in record.systems.values():
         check_start(scene, system)
     check_room(record, scene, out)

@@ -10,10 +10,14 @@ import hashlib
 import json
 import tempfile
 import warnings
+import zlib
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.data import Scene
+import numpy as np
+
+from a2tg_jax.data import Scene, View
+from a2tg_jax.data.scene import views_by_kind
 from a2tg_jax.host import signals
 from a2tg_jax.host.processes import broadcast, team
 from a2tg_jax.io.model_file import load_model
@@ -22,25 +26,48 @@ from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import DivergedError, Session, fit_stage, load_checkpoint
 from a2tg_jax.training.loop import IsStopped
 
+DIFFERING = ("options", "--devices", "views, cameras or points")
+"""What is compared with the first process."""
 
-def check_alike(record: RunRecord, scene: Scene) -> None:
-    """Compare the options and the scene with the first process's; all processes call it together.
+
+def check_alike(record: RunRecord, scene: Scene, session: Session | None) -> None:
+    """Compare options, devices and the scene with the first process's; all processes call it together.
 
     Raises:
       ValueError: if they differ.
     """
-    if team() is None:
+    others = team()
+    if others is None:
         return
-    own = digest_of(record, scene)
-    if broadcast(own) != own:
-        raise ValueError("this process has other options or another scene than the first: start all with the same")
+    own = digests_of(record, scene, session)
+    told = broadcast(b"".join(own))
+    differing = [name for place, name in enumerate(DIFFERING) if told[32 * place : 32 * (place + 1)] != own[place]]
+    if differing:
+        raise ValueError(f"this process has other {' and '.join(differing)} than the first: start all with the same")
+    others.has_met = True
 
 
-def digest_of(record: RunRecord, scene: Scene) -> bytes:
-    """Return 32 bytes that differ if training would: options, views, points. Paths may differ between machines."""
+def digests_of(record: RunRecord, scene: Scene, session: Session | None) -> list[bytes]:
+    """Return 32 bytes for each of `DIFFERING` that differ if training would. Paths and the pixels of photographs, masks
+    and depth maps are not compared."""
     systems = [(label, repr(system)) for label, system in record.systems.items()]
-    views = [(view.name, view.picture.size) for view in scene.train]
-    return hashlib.sha256(repr((systems, views, scene.points.shape, float(scene.scale))).encode()).digest()
+    mesh = None if session is None or session.exchange is None else session.exchange.mesh
+    devices = [] if mesh is None else [(device.process_index, device.id) for device in mesh.devices.flat]
+    views = [_told_of_view(view) for view in scene.train]
+    rays = [_checksum(own[0].camera.rays) for own in views_by_kind(scene.train)]
+    told = views, rays, _checksum(scene.points), _checksum(scene.colors), float(scene.scale)
+    return [hashlib.sha256(repr(value).encode()).digest() for value in (systems, devices, told)]
+
+
+def _told_of_view(view: View) -> tuple[Any, ...]:
+    """Return what is compared of a view: its name, its size, what it has, and its camera."""
+    has = view.has_alpha, view.mask is not None, view.depth is not None
+    return view.name, view.picture.size, has, _checksum(view.camera.viewmat), _checksum(view.camera.K)
+
+
+def _checksum(x: Any) -> tuple[tuple[int, ...], int] | None:
+    """Return the shape of an array and a checksum of its bytes; None of None."""
+    return None if x is None else (np.shape(x), zlib.crc32(np.ascontiguousarray(x).tobytes()))
 
 
 def tell_stage(name: str, resume: Path | None, start: Path | None, num_restored: int | None) -> None:
@@ -67,7 +94,7 @@ def follow(record: RunRecord, scene: Scene, session: Session) -> None:
       ValueError: as `fit_stage` does.
       Stopped: if one of the processes is asked to end.
     """
-    check_alike(record, scene)
+    check_alike(record, scene, session)
     with warnings.catch_warnings(), signals.noted() as is_stopped:
         warnings.simplefilter("ignore")
         while (header := json.loads(broadcast(b"")))["name"] is not None:

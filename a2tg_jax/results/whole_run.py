@@ -101,7 +101,7 @@ def go_on(
     errors those of `begin_run`."""
     devices = None if session is None else session.devices
     with _advised(run, devices, is_replacing=replaced_by is not None):
-        check_alike(replaced_by or read_record(run), scene)
+        check_alike(replaced_by or read_record(run), scene, session)
         with signals.noted() as is_stopped, watched(scene) as watch:
             train_run(
                 run,

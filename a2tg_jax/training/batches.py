@@ -13,7 +13,7 @@ from jax import Array
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.rasterize.exchange import Exchange
-from a2tg_jax.rasterize.placement import everywhere, spread_pixels
+from a2tg_jax.rasterize.placement import asked_by_any, everywhere, spread_pixels
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -116,7 +116,7 @@ def view_bytes(view: View, has_depths: bool = False) -> int:
 
 class PhotoStore:
     """Photographs of a stage's iterations. They stay on the device if all of them fit; otherwise threads prepare
-    batches ahead of the step. Close it when the stage is over."""
+    batches ahead of the step. Several processes decide together. Close it when the stage is over."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class PhotoStore:
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
         self._has_depths = has_depths
         plan = plan_batches(views, len(order.indices(1)), room, has_depths)
-        self.is_resident, self.num_ahead = plan.is_resident, plan.num_ahead
+        self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
         self._kinds = kinds_of(views)
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
         self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead)
@@ -223,6 +223,16 @@ def check_depths(views: tuple[View, ...]) -> None:
         raise ValueError(
             "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
             "into the folder depths beside images, or set it to 0"
+        )
+
+
+def check_lenses(views: tuple[View, ...], num_devices: int) -> None:
+    """Raise ValueError if photographs behind a lens are to be trained on by several devices."""
+    view = next((view for view in views if view.camera.rays is not None), None)
+    if view is not None and num_devices > 1:
+        raise ValueError(
+            f"view {view.name} keeps its lens, which one device trains: leave out --devices and --coordinator, or say "
+            "--lens undistort"
         )
 
 

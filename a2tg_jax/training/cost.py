@@ -32,6 +32,8 @@ COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
+GATHERED = 2
+"""Number of states that an event on the host holds: the former and the new one."""
 STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 """Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
 (colours, loss, and the gradients of both) and pair (tile lists)."""
@@ -86,6 +88,8 @@ class StageForecast:
     """Programs compiled while it runs."""
     seconds: float
     """All its iterations, on CPUs, roughly."""
+    gathered_bytes: float
+    """Bytes on one device while an event on the host changes the state; 0 without such events."""
 
 
 def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
@@ -100,9 +104,12 @@ def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
         for event in stage.events:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
         floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
-        programs = 1 + sum(e.num_programs(stage.iterations) for e in stage.events if isinstance(e, HostEvent))
+        on_host = [event for event in stage.events if isinstance(event, HostEvent)]
+        programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
+        gathered = GATHERED * STATES * model_bytes * any(event.iterations(stage.iterations) for event in on_host)
         seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
-        yield StageForecast(stage_bytes(scene, system, stage, num, model_bytes), model_bytes, num, programs, seconds)
+        needed = stage_bytes(scene, system, stage, num, model_bytes)
+        yield StageForecast(needed, model_bytes, num, programs, seconds, gathered)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
 

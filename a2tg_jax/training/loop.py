@@ -5,6 +5,7 @@ after it stay idle (`step.TrainState.status`); the loop mends the cause and laun
 """
 
 import dataclasses
+import functools
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -21,9 +22,9 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import Exchange, spread
-from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, readable
+from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, of_first, readable
 from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
-from a2tg_jax.training.batches import BatchOrder, PhotoStore
+from a2tg_jax.training.batches import BatchOrder, PhotoStore, check_lenses
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
@@ -115,6 +116,7 @@ class StageRun:
         self.session = Session() if session is None else session
         self.exchange = self.session.exchange
         self.views, self.system, self.index = scene.train, system, index
+        check_lenses(self.views, self.num_devices)
         self.stage = system.stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
         self._logged, self.earlier_seconds = HistoryLog(resume.history if resume else History.empty()), 0.0
@@ -246,6 +248,9 @@ class StageRun:
             stops.append(iteration + checkpoint_every - iteration % checkpoint_every)
         return min(stops)
 
+    def _on_host(self) -> list[HostEvent]:
+        return [event for event in self.stage.events if isinstance(event, HostEvent)]
+
     def _due_on_host(self) -> list[int]:
         """Return the iterations of all host events, and the last one of each step event."""
         count = self.stage.iterations
@@ -342,6 +347,8 @@ class StageRun:
         """Apply the host events that follow an iteration, on one device, and drop the statistics of past events."""
         if iteration not in self._due_on_host():
             return
+        if not any(iteration in event.iterations(self.stage.iterations) for event in self._on_host()):
+            return self._apply_host_events(iteration)
         self.state = gathered(self.exchange, self.state)
         self._apply_host_events(iteration)
         check_same(self.exchange, self.state, f"the events at iteration {iteration} of stage {self.stage.name}")
@@ -354,7 +361,8 @@ class StageRun:
                 due = event.iterations(self.stage.iterations)
                 if iteration not in due:
                     continue
-                told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
+                agreed = functools.partial(of_first, self.exchange)
+                told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes, agreed)
                 change = event.apply(told, self.state.model, self.state.moments, state)
                 self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
                 if change.rows is not None:
