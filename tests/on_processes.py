@@ -69,7 +69,7 @@ def started(arguments):
 
 
 def ended(processes, timeout=600):
-    """What processes write to stderr, once they have ended well; they are killed after some seconds."""
+    """Text that processes write to stderr, once they have ended well; they are killed after some seconds."""
     try:
         told = [process.communicate(timeout=timeout)[1] for process in processes]
     finally:

@@ -11,7 +11,7 @@ class BenchmarkSet(NamedTuple):
     """A data set for `a2tg download`."""
 
     content: str
-    """What it holds, in a few words."""
+    """Content in a few words."""
     archive: Archive
 
 

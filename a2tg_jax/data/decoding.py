@@ -61,7 +61,7 @@ def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 class PictureFacts(NamedTuple):
-    """What is known of an image file that can be decoded."""
+    """Facts about an image file that can be decoded."""
 
     size: tuple[int, int]
     """(width, height) after EXIF rotation."""

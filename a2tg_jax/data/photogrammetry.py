@@ -1,4 +1,4 @@
-"""What captures of photogrammetry share: XML, numbers in texts, images by name, and worlds of maps."""
+"""Parts that readers of photogrammetry programs share: XML, numbers in texts, images by name, and worlds of maps."""
 
 import dataclasses
 import re

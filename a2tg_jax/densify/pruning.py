@@ -84,7 +84,7 @@ def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> 
 
 
 class Shown(NamedTuple):
-    """What N Gaussians show in some views."""
+    """Contribution of N Gaussians to some views."""
 
     weights: np.ndarray
     """[N] Σ α·T over the pixels of all views that count, in pixels."""

@@ -27,7 +27,7 @@ from a2tg_jax.training import DivergedError, Session, fit_stage, load_checkpoint
 from a2tg_jax.training.loop import IsStopped
 
 DIFFERING = ("options", "--devices", "views, cameras or points")
-"""What is compared with the first process."""
+"""Facts that are compared with the first process."""
 
 
 def check_alike(record: RunRecord, scene: Scene, session: Session | None) -> None:

@@ -74,7 +74,7 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CorrectionConfig:
-    """What `exposure` and `refine_poses` learn, and how fast."""
+    """Options of what `exposure` and `refine_poses` learn."""
 
     exposure_kind: Literal["affine", "grid"] = "affine"
     """Exposure of a photograph: an affine map of its colours, or in addition a bilateral grid of such maps, which
