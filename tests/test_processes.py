@@ -50,12 +50,26 @@ def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     assert first.returncode == LOST
 
 
-@pytest.mark.parametrize(("victim", "number"), [(0, signal.SIGKILL), (1, signal.SIGSTOP)])
-def test_a_lost_process_is_noticed(victim, number):
+def waiting():
+    """Two processes that have met."""
     processes = pair(["--what", "wait", "--seconds", "2"])
     for process in processes:
         if process.stdout.readline() != "met\n":
             pytest.fail(str(ended(processes, 10)))
+    return processes
+
+
+def test_an_error_of_the_first_process_ends_both_at_once():
+    first, other = waiting()
+    first.send_signal(signal.SIGINT)
+    told = [process.communicate(timeout=20)[1] for process in (first, other)]
+    assert "KeyboardInterrupt" in told[0] and first.returncode == -signal.SIGINT
+    assert told[1] == "" and other.returncode == LOST
+
+
+@pytest.mark.parametrize(("victim", "number"), [(0, signal.SIGKILL), (1, signal.SIGSTOP)])
+def test_a_lost_process_is_noticed(victim, number):
+    processes = waiting()
     took, told = survivor_of(processes, victim, number, 60)
     reason = "has ended" if number == signal.SIGKILL else "was not heard from for 2 s"
     assert told == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8

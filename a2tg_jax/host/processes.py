@@ -91,8 +91,11 @@ class Team:
             time.sleep(self._seconds)
 
     def _end(self, reason: str) -> NoReturn:
-        """End this process, which waits inside XLA, with one line."""
-        if reason:
+        """End this process, which waits inside XLA, with one line; without a reason the first one ends, too."""
+        if not reason:
+            with contextlib.suppress(Exception):
+                jax.distributed.shutdown()  # The first process waits for it at its end.
+        else:
             with contextlib.suppress(ValueError, OSError):
                 print("; ".join(filter(None, (f"a2tg: error: {reason}", self.advice()))), file=sys.stderr)
         sys.stdout.flush()
