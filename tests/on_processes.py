@@ -37,7 +37,7 @@ SYSTEMS = {
     "mcmc": lambda length: system(Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length),
 }
 SMALL = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
-PRUNING = ("--floaters.min-views", "2", "--floaters.at", "0.5")
+PRUNING = ("--floaters.min-views", "2", "--floaters.at", "0.25")
 """Options with which process 0 prunes for all."""
 SHORT = (*SMALL, *PRUNING, "--texture.upscale-at", "0.5", "--stage1-iterations", "20", "--stage2-iterations", "10")
 LONG = (*SMALL, "--stage1-iterations", "20000")

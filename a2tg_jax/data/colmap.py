@@ -128,8 +128,9 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
         pixels, K = lens.undistort(photograph, still_to_downscale)
         rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
-        advice = "" if isinstance(lens, KeptLens) else "; undistort the scene with COLMAP first"
-        raise ValueError(f"{file}: its camera model {error}{advice}") from None
+        if isinstance(lens, KeptLens):
+            raise ValueError(f"{file}: its camera model {error}") from None
+        raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, file if pixels is photograph else None)
     depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)
