@@ -9,11 +9,12 @@ import pytest
 from PIL import ExifTags, Image
 from test_data_colmap import write_scene as write_colmap
 
-from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
+from a2tg_jax.data import load_scene, progress, run_sfm, sfm, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import find_photos
 from a2tg_jax.data.sfm_database import join_rig, list_images
 from a2tg_jax.data.staging import _link, _prefixes, stage
+from a2tg_jax.host import bars
 from a2tg_jax.results.camera_picture import save_camera_picture
 
 
@@ -144,14 +145,20 @@ def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
         _link(photos / "a.bmp", folder / group.names[0])
 
 
-def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd):
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is_terminal):
+    """As bars on a terminal, as plain lines in a pipe."""
+    for module in (bars, progress):
+        monkeypatch.setattr(module, "has_terminal", lambda: is_terminal)
     save_photos(tmp_path / "photos", 4, 128, 96)
     with contextlib.suppress(ValueError):  # The phases count, not what they find.
         run_sfm(tmp_path / "photos", tmp_path / "scene")
-    lines = capfd.readouterr().err.replace("\r", "\n").splitlines()
+    told = capfd.readouterr().err
+    assert is_terminal == ("\r" in told)
+    lines = told.replace("\r", "\n").splitlines()
     assert all(re.match(r"(features|matching|mapping|undistorting)\b|$", line) for line in lines)
-    assert any("4/4" in line for line in lines if line.startswith("features"))
-    assert any(line.startswith("matching 6 pairs: 00:0") for line in lines)
+    assert any(("4/4" if is_terminal else "4 of 4") in line for line in lines if line.startswith("features"))
+    assert any(line.startswith("matching 6 pairs: 00:0" if is_terminal else "matching 6 pairs …") for line in lines)
 
 
 def test_too_little_in_common(tmp_path, capfd):

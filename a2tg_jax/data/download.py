@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
+from a2tg_jax.host.bars import progress_over
+
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 60
 ATTEMPTS = 5
@@ -171,14 +173,14 @@ def unpack(file: Path, folder: Path, begun: Path, *, progress: bool = True) -> N
             _check_members(file, folder, [member.name for member in members], sizes, begun)
             if hasattr(tarfile, "data_filter"):  # Pythons before 3.11.4 know no filters.
                 opened.extraction_filter = tarfile.data_filter
-            for member in tqdm(members, desc="unpacking", unit="file", disable=not progress):
+            for member in progress_over(members, "unpacking", "file", is_shown=progress):
                 opened.extract(member, folder)
         return
     with zipfile.ZipFile(file) as opened_zip:
         infos = [info for info in opened_zip.infolist() if _is_wanted(info.filename)]
         sizes = [None if info.is_dir() else info.file_size for info in infos]
         _check_members(file, folder, [info.filename for info in infos], sizes, begun)
-        for info in tqdm(infos, desc="unpacking", unit="file", disable=not progress):
+        for info in progress_over(infos, "unpacking", "file", is_shown=progress):
             opened_zip.extract(info, folder)
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, get_args
 from a2tg_jax.core.display import counted
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
-from a2tg_jax.data.progress import clock, photo_bar
+from a2tg_jax.data.progress import clock
 from a2tg_jax.data.sfm_database import (
     CameraModel,
     Matching,
@@ -23,6 +23,7 @@ from a2tg_jax.data.sfm_database import (
 )
 from a2tg_jax.data.staging import Panorama, Staged, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
+from a2tg_jax.host.bars import counting
 
 MAX_EXHAUSTIVE = 200
 """Number of photographs beyond which "auto" matches only neighbours in name order."""
@@ -136,7 +137,7 @@ def _map(staged: Staged, work: Path, seed: int, progress: bool, tell: Callable[[
     if staged.rigs:
         options.ba_refine_sensor_from_rig = False
         options.constant_cameras = known_cameras(work / "database.db", staged)
-    with photo_bar("mapping", staged.num_places, progress) as bar:
+    with counting("mapping", staged.num_places, "photo", is_shown=progress) as bar:
         models = colmap.incremental_mapping(
             work / "database.db",
             staged.folder,

@@ -7,8 +7,9 @@ from typing import Literal
 import numpy as np
 
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.progress import clock, photo_bar
+from a2tg_jax.data.progress import clock
 from a2tg_jax.data.staging import CameraGroup, Rig, Staged
+from a2tg_jax.host.bars import counting
 from a2tg_jax.host.cores import num_threads
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -35,7 +36,7 @@ def extract_features(
     for rig in staged.rigs:
         join_rig(database, rig)
     together = PHOTOS_PER_CORE * num_threads()
-    with photo_bar("features", len(names), progress) as bar:
+    with counting("features", len(names), "photo", is_shown=progress) as bar:
         for start in range(0, len(names), together):
             some = names[start : start + together]
             colmap.extract_features(database, staged.folder, some, device=colmap.Device.cpu)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from scipy.ndimage import laplace
-from tqdm import tqdm
 
 from a2tg_jax.data.decoding import MAX_PIXELS
+from a2tg_jax.host.bars import counting
 
 DEFAULT_FRAMES = 150
 SHARPNESS_WIDTH, MOTION_WIDTH = 640, 128
@@ -106,8 +106,7 @@ def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
             stream.thread_type = "AUTO"
             if stream.width * stream.height > MAX_PIXELS:
                 raise ValueError(f"{video}: has frames of more than {MAX_PIXELS // 10**6} megapixels")
-            bar = tqdm(desc=phase, total=stream.frames or None, unit="frame", disable=not progress)
-            with bar:
+            with counting(phase, stream.frames or None, "frame", is_shown=progress) as bar:
                 for frame in container.decode(stream):
                     bar.update()
                     yield frame

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 from tqdm import tqdm
@@ -27,15 +28,41 @@ def progress_over(items: Sequence[Item], title: str, unit: str, *, is_shown: boo
       unit: word for one item.
       is_shown: without, nothing is shown.
     """
-    if not is_shown or has_terminal():
-        yield from tqdm(items, desc=title, unit=unit, disable=not is_shown)
+    with counting(title, len(items), unit, is_shown=is_shown) as counter:
+        for item in items:
+            yield item
+            counter.update(1)
+
+
+@contextmanager
+def counting(title: str, total: int | None, unit: str, *, is_shown: bool = True) -> Iterator["tqdm | PlainCounter"]:
+    """Show how many items are done, which `update(number)` of the result tells.
+
+    Args:
+      title, unit, is_shown: as of `progress_over`.
+      total: number of items; None if it is not known.
+    """
+    if is_shown and not has_terminal():
+        yield PlainCounter(title, total)
         return
-    total, told, at = len(items), 0, time.perf_counter()
-    for done, item in enumerate(items, start=1):
-        yield item
-        if is_line_due(done, total, told, at):
-            print(f"{title}: {done:,} of {total:,}", file=sys.stderr, flush=True)
-            told, at = done, time.perf_counter()
+    with tqdm(total=total, desc=title, unit=unit, disable=not is_shown) as bar:
+        yield bar
+
+
+class PlainCounter:
+    """Number of finished items in plain lines on stderr."""
+
+    def __init__(self, title: str, total: int | None):
+        self._title, self._total, self._done = title, total, 0
+        self._last_line = 0, time.perf_counter()
+
+    def update(self, num: int = 1) -> None:
+        """Count items."""
+        self._done += num
+        if is_line_due(self._done, self._total or 0, *self._last_line):
+            of_total = f" of {self._total:,}" if self._total else ""
+            print(f"{self._title}: {self._done:,}{of_total}", file=sys.stderr, flush=True)
+            self._last_line = self._done, time.perf_counter()
 
 
 def is_line_due(done: int, total: int, told: int, at: float) -> bool:
@@ -43,7 +70,7 @@ def is_line_due(done: int, total: int, told: int, at: float) -> bool:
 
     Args:
       done: items so far.
-      total: all of them.
+      total: all of them; 0 if their number is not known.
       told: items at the last line.
       at: time of the last line, by `time.perf_counter`.
     """
