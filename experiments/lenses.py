@@ -13,6 +13,7 @@ OUT/lenses.md.
 import dataclasses
 import functools
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from lab.kept import KeptFigures, parser_of
 from PIL import Image
 
 import a2tg_jax as a2tg
+from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.lenses import KeptLens, Lens
 from a2tg_jax.data.lighting import light
 from a2tg_jax.data.surfaces import Surface, trace
@@ -44,12 +46,10 @@ USES = ("keep", "undistort")
 
 def lens_of(name: str) -> KeptLens:
     """Return a lens by its name."""
-    import pycolmap
-
     focal, k1 = LENSES[name]
     width, height = SIZE
     params = [focal, focal, width / 2, height / 2, k1, 0.0, 0.0, 0.0]
-    return KeptLens(pycolmap.Camera(model="OPENCV_FISHEYE", width=width, height=height, params=params))
+    return KeptLens(pycolmap().Camera(model="OPENCV_FISHEYE", width=width, height=height, params=params))
 
 
 def photograph(surfaces: Sequence[Surface], viewmat: np.ndarray, lens: KeptLens) -> np.ndarray:
@@ -88,8 +88,6 @@ def write_scene(folder: Path, name: str) -> None:
 
 def read_scene(folder: Path, use: Any) -> a2tg.Scene:
     """Return the scene read in one way, with the points of the built-in scene, which has none of its own."""
-    import warnings
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = a2tg.load_scene(folder, lens=use)

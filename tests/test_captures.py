@@ -116,7 +116,7 @@ def test_record3d(tmp_path, metadata, images, changes):
 
 
 def metashape_place(pose, f=100.0, b1=-4.0, cx=-2.0, cy=2.0, k1=-0.1, k2=0.02, k3=0.001, p1=0.004, p2=-0.003):
-    """Where Metashape's manual projects the target: Brown's distortion, then f, b1 and the offset from the middle."""
+    """The place of the target by Metashape's manual: Brown's distortion, then f, b1 and the offset from the middle."""
     x, y, z = to_camera(pose, TARGET)
     x, y = x / z, y / z
     r2 = x * x + y * y
@@ -283,7 +283,7 @@ def test_a_world_of_a_map_is_moved(tmp_path):
 
 
 def colmap_text(folder, points="points3D.txt"):
-    """As VGGT and MASt3R write it: a PINHOLE camera for each image, no features, points without tracks."""
+    """A model as VGGT and MASt3R write it: a PINHOLE camera for each image, no features, points without tracks."""
     save_dots(folder / "images", [f"{index}.png" for index in range(COUNT)])
     model = folder / "sparse"
     model.mkdir()

@@ -85,7 +85,7 @@ def cameras_of(found, work):
 
 
 def test_cameras_are_told_apart_and_exif_gives_their_focal_length(tmp_path):
-    """By folder, size and lens. A photograph that is turned keeps its EXIF data."""
+    """Photographs of one folder, size and lens share a camera. One that is turned keeps its EXIF data."""
     image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))
     for name, size in (("a/1.png", (64, 48)), ("a/2.png", (64, 48)), ("a/3.png", (32, 24)), ("b/1.png", (64, 48))):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -147,7 +147,7 @@ def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
 
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is_terminal):
-    """As bars on a terminal, as plain lines in a pipe."""
+    """Phases are bars on a terminal and plain lines in a pipe."""
     for module in (bars, progress):
         monkeypatch.setattr(module, "has_terminal", lambda: is_terminal)
     save_photos(tmp_path / "photos", 4, 128, 96)

@@ -106,7 +106,7 @@ def test_memory_takes_as_many_photographs_as_it_has_room_for(tmp_path):
 
 @pytest.mark.parametrize("room", [None, 0])
 def test_photographs_stay_on_no_device_if_one_process_lacks_the_room(tmp_path, monkeypatch, room):
-    """Where another process has no room, where this one has none, and where both have some."""
+    """Three cases: another process has no room, this one has none, both have some."""
     scene, told = load(write_scene(tmp_path / "scene")), []
     for other in (False, True):
         monkeypatch.setattr(batches, "asked_by_any", lambda _, own, other=other: told.append(own) or own or other)

@@ -33,7 +33,7 @@ SECONDS = 0.3
 
 
 def test_two_processes_train_as_one(tmp_path):
-    """By the command line, in two stages with a pruning and the growth of textures; the first is compared."""
+    """The command line trains two stages, with a pruning and the growth of textures. The first is compared."""
     run = RunFolder(tmp_path / "run")
     assert ended(trainings(run.path, SHORT, (), ()))[1] == ""
     record = read_record(run)

@@ -70,7 +70,7 @@ def test_rays_of_a_pinhole_camera_show_what_it_shows(x64, change, compositor, ti
 
 @BOTH
 def test_every_pixel_of_a_fisheye_sees_along_its_own_ray(x64, compositor):
-    """As a pinhole camera of a single pixel does; splats are larger than pixels, so that no filter decides."""
+    """It shows what a pinhole camera of that pixel alone does. Splats are larger than pixels: no filter decides."""
     scene = draw_scene(4, num=12)
     camera = fisheye(as_camera(scene, "float64"))
     gaussians = as_gaussians(scene, "float64")
@@ -209,7 +209,7 @@ def write_fisheye(folder, num_views=4, focal=20.0, size=(32, 24), **more):
 
 
 def aim(index):
-    """Where the camera of a place looks, and what is down."""
+    """The direction in which the camera of a place looks, and down."""
     return -np.array([np.cos(index), np.sin(index), 0.3]), np.array([0.0, 0.0, -1.0])
 
 

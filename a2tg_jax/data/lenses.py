@@ -21,17 +21,16 @@ GRID, MARGIN = 9, 0.1
 """Number of test points along an axis of an undistorted image, and their largest distance outside the photograph."""
 ROWS_AT_ONCE = 128
 """Number of rows undistorted at a time, which bounds the memory."""
-
-
 WIDEST_ANGLE = np.deg2rad(80.0)
 """Largest angle between a ray of a kept lens and the direction of view; pixels beyond it do not count."""
 FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
-_LOCK = threading.Lock()
 LEAST_SEEN = 0.05
 """Smallest share of pixels with a ray."""
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
+
+_LOCK = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

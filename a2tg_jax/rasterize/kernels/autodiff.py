@@ -66,7 +66,7 @@ def _block(
         return jax.tree.map(lambda entry: jnp.broadcast_to(entry[:, None], (BLOCK, x.shape[1])), tree)
 
     splat = xla.split(splats, settings.has_geometry)
-    planes, splat = spread(xla.seen_from(splats, tile)), spread(splat)
+    planes, splat = spread(pixel.planes_of(splat.M, xla.numbers_of(tile))), spread(splat)
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
 
     def show(planes: pixel.Planes) -> pixel.Shown:

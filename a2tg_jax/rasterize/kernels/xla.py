@@ -212,11 +212,6 @@ def pixels_of_tile(size: int, dtype: DTypeLike) -> tuple[Array, Array]:
     return jnp.asarray(x.reshape(1, -1), dtype), jnp.asarray(y.reshape(1, -1), dtype)
 
 
-def seen_from(splats: Splats, tile: Tiles) -> pixel.Planes:
-    """Return the planes of splats [B, ...] for a tile, each number [B]."""
-    return pixel.planes_of(split(splats, False).M, numbers_of(tile))
-
-
 def numbers_of(tile: Tiles) -> pixel.TileNumbers:
     """Return the centre of a tile, and its frame if pixels have rays of their own."""
     if tile.pixels is None:
@@ -251,7 +246,8 @@ def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.S
 def _hits(settings: CompositingSettings, rule: AppearanceRule, splats: Splats, tile: Tiles) -> pixel.Hit:
     """Return the hits of a tile's pixels with the splats of a block, [B, P] each."""
     x, y = pixels_of(tile, settings.grid.tile_size, splats.M.dtype)
-    planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), seen_from(splats, tile))
+    planes = pixel.planes_of(split(splats, False).M, numbers_of(tile))
+    planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
     return pixel.intersect(planes, x, y, settings.near_plane, rule.has_low_pass)
 
 
