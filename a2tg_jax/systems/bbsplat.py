@@ -8,7 +8,8 @@ from a2tg_jax.appearance import Billboards
 from a2tg_jax.mcmc import FillingMcmc, Mcmc
 from a2tg_jax.systems.stage1 import ANY_RATE, FLOATS_PER_TEXEL, MCMC_OPTIONS, QUICK, SMOKE, continued, growing_stage
 from a2tg_jax.training.options import LossConfig, Ranges, System
-from a2tg_jax.training.stage import LearningRates, Stage
+from a2tg_jax.training.rates import LearningRates
+from a2tg_jax.training.stage import Stage
 
 AUTHORS_OPACITY_WEIGHT = 0.01
 AUTHORS_RATES = LearningRates(sh_degree0=5e-3, sh_rest=2.5e-4)

@@ -12,7 +12,8 @@ from a2tg_jax.events import Event, Times, from_options, iterations_at
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.training.options import Ranges, System
-from a2tg_jax.training.stage import LearningRates, Stage
+from a2tg_jax.training.rates import LearningRates
+from a2tg_jax.training.stage import Stage
 
 QUICK_CAP = 10_000
 QUICK_OPACITY = 0.5
@@ -151,7 +152,7 @@ def growing_stage(
         appearance=appearance,
         events=(*events, *system.floaters.events(iterations, events)),
         losses=system.loss.terms(),
-        rates=system.rates,
+        rates=dataclasses.replace(system.rates, cooldown=0.0),
         iterations=iterations,
         params_rate=params_rate,
         corrections=system.corrections_of(0),
@@ -183,5 +184,5 @@ def later_stage(
 def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:
     """Return a first stage, and a second one without events if it has iterations."""
     if not iterations:
-        return (first,)
+        return (dataclasses.replace(first, rates=system.rates),)
     return first, later_stage(system, "continued", first.appearance, (), iterations, first.params_rate)

@@ -20,7 +20,8 @@ from a2tg_jax.systems.stage1 import (
     growing_stage,
 )
 from a2tg_jax.training.options import Ranges, System
-from a2tg_jax.training.stage import LearningRates, Stage
+from a2tg_jax.training.rates import LearningRates
+from a2tg_jax.training.stage import Stage
 
 AUTHORS_LOG_SCALES = 3e-3
 

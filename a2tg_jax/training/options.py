@@ -17,8 +17,9 @@ from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.bilateral import BilateralGrid
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
 from a2tg_jax.training.depth_prior import DepthKind, DepthPrior
+from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.robust import RobustPhotometric
-from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
+from a2tg_jax.training.stage import LossTerm, Stage
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
 
 Ranges = dict[str, tuple[float, float]]
@@ -405,6 +406,8 @@ RANGES = {
     "tile_size": (1, MAX_TILE_SIZE),
     "loss.ssim_weight": (0, 1),
     "loss.robust_share": (0, 1),
+    "rates.means_by_size": (0, 1),
+    "rates.cooldown": (0, 1),
 }
 """Smallest and largest value of options that every system has, both included."""
 

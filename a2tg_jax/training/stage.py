@@ -10,13 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.training.corrections import Correction
+from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.terms import Target
 
 Background = Literal["black", "white", "random"]
@@ -33,33 +32,6 @@ class LossTerm(Protocol):
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         """Its value, the weight included."""
         ...
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class LearningRates:
-    """Adam's learning rates of the Gaussians."""
-
-    means: float = 1.6e-4
-    """Learning rate of the means, times scene_scale; decays exponentially over each stage."""
-    means_final_factor: float = 0.01
-    """Factor of the means' learning rate at the end of a stage."""
-    log_scales: float = 5e-3
-    """Learning rate of the logarithms of the scales."""
-    quats: float = 1e-3
-    """Learning rate of the rotations."""
-    logit_opacities: float = 5e-2
-    """Learning rate of the logits of the opacities."""
-    sh_degree0: float = 2.5e-3
-    """Learning rate of the colours, the spherical harmonics of degree 0."""
-    sh_rest: float = 1.25e-4
-    """Learning rate of the other spherical harmonics."""
-
-    def of_gaussians(self, means: Any, sh_degree: int = 3) -> Gaussians:
-        """Return one rate per field of the Gaussians, given the present rate of the means and the SH degree."""
-        sh = jnp.full((1, NUM_BASES[sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
-        fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
-        return Gaussians(*fields)
 
 
 @jax.tree_util.register_dataclass

@@ -173,7 +173,7 @@ def attempt(
     progress = clock.progress(state.iteration)
     decay = jnp.exp(clock.log_decay * progress)
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
-    step = _optimized(stage, state, grads, rate)
+    step = optimized(stage, state, grads, rate, progress)
     gaussians, params = step.params
     moments: AdamState = step.state
     model = dataclasses.replace(state.model, gaussians=gaussians, params=stage.appearance.project(params))
@@ -289,13 +289,19 @@ def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: Batch
     return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height), colors)
 
 
-def _optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array) -> OptStep:
-    """Return (gaussians, params) and moments after Adam."""
+def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> OptStep:
+    """Return (gaussians, params) and moments after Adam.
+
+    Args:
+      stage: its rates.
+      state: before the step.
+      grads: of (gaussians, params).
+      rate_of_means: present rate of the means.
+      progress: share of the stage that is done.
+    """
     model = state.model
-    rates = (
-        stage.rates.of_gaussians(rate_of_means, model.gaussians.sh_degree),
-        stage.appearance.rates(stage.params_rate, model.params),
-    )
+    of_params = stage.appearance.rates(stage.params_rate, model.params)
+    rates = stage.rates.cooled((stage.rates.of_gaussians(rate_of_means, model), of_params), progress)
     return adam_update((model.gaussians, model.params), grads, state.moments, rates)
 
 

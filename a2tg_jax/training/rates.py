@@ -1,0 +1,80 @@
+"""Adam's learning rates of the Gaussians, and how they differ between Gaussians and change during a stage."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.events import static
+from a2tg_jax.model import Model
+
+COOLED = 0.1
+"""Factor of all learning rates at the end of a cooldown."""
+LARGEST_RATIO = 5.0
+"""Largest ratio between the size of a Gaussian and the mean of all that its learning rate follows."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rates of the Gaussians."""
+
+    means: float = 1.6e-4
+    """Learning rate of the means, times scene_scale; decays exponentially over each stage."""
+    means_final_factor: float = 0.01
+    """Factor of the means' learning rate at the end of a stage."""
+    log_scales: float = 5e-3
+    """Learning rate of the logarithms of the scales."""
+    quats: float = 1e-3
+    """Learning rate of the rotations."""
+    logit_opacities: float = 5e-2
+    """Learning rate of the logits of the opacities."""
+    sh_degree0: float = 2.5e-3
+    """Learning rate of the colours, the spherical harmonics of degree 0."""
+    sh_rest: float = 1.25e-4
+    """Learning rate of the other spherical harmonics."""
+    means_by_size: float = static(default=0.0, is_addition=True)
+    """Power p of size in the means' learning rate, which is multiplied by (size / mean size)^p; 0: the same for all.
+    Sizes are geometric means, and their ratio stays between 1/5 and 5."""
+    cooldown: float = static(default=0.0, is_addition=True)
+    """Share of the last stage, at its end, in which all learning rates fall linearly to a tenth; 0: they do not."""
+
+    def of_gaussians(self, rate_of_means: Array, model: Model) -> Gaussians:
+        """Return one rate per field of the model's Gaussians, which broadcasts against it.
+
+        Args:
+          rate_of_means: present rate of the means, for Gaussians of mean size.
+          model: N Gaussians.
+        """
+        gaussians = model.gaussians
+        means = rate_of_means
+        if self.means_by_size:
+            means = rate_of_means * relative_sizes(gaussians, model.live_count)[:, None] ** self.means_by_size
+        sh = jnp.full((1, NUM_BASES[gaussians.sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
+        fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
+        return Gaussians(*fields)
+
+    def cooled(self, rates: Any, progress: Array) -> Any:
+        """Return learning rates, a pytree, at a share of the stage: lower ones during the cooldown."""
+        if not self.cooldown:
+            return rates
+        done = jnp.clip((progress - (1 - self.cooldown)) / self.cooldown, 0.0, 1.0)
+        factor = 1 - (1 - COOLED) * done
+        return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate)), rates)
+
+
+def relative_sizes(gaussians: Gaussians, num_live: Array | int) -> Array:
+    """Return [N] sizes relative to the geometric mean of the live Gaussians, between 1/5 and 5.
+
+    Args:
+      gaussians: N rows.
+      num_live: rows in use; may be traced.
+    """
+    log_sizes = jnp.mean(gaussians.log_scales, axis=1)
+    is_live = jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
+    mean = jnp.sum(jnp.where(is_live, log_sizes, 0.0)) / jnp.maximum(num_live, 1).astype(log_sizes.dtype)
+    return jnp.clip(jnp.exp(log_sizes - mean), 1 / LARGEST_RATIO, LARGEST_RATIO)
