@@ -125,7 +125,7 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
     photograph = read_pixels(file)
     check_aspect(file, photograph, *lens.size)
     try:
-        pixels, K = lens.undistort(photograph, still_to_downscale)
+        pixels, K = lens.view_pixels(photograph, still_to_downscale)
         rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
         if isinstance(lens, KeptLens):

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, in_bytes, png
@@ -171,25 +172,24 @@ def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
 
 def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
     """Return height, width and lens of each view. Lens 0 is a pinhole; others are numbered in order of appearance."""
-    lenses: dict[int, int] = {}
+    numbers = {key: number for number, key in enumerate(_lenses(views), 1)}
+    return [(*view.picture.size, numbers.get(id(view.camera.rays), 0)) for view in views]
 
-    def lens_of(view: View) -> int:
-        rays = view.camera.rays
-        return 0 if rays is None else lenses.setdefault(id(rays), len(lenses) + 1)
 
-    return [(*view.picture.size, lens_of(view)) for view in views]
+def _lenses(views: Sequence[View]) -> dict[int, Array]:
+    """Return the rays of each lens by their identity, in order of appearance; its views share the array."""
+    return {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
 
 
 def ray_bytes(views: Sequence[View]) -> int:
     """Return the bytes of the rays of the views' lenses; those of one lens count once."""
-    arrays = {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
-    return sum(int(rays.nbytes) for rays in arrays.values())
+    return sum(int(rays.nbytes) for rays in _lenses(views).values())
 
 
 def warn_of_lenses(scene: Scene) -> None:
     """Warn if most photographs have a lens of their own: the rays of each then take more memory than its pixels."""
     views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
-    num = len({id(view.camera.rays) for view in views})
+    num = len(_lenses(views))
     if num > MANY_LENSES and 2 * num > len(views):
         warnings.warn(
             f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
