@@ -103,6 +103,19 @@ def test_rows_and_bytes_are_those_that_training_reaches():
     assert (first.num_programs, second.num_programs) == (1, 3)
 
 
+def test_splats_of_a_file_are_forecast_in_place_of_the_first_stage():
+    scene, system = scene_of(24, 16), a2tg.A2tg.preset("smoke")
+    first, second = forecast_stages(scene, system, 10**6)
+    assert (first.num_rows, first.num_programs, first.seconds, second.num_rows) == (10**6, 0, 0, 10**6)
+    plan = plan_run({"a": system, "b": a2tg.Gaussians2d.preset("smoke")})
+    own, given = (forecast_run(scene, plan, num) for num in (None, 10**6))
+    assert own.phases.keys() - given.phases.keys() == {"a-gaussians"}
+    assert given.phases["b-gaussians"].model == own.phases["b-gaussians"].model
+    assert given.disk_bytes > own.disk_bytes + 10**6 * 232
+    with pytest.raises(ValueError, match="a-textures: program"):
+        tell_forecast(scene, plan, 10**9, num_given=10**6)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_budget_is_the_size_of_what_is_left(name):
     preset = type(a2tg.find_system(name)).preset("smoke")

@@ -31,11 +31,13 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by
 from a2tg_jax.io.gaussforge_files import SUFFIXES
-from a2tg_jax.results import run_training
-from a2tg_jax.results.folder import create_run
+from a2tg_jax.results import first_stage, preflight, run_training
+from a2tg_jax.results.first_stage import GivenSplats
+from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.preflight import check_init
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.viewing import open_source
+from a2tg_jax.results.whole_run import begin_run
 
 OTHERS = [".ply", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"
@@ -255,12 +257,33 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
     assert main(command) == 2 and "there is no file" in capsys.readouterr().err
 
 
+def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, monkeypatch):
+    scene, read, told = synthetic_scene(width=32, height=24, num_views=4, num_points=50), [], []
+    load = first_stage.load_splats
+
+    def trained(*_, **options):
+        raise RuntimeError("the second stage")
+
+    monkeypatch.setattr(first_stage, "load_splats", lambda file: read.append(file) or load(file))
+    monkeypatch.setattr(SceneSource, "load", lambda self, room: scene)
+    monkeypatch.setattr(preflight, "tell_forecast", lambda *args: told.append(args))
+    monkeypatch.setattr(run_training, "fit_stage", trained)
+    save_ply(tmp_path / "a.ply", some_gaussians(40))
+    system = A2tg(stage1_iterations=5, stage2_iterations=4)
+    record = RunRecord(SceneSource("synthetic"), "a2tg", system, init=str(tmp_path / "a.ply"))
+    with pytest.raises(RuntimeError, match="the second stage"):
+        begin_run(record, tmp_path / "run", overwrite=False, progress=False)
+    assert read == [tmp_path / "a.ply"]
+    assert told[0][-1] == first_stage.number_given(RunFolder(tmp_path / "run"), record) == 40
+    assert len(read) == 1, "a resumed run counts the model of its first stage"
+
+
 def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     save_model(tmp_path / "a.npz", textured())
     with pytest.warns(UserWarning, match="leaves out what its splats show beside Gaussians"):
-        check_init(tmp_path / "a.npz", tmp_path / "run", A2tg(sh_degree=3))
+        check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg(sh_degree=3))
     save_ply(tmp_path / "a.ply", init_from_points(np.eye(3), np.eye(3), sh_degree=2))
     with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):
-        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=1))
+        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=1))
     with pytest.raises(ValueError, match="3 Gaussians, 444 bytes at degree 2, which is more than the memory_budget"):
-        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0004))
+        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0004))

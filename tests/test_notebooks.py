@@ -23,6 +23,9 @@ SMALL = {
     "refining_poses": {"width": 40, "height": 30, "num_views": 5, "iterations": 20, "pose_iterations": 3,
         "all_degrees": (6,)},
     "gradients_and_differences": {"width": 12, "height": 9, "num_gaussians": 5},
+    "a_sweep_and_its_table": {
+        "width": 24, "height": 18, "num_views": 12, "iterations": 8, "budgets": (20,), "methods": ("MCMC, degree 0",),
+    },
 }  # fmt: skip
 """Values for the cell that is tagged "parameters"."""
 MOST_BYTES = 300_000
@@ -94,6 +97,19 @@ def test_gradients_agree_with_differences(monkeypatch):
     assert len(names["found"]) == 9
     assert max(map(names["error"], names["found"].values())) < 1e-6
     assert min(names["curves"]["float64"]) < 1e-3 * min(names["curves"]["float32"])
+
+
+def test_a_sweep_goes_on_with_the_runs_that_are_left(monkeypatch):
+    names = run("a_sweep_and_its_table", monkeypatch)
+    results = json.loads((names["folder"] / "results.json").read_text(encoding="utf-8"))
+    assert results == names["results"] and len(results) == 2
+    assert all(19_900 < result["bytes"] <= 20_000 for result in results.values())
+    sources = ("".join(cell["source"]) for cell in code_cells("a_sweep_and_its_table"))
+    (sweep,) = (source for source in sources if "results.json" in source)
+    lost = results.popitem()[0]
+    (names["folder"] / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    exec(sweep, names | {"run": lambda scene, system, session, file: file.stem})
+    assert json.loads((names["folder"] / "results.json").read_text(encoding="utf-8")) == results | {lost: lost}
 
 
 @pytest.mark.parametrize("name", SMALL)

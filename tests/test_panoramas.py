@@ -1,13 +1,17 @@
 """Panoramas are cut into perspective views that agree with direct renders of the built-in scene."""
 
+from pathlib import PurePosixPath
+
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
-from a2tg_jax.data import synthetic
+from a2tg_jax.data import load_scene, synthetic
+from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.panoramas import cut_view, directions, is_panorama, view_size
+from a2tg_jax.data.scene import with_validation_views
 
 CENTER = np.array([0.3, -1.2, 1.2])
 WIDTH, FACE = 640, 224
@@ -110,3 +114,39 @@ def test_views_of_panoramas_have_names_of_their_own(tmp_path, panorama):
     found = staged([tmp_path], tmp_path / "work", "yes")
     assert len(set(found.names)) == 17 and found.rigs[0].folder == "panorama~2"
     assert all((found.folder / name).is_file() for name in found.names)
+
+
+@pytest.fixture(params=["panoramas", "stereo"])
+def rig_scene(request, tmp_path):
+    """Three views at each of five places, of one point or a little apart, named 0/0.png, 0/1.png, ..."""
+    apart = 0.1 if request.param == "stereo" else 0.0
+    options = pycolmap().SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=5, num_points3D=9, camera_width=16, camera_height=12,
+        camera_model_id=pycolmap().CameraModelId.PINHOLE, camera_params=[16.0, 16.0, 8.0, 6.0],
+        sensor_from_rig_translation_stddev=apart,
+    )  # fmt: skip
+    model = pycolmap().synthesize_dataset(options)
+    for image in model.images.values():
+        image.name = f"{image.camera_id}/{image.frame_id}.png"
+        (tmp_path / "images" / image.name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (16, 12)).save(tmp_path / "images" / image.name)
+    (tmp_path / "sparse").mkdir()
+    model.write(tmp_path / "sparse")
+    return request.param, tmp_path
+
+
+def test_the_views_of_a_panorama_are_held_out_together(rig_scene):
+    kind, folder = rig_scene
+    scene = load_scene(folder, test_every=2)
+    sizes, common = [], []
+    for made in (scene, with_validation_views(scene)):
+        train, test = ([PurePosixPath(view.name).stem for view in views] for views in (made.train, made.test))
+        sizes.append((len(train), len(test)))
+        common.append(bool({*train} & {*test}))
+    assert sizes == ([(6, 9), (3, 3)] if kind == "panoramas" else [(7, 8), (6, 1)])
+    assert common == [kind == "stereo"] * 2
+    if kind == "panoramas":
+        one = load_scene(folder, test_every=4)
+        assert {view.name for view in one.test} == {f"{camera}/{place}.png" for camera in (1, 2, 3) for place in (1, 5)}
+        with pytest.raises(ValueError, match="there is 1 panorama, cut into 3 views"):
+            with_validation_views(with_validation_views(scene))

@@ -64,12 +64,12 @@ def test_links_lead_to_the_place_in_the_site(page, link, wanted):
 def test_a_notebook_becomes_text_code_and_outputs():
     outputs = [{"text": ["1\n"]}, {"data": {"image/png": "AA=="}}, {"data": {"text/html": ["<b>2</b>"]}}]
     cells = [
-        {"cell_type": "markdown", "source": ["# Title"]},
+        {"cell_type": "markdown", "source": ["# [Title](../docs/a.md)"]},
         {"cell_type": "code", "source": ["print(1)"], "outputs": outputs},
     ]
     text = site_pages.notebook_text(json.loads(json.dumps({"cells": cells})))
     assert text.split("\n\n") == [
-        "# Title",
+        "# [Title](../a.md)",
         "```python\nprint(1)\n```",
         "```text\n1\n```",
         '<img alt="" src="data:image/png;base64,AA==">',

@@ -125,7 +125,7 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
     photograph = read_pixels(file)
     check_aspect(file, photograph, *lens.size)
     try:
-        pixels, K = lens.undistort(photograph, still_to_downscale)
+        pixels, K = lens.view_pixels(photograph, still_to_downscale)
         rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
         if isinstance(lens, KeptLens):
@@ -134,7 +134,17 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, file if pixels is photograph else None)
     depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)
-    return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth)
+    return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth, panorama_of(image))
+
+
+def panorama_of(image: Any) -> int | None:
+    """Return the number of the frame of a pycolmap.Image whose rig looks around from one point; None of others."""
+    rig = image.frame.rig
+    if rig.num_sensors() < 2:
+        return None
+    poses = rig.non_ref_sensors.values()
+    is_one_point = all(pose is not None and not np.any(pose.translation) for pose in poses)
+    return int(image.frame_id) if is_one_point else None
 
 
 def _model_suffix(folder: Path) -> str | None:

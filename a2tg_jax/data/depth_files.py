@@ -56,7 +56,7 @@ def depth_map(file: Path | None, lens: Lens, photograph: np.ndarray, pixels: np.
         height, width = values.shape
         if abs(width * stored[1] - height * stored[0]) > max(LARGEST_ERROR * width * stored[1], 2 * max(stored)):
             raise ValueError(f"{file}: is {width}x{height}, of another aspect than its photograph, {_told(stored)}")
-        return np.asarray(Image.fromarray(lens.undistort_plane(values)).resize(size, Image.Resampling.BILINEAR))
+        return np.asarray(Image.fromarray(lens.view_plane(values)).resize(size, Image.Resampling.BILINEAR))
 
     return DepthMap((size[1], size[0]), load)
 

@@ -84,8 +84,8 @@ class Lens:
         is_ordered = (np.diff(places[..., 0], axis=1) > 0).all() and (np.diff(places[..., 1], axis=0) > 0).all()
         return bool(is_inside and is_ordered)
 
-    def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pinhole image of a photograph, at the photograph's resolution divided by `downscale`.
+    def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels of a photograph's view, a pinhole's, at the photograph's resolution divided by `downscale`.
 
         Args:
           pixels: [h, w, C] uint8, of the calibrated size or that size scaled.
@@ -108,8 +108,9 @@ class Lens:
         """Return the rays of pictures of a size, as `Camera.rays` has them; None of a pinhole."""
         return None
 
-    def undistort_plane(self, plane: np.ndarray) -> np.ndarray:
-        """Return numbers [h, w] float32 of each pixel of a photograph as a pinhole would see them, at their size."""
+    def view_plane(self, plane: np.ndarray) -> np.ndarray:
+        """Return numbers [h, w] float32 of each pixel of a photograph as its view, a pinhole's, sees them, at their
+        size."""
         if self.is_pinhole:
             return plane
         K, size = self.pinhole
@@ -145,12 +146,12 @@ class Lens:
 class KeptLens(Lens):
     """A calibrated camera whose photographs are kept as they are."""
 
-    def undistort(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return a photograph divided by `downscale`, and its K [3, 3]; `rays` are places in the image plane of K."""
         new_size = downscaled_size(pixels.shape[1], pixels.shape[0], downscale)
         return resize_pixels(pixels, *new_size), scaled_intrinsics(self._matrix(), self.size, new_size)
 
-    def undistort_plane(self, plane: np.ndarray) -> np.ndarray:
+    def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] of each pixel of a photograph as they are."""
         return plane
 

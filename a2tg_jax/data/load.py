@@ -47,8 +47,8 @@ def load_scene(
     Args:
       path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
       downscale: k >= 1; images are read from `images_k` if it exists, and downscaled from the full ones otherwise.
-      test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. Has no
-        effect if the scene names its own test views.
+      test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
+        panorama count as one. Has no effect if the scene names its own test views.
       room: bytes of memory for photographs, at 3 or 4 a pixel; those beyond it stay on disk and are read when
         needed (`Shelf`), which changes no result. None takes a quarter of the process's memory.
       alpha: meaning of the alpha channel: "transparency" before a background, or a "mask", of which only opaque

@@ -73,7 +73,7 @@ def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray
         told = "x".join(map(str, size)), "x".join(map(str, photograph_size))
         raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
-    planes, _ = lens.undistort(planes, still_to_downscale)
+    planes, _ = lens.view_pixels(planes, still_to_downscale)
     return Mask.of(resize_pixels(planes, *pixels.shape[1::-1])[..., 0] == 255)
 
 

@@ -7,10 +7,11 @@ import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, in_bytes, png
@@ -53,6 +54,8 @@ class View:
     """Mask of the pixels that count in losses and metrics; None counts all. An array [H, W] bool may be given, too."""
     depth: DepthMap | None = None
     """Depth map for `loss.depth_weight`; None without one. An array [H, W] of floats may be given, too."""
+    panorama: int | None = None
+    """Number of the panorama that it was cut from; None of a photograph. Its views are held out together."""
 
     def __post_init__(self) -> None:
         """Convert arrays to pictures, masks and depth maps."""
@@ -137,6 +140,8 @@ class Shot:
     """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None of a pinhole."""
     depth: DepthMap | None = None
     """Depth map; None without one."""
+    panorama: int | None = None
+    """Number of the panorama that it was cut from; None of a photograph."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -147,6 +152,10 @@ class PointCloud:
     """[P, 3]."""
     colors: np.ndarray
     """[P, 3] uint8."""
+
+
+Held = TypeVar("Held", Shot, View)
+"""What is held out."""
 
 
 def check_are_views(views: Sequence[View], call: str) -> None:
@@ -171,25 +180,24 @@ def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
 
 def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
     """Return height, width and lens of each view. Lens 0 is a pinhole; others are numbered in order of appearance."""
-    lenses: dict[int, int] = {}
+    numbers = {key: number for number, key in enumerate(_lenses(views), 1)}
+    return [(*view.picture.size, numbers.get(id(view.camera.rays), 0)) for view in views]
 
-    def lens_of(view: View) -> int:
-        rays = view.camera.rays
-        return 0 if rays is None else lenses.setdefault(id(rays), len(lenses) + 1)
 
-    return [(*view.picture.size, lens_of(view)) for view in views]
+def _lenses(views: Sequence[View]) -> dict[int, Array]:
+    """Return the rays of each lens by their identity, in order of appearance; its views share the array."""
+    return {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
 
 
 def ray_bytes(views: Sequence[View]) -> int:
     """Return the bytes of the rays of the views' lenses; those of one lens count once."""
-    arrays = {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
-    return sum(int(rays.nbytes) for rays in arrays.values())
+    return sum(int(rays.nbytes) for rays in _lenses(views).values())
 
 
 def warn_of_lenses(scene: Scene) -> None:
     """Warn if most photographs have a lens of their own: the rays of each then take more memory than its pixels."""
     views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
-    num = len({id(view.camera.rays) for view in views})
+    num = len(_lenses(views))
     if num > MANY_LENSES and 2 * num > len(views):
         warnings.warn(
             f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
@@ -292,14 +300,16 @@ def with_validation_views(scene: Scene) -> Scene:
     """Return the scene for choosing options: every eighth training view is held out in place of the test views.
 
     Cameras, points and world stay those of the whole scene. Test views are left out, so that no choice can see them.
+    The views of a panorama are held out together and count as one.
 
     Raises:
-      ValueError: if there is one training view only.
+      ValueError: if there is one training view, or one panorama, only.
     """
-    if len(scene.train) < 2:
-        raise ValueError(f"{scene.name}: validation views are taken from at least 2 training views; there is 1")
-    train = [view for index, view in enumerate(scene.train) if index % VALIDATION_EVERY]
-    return dataclasses.replace(scene, train=tuple(train), test=scene.train[::VALIDATION_EVERY])
+    train, held_out = split(scene.train, VALIDATION_EVERY)
+    if not train:
+        only = "1" if len(scene.train) == 1 else f"1 panorama, cut into {len(scene.train)} views"
+        raise ValueError(f"{scene.name}: validation views are taken from at least 2 training views; there is {only}")
+    return dataclasses.replace(scene, train=tuple(train), test=tuple(held_out))
 
 
 def check_test_every(test_every: int) -> None:
@@ -309,11 +319,23 @@ def check_test_every(test_every: int) -> None:
 
 
 def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
-    """Return (train, test): test shots are 0, k, 2k, … in order of names; none for k = 0."""
-    ordered = sorted(shots, key=lambda shot: shot.name)
-    is_test = [test_every > 0 and index % test_every == 0 for index in range(len(ordered))]
-    train = [shot for shot, test in zip(ordered, is_test, strict=True) if not test]
-    return train, [shot for shot, test in zip(ordered, is_test, strict=True) if test]
+    """Return (train, test): test shots are 0, k, 2k, … in order of names; none for k = 0. Shots of a panorama count as
+    one."""
+    return split(sorted(shots, key=lambda shot: shot.name), test_every)
+
+
+def split(views: Sequence[Held], every: int) -> tuple[list[Held], list[Held]]:
+    """Return the views that are kept, and those that are held out: 0, k, 2k, …; none for k = 0.
+
+    The views of a panorama count as one. Alone, a held-out view would have training views from the same point.
+    """
+    numbers: dict[int | str, int] = {}
+    kept: list[Held] = []
+    held_out: list[Held] = []
+    for view in views:
+        number = numbers.setdefault(view.name if view.panorama is None else view.panorama, len(numbers))
+        (held_out if every and number % every == 0 else kept).append(view)
+    return kept, held_out
 
 
 def random_points(center: np.ndarray, half_side: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -394,4 +416,4 @@ def _view(shot: Shot, viewmat: np.ndarray) -> View:
         has_ray = np.isfinite(shot.rays).all(axis=2)
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     mask = None if mask is None or mask.is_full else mask
-    return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth)
+    return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth, shot.panorama)

@@ -165,7 +165,7 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: 
     lens = _lens(frame, photograph, f"{file}: {name}", use)
     check_aspect(image_file, photograph, *lens.size)
     try:
-        pixels, K = lens.undistort(photograph, still_to_downscale)
+        pixels, K = lens.view_pixels(photograph, still_to_downscale)
         rays = lens.rays(*pixels.shape[1::-1])
     except ValueError as error:
         raise ValueError(f"{file}: {name}: its camera model {error}") from None

@@ -14,25 +14,29 @@ CHUNK = 1 << 20
 
 
 class SurfaceDistance(NamedTuple):
-    """Distances of a surface from its reference, in units of their world."""
+    """Distances between a surface and its reference.
+
+    Accuracy, completeness and Chamfer distance are lengths, named as DTU's evaluation names them: lower is better.
+    Precision, recall and F-score are shares from 0 to 1: higher is better.
+    """
 
     accuracy: float
-    """Mean distance of the surface's points from the reference."""
+    """Mean distance of the surface's points from the reference, in scene units; lower is better."""
     completeness: float
-    """Mean distance of the reference's points from the surface."""
+    """Mean distance of the reference's points from the surface, in scene units; lower is better."""
     precision: float
-    """Share of the surface's points that lie within the threshold of the reference."""
+    """Share of the surface's points that lie within the threshold of the reference; higher is better."""
     recall: float
-    """Share of the reference's points that lie within the threshold of the surface."""
+    """Share of the reference's points that lie within the threshold of the surface; higher is better."""
 
     @property
     def chamfer(self) -> float:
-        """Mean of accuracy and completeness, as DTU's evaluation of splats reports it."""
+        """Mean of accuracy and completeness, as DTU's evaluation of splats reports it; lower is better."""
         return (self.accuracy + self.completeness) / 2
 
     @property
     def f_score(self) -> float:
-        """Harmonic mean of precision and recall; 0 if both are 0."""
+        """Harmonic mean of precision and recall, 0 if both are 0; higher is better."""
         total = self.precision + self.recall
         return 2 * self.precision * self.recall / total if total else 0.0
 

@@ -12,30 +12,67 @@ from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.formats import load_splats
-from a2tg_jax.io.model_file import save_model
+from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import plain_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import History
 from a2tg_jax.training.fitting import BACKGROUNDS
 
 
-def write_first_stage(run: RunFolder, planned: PlannedStage, file: Path, scene: Scene) -> None:
+class GivenSplats:
+    """Splats of a file in place of a first stage. The file is read once: for checks, the forecast and that stage."""
+
+    def __init__(self, file: Path):
+        """Args:
+        file: of any format that `load_splats` reads; plain splats in the original world of the photographs, or a model.
+        """
+        self.file = file
+        self._splats: Model | None = None
+
+    @property
+    def splats(self) -> Model:
+        """What the file holds."""
+        if self._splats is None:
+            self._splats = load_splats(self.file)
+        return self._splats
+
+    def taken(self) -> Model:
+        """Return the splats, and release them."""
+        splats, self._splats = self.splats, None
+        return splats
+
+
+def given_splats(record: RunRecord) -> GivenSplats | None:
+    """Return the splats in place of a run's first stage; None if it is trained."""
+    return None if record.init is None else GivenSplats(Path(record.init))
+
+
+def number_given(run: RunFolder, record: RunRecord) -> int | None:
+    """Return the number of Gaussians in place of the first stage of a run that was begun; None if it is trained."""
+    given, first = given_splats(record), run.model(record.plan.main[0])
+    if given is None:
+        return None
+    return load_model(first).num if first.is_file() else given.splats.num
+
+
+def write_first_stage(run: RunFolder, planned: PlannedStage, given: GivenSplats, scene: Scene) -> None:
     """Write the splats of a file as the model of a first stage, in the scene's normalised world, without a history.
 
     Args:
       run: the run folder.
       planned: the first stage of the main system.
-      file: of any format that `load_splats` reads; plain splats in the original world of the photographs, or a model.
+      given: the splats, which are released.
       scene: the scene of the run.
     """
-    gaussians = transform_gaussians(plain_gaussians(load_splats(file)), scene.transform)
+    gaussians = transform_gaussians(plain_gaussians(given.taken()), scene.transform)
     gaussians = _of_degree(gaussians, planned.system.initial_sh_degree)
     origin = origin_of_scene(scene, BACKGROUNDS[planned.system.background])
     model = Model(gaussians, appearance=planned.stage.appearance, origin=origin)
-    save_model(run.own(run.model(planned.name)), model, {"init": str(file)})
+    save_model(run.own(run.model(planned.name)), model, {"init": str(given.file)})
     write_history(run.own(run.history(planned.name)), History.empty())
 
 

@@ -136,12 +136,20 @@ class RunForecast:
         return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
 
 
-def forecast_run(scene: Scene, plan: RunPlan) -> RunForecast:
-    """Return a forecast of what the run will take (host; nothing is compiled)."""
+def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None) -> RunForecast:
+    """Return a forecast of what the run will take (host; nothing is compiled).
+
+    Args:
+      scene: the run's scene.
+      plan: its stages.
+      num_given: Gaussians of the file in place of the main system's first stage; None without one.
+    """
     is_host = jax.default_backend() == "cpu"
-    stages = _stages(scene, plan)
+    stages = _stages(scene, plan, num_given)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
+        if not stage.num_programs:
+            continue
         resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
         compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)  # before there are any of these
         phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
@@ -169,35 +177,37 @@ def quick_flags(downscale: int) -> list[str]:
     return ["--preset", QUICK, *(["--downscale", str(downscale)] if downscale > 1 else [])]
 
 
-def quicker_text(scene: Scene, record: RunRecord) -> str:
+def quicker_text(scene: Scene, record: RunRecord, num_given: int | None = None) -> str:
     """Return the flags with which a long run on CPUs gets quicker, with their forecast; empty for other runs.
 
     Args:
       scene: the scene of the record, downscaled as it says.
       record: the run.
+      num_given: as in `forecast_run`.
     """
-    seconds = forecast_run(scene, record.plan).seconds
+    seconds = forecast_run(scene, record.plan, num_given).seconds
     presets = type(record.system).presets()
     if seconds * ROUGHLY <= LONG or QUICK not in presets:
         return ""
     downscale = quick_downscale(max(max(view.camera.width, view.camera.height) for view in scene.train))
     system = dataclasses.replace(presets[QUICK], memory_budget=record.system.memory_budget)
     quick = dataclasses.replace(record, system=system, preset=QUICK)
-    quick_seconds = _training_seconds(scene, quick.plan, downscale)
+    quick_seconds = _training_seconds(scene, quick.plan, downscale, num_given)
     if quick_seconds > seconds / 2:
         return ""
     flags = " ".join(quick_flags(downscale * record.scene.downscale))
     return f"quicker: {flags} takes very roughly {_between(quick_seconds)}"
 
 
-def _training_seconds(scene: Scene, plan: RunPlan, downscale: int) -> float:
+def _training_seconds(scene: Scene, plan: RunPlan, downscale: int, num_given: int | None) -> float:
     """Return the training time on CPUs if the photographs are downscaled further."""
-    forecasts = _stages(scene, plan)
+    forecasts = _stages(scene, plan, num_given)
     return sum(
         planned.stage.iterations
         * planned.system.batch_size
         * iteration_seconds(scene.train, forecasts[planned.name].num_rows, downscale)
         for planned in plan.stages
+        if forecasts[planned.name].num_programs
     )
 
 
@@ -225,25 +235,28 @@ def room_for_photographs(max_memory: int | None) -> int | None:
     return None if max_memory is None else int(SHARE_OF_MEMORY * max_memory)
 
 
-def tell_forecast(scene: Scene, plan: RunPlan, max_memory: int | None, num_devices: int = 1) -> None:
-    """Print the forecast of a run, on so many devices together.
+def tell_forecast(
+    scene: Scene, plan: RunPlan, max_memory: int | None, num_devices: int = 1, num_given: int | None = None
+) -> None:
+    """Print the forecast of a run, on so many devices together. `num_given` is as in `forecast_run`.
 
     Raises:
       ValueError: if that cannot fit, naming the options to change.
     """
-    found, limit = forecast_run(scene, plan), allowed_memory(max_memory, num_devices)
+    found, limit = forecast_run(scene, plan, num_given), allowed_memory(max_memory, num_devices)
     found.check(limit)
     if num_devices > 1:
         found.check_one_device(allowed_memory(max_memory))
     print(found.told(limit), flush=True)
 
 
-def _stages(scene: Scene, plan: RunPlan) -> dict[str, StageForecast]:
-    """Return the forecast of every stage that is trained, by name."""
+def _stages(scene: Scene, plan: RunPlan, num_given: int | None) -> dict[str, StageForecast]:
+    """Return the forecast of every stage, by name."""
     systems: dict[int, tuple[System, list[StageForecast]]] = {}
     for planned in plan.stages:
         if id(planned.system) not in systems:
-            systems[id(planned.system)] = planned.system, list(forecast_stages(scene, planned.system))
+            num = num_given if plan.begins_like_main(planned.name) else None
+            systems[id(planned.system)] = planned.system, list(forecast_stages(scene, planned.system, num))
     return {planned.name: systems[id(planned.system)][1][planned.index] for planned in plan.stages}
 
 
@@ -252,7 +265,7 @@ def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) ->
     views = scene.test or scene.train
     pixels = sum(view.camera.width * view.camera.height for view in views)
     num_pictures = 3 + max(1, len(plan.chains) - 1)
-    kept = sum((KEPT_STATES * STATES + 1) * stage.model_bytes for stage in stages)
+    kept = sum((KEPT_STATES * STATES * (stage.num_programs > 0) + 1) * stage.model_bytes for stage in stages)
     return kept + PICTURE_PER_PIXEL * num_pictures * pixels
 
 

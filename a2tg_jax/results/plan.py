@@ -69,6 +69,11 @@ class RunPlan:
                 return planned
         raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
 
+    def begins_like_main(self, name: str) -> bool:
+        """Return whether a stage is the first one of the main system, or follows it."""
+        start = self[name].start
+        return name == self.main[0] if start is None else self.begins_like_main(start)
+
     def first_iteration(self, name: str) -> int:
         """Return the number of iterations before a stage, in the stages that it follows."""
         start = self[name].start

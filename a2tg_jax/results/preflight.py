@@ -10,8 +10,9 @@ from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.formats import format_of, load_splats
+from a2tg_jax.io.formats import format_of
 from a2tg_jax.measure.metrics import load_lpips
+from a2tg_jax.results.first_stage import GivenSplats
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, RunFolder, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
 from a2tg_jax.results.output import check_output
@@ -19,7 +20,7 @@ from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training import System
 from a2tg_jax.training.batches import check_lenses
-from a2tg_jax.training.start import check_start, initial_number
+from a2tg_jax.training.start import check_start, initial_number, num_rows
 
 STATE_SIZE = 3
 """Arrays per parameter in a checkpoint: its value and two moments."""
@@ -29,12 +30,20 @@ def check_new_run(
     record: RunRecord,
     out: Path,
     *,
+    given: GivenSplats | None,
     overwrite: bool,
     lpips_weights: Path | None,
     max_memory: int | None = None,
     num_devices: int = 1,
 ) -> Scene:
     """Return the scene of a run that can be trained in a folder. What the run will need is printed.
+
+    Args:
+      record: what is trained.
+      out: the folder.
+      given: splats in place of its first stage; None: it is trained.
+      overwrite, lpips_weights, max_memory: as in `begin_run`.
+      num_devices: devices that train together.
 
     Raises:
       ValueError, OSError: naming what is wrong: an option, the weights, the folder, the scene, the disk, the memory.
@@ -44,31 +53,33 @@ def check_new_run(
     if record.scene.path != SYNTHETIC:
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=overwrite)
-    if record.init is not None:
-        check_init(Path(record.init), out, record.system)
+    if given is not None:
+        check_init(given, out, record.system)
+    num_given = None if given is None else given.splats.num
     check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory))
     check_lenses(scene.train, num_devices)
     for system in record.systems.values():
         check_start(scene, system)
-    check_room(record, scene, out)
+    check_room(record, scene, out, num_given)
     warn_of_small_budget(record.system)
-    tell_forecast(scene, record.plan, max_memory, num_devices)
-    quicker = quicker_text(scene, record)
+    tell_forecast(scene, record.plan, max_memory, num_devices, num_given)
+    quicker = quicker_text(scene, record, num_given)
     if quicker:
         print(quicker, flush=True)
     return scene
 
 
-def check_init(file: Path, out: Path, system: System) -> None:
+def check_init(given: GivenSplats, out: Path, system: System) -> None:
     """Raise ValueError unless a file of splats can take the place of the first stage of a run in a folder. What the
     stage cannot take of it is warned of."""
+    file = given.file
     if not is_regular(file):
         raise ValueError(f"init: there is no file {file}")
     format_of(file)
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
-    splats, degree = load_splats(file), system.initial_sh_degree
+    splats, degree = given.splats, system.initial_sh_degree
     needed, budget = splats.num * bytes_per_gaussian(degree), system.budget_bytes
     if budget is not None and needed > budget:
         raise ValueError(
@@ -100,12 +111,14 @@ def check_apart(out: Path, source: Path) -> None:
         raise ValueError(f"{out} and {source} overlap: choose an output folder outside it")
 
 
-def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
+def check_room(record: RunRecord, scene: Scene, out: Path, num_given: int | None = None) -> None:
     """Raise ValueError unless the disk has room for what will surely be written.
 
     Models and checkpoints of the Gaussians that there will be, without what they show besides.
     """
-    stages = [(planned, gaussian_bytes(planned, scene)) for planned in record.plan.stages]
+    plan = record.plan
+    nums = {name: num_given if plan.begins_like_main(name) else None for name in plan.names}
+    stages = [(planned, gaussian_bytes(planned, scene, nums[planned.name])) for planned in plan.stages]
     largest = max(num_bytes for _, num_bytes in stages)
     needed = sum(num_bytes for _, num_bytes in stages) + STATE_SIZE * (KEPT_CHECKPOINTS + 1) * largest
     free = shutil.disk_usage(_existing(out)).free
@@ -116,11 +129,11 @@ def check_room(record: RunRecord, scene: Scene, out: Path) -> None:
         )
 
 
-def gaussian_bytes(planned: PlannedStage, scene: Scene) -> int:
-    """Return the largest number of bytes of Gaussians that a system's first stage can leave."""
+def gaussian_bytes(planned: PlannedStage, scene: Scene, num_given: int | None = None) -> int:
+    """Return the largest number of bytes of Gaussians that a system's first stage, or a file in its place, can
+    leave."""
     system, first = planned.system, planned.system.stages()[0]
-    num = initial_number(scene, system)
-    num = max([num, *(event.num_rows(num, first.iterations) for event in first.events)])
+    num = num_rows(first, initial_number(scene, system)) if num_given is None else num_given
     if system.budget_bytes is not None:
         return system.budget_bytes
     return int(num * bytes_per_gaussian(system.initial_sh_degree))

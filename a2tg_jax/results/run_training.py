@@ -9,7 +9,7 @@ from a2tg_jax.host.machine import this_machine
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.model_file import FORMAT, load_model, save_model
-from a2tg_jax.results.first_stage import write_first_stage
+from a2tg_jax.results.first_stage import GivenSplats, given_splats, write_first_stage
 from a2tg_jax.results.folder import RunFolder, iteration_of
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
@@ -44,6 +44,7 @@ def train_run(
     watch: Watch = unwatched,
     session: Session | None = None,
     tensorboard: bool = False,
+    given: GivenSplats | None = None,
 ) -> None:
     """Train every stage of the run's record that is not finished yet.
 
@@ -59,6 +60,7 @@ def train_run(
       watch: called between steps with the stage under way (`training.loop.Watch`).
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
       tensorboard: write the histories as files of TensorBoard too, at each checkpoint.
+      given: splats in place of the first stage, if their file was read already.
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other numbers
@@ -66,9 +68,10 @@ def train_run(
     """
     record = replaced_by or read_record(run)
     session = Session() if session is None else session
+    given = given or given_splats(record)
     for planned in record.plan.stages:
-        if record.init is not None and planned.name == record.plan.main[0] and not run.model(planned.name).is_file():
-            write_first_stage(run, planned, Path(record.init), scene)
+        if given is not None and planned.name == record.plan.main[0] and not run.model(planned.name).is_file():
+            write_first_stage(run, planned, given, scene)
         events = EventWriter(run, planned.name) if tensorboard else None
         training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch, session, events)
         if replaced_by is not None:

@@ -9,6 +9,7 @@ from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.host.processes import team
+from a2tg_jax.results.first_stage import GivenSplats, given_splats
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
@@ -60,9 +61,11 @@ def begin_run(
       ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
       Stopped: if the process is asked to end; its `advice` tells how to go on.
     """
+    given = given_splats(record)
     scene = check_new_run(
         record,
         out,
+        given=given,
         overwrite=overwrite,
         lpips_weights=lpips_weights,
         max_memory=max_memory,
@@ -83,6 +86,7 @@ def begin_run(
             session=session,
             progress=progress,
             tensorboard=tensorboard,
+            given=given,
         )
 
 
@@ -96,6 +100,7 @@ def go_on(
     session: Session | None = None,
     progress: bool = True,
     tensorboard: bool = False,
+    given: GivenSplats | None = None,
 ) -> RunResult:
     """Train the stages that are not finished yet, and measure. Arguments are those of `train_run` and `begin_run`,
     errors those of `begin_run`."""
@@ -112,6 +117,7 @@ def go_on(
                 watch=watch,
                 session=session,
                 tensorboard=tensorboard,
+                given=given,
             )
         if (others := team()) is not None:
             others.leave()

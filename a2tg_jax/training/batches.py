@@ -63,7 +63,8 @@ class BatchOrder:
         seed: of the order.
         number: index of the order among those of this seed.
         """
-        self._kinds, self._batch_size = kinds_of(views), batch_size
+        self.kinds, self._batch_size = kinds_of(views), batch_size
+        """Image size and lens of each view."""
         self._seeds = (seed, number) if number else (seed,)
         self._epoch, self._batches = -1, self._draw(0)
 
@@ -78,8 +79,8 @@ class BatchOrder:
         """Return one epoch: every view once. The last batch of a kind is filled from the start of its order."""
         rng = np.random.default_rng([*self._seeds, epoch])
         by_kind: dict[tuple[int, int, int], list[int]] = {}
-        for index in rng.permutation(len(self._kinds)):
-            by_kind.setdefault(self._kinds[index], []).append(int(index))
+        for index in rng.permutation(len(self.kinds)):
+            by_kind.setdefault(self.kinds[index], []).append(int(index))
         batches = []
         for _, order in sorted(by_kind.items()):
             for start in range(0, len(order), self._batch_size):
@@ -139,7 +140,6 @@ class PhotoStore:
         self._has_depths = has_depths
         plan = plan_batches(views, len(order.indices(1)), room, has_depths)
         self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
-        self._kinds = kinds_of(views)
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
         self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead)
 
@@ -154,13 +154,13 @@ class PhotoStore:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             batch = self._ahead.first({key: self._order.indices(key) for key in following})
             return on_devices(batch, self._exchange), np.arange(len(indices), dtype=np.int32)
-        stack, places = self._stack(self._kinds[indices[0]])
+        stack, places = self._stack(self._order.kinds[indices[0]])
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
     def _stack(self, kind: tuple[int, int, int]) -> tuple[Photographs, dict[int, int]]:
         """Return all photographs of a kind on the device, and the place of each view's."""
         if kind not in self._stacks:
-            found = [index for index, own in enumerate(self._kinds) if own == kind]
+            found = [index for index, own in enumerate(self._order.kinds) if own == kind]
             stack = on_devices(self._stacked(found, self._views), self._exchange)
             if self._exchange is None:
                 stack = jax.device_put(stack)

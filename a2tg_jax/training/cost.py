@@ -85,17 +85,27 @@ class StageForecast:
     num_rows: int
     """Gaussians that it can reach."""
     num_programs: int
-    """Programs compiled while it runs."""
+    """Programs compiled while it runs; 0 if it is not trained."""
     seconds: float
     """All its iterations, on CPUs, roughly."""
     gathered_bytes: float
     """Bytes on one device while an event on the host changes the state; 0 without such events."""
 
 
-def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
-    """Yield the forecast of each stage of a system (host; nothing is compiled)."""
+def forecast_stages(scene: Scene, system: System, num_given: int | None = None) -> Iterator[StageForecast]:
+    """Yield the forecast of each stage of a system (host; nothing is compiled).
+
+    Args:
+      scene: its photographs and points.
+      system: with its options.
+      num_given: Gaussians of a file in place of the first stage, which takes nothing then; None: it is trained.
+    """
     num, floats, shown = min(initial_number(scene, system), len(scene.points)), 0.0, None
-    for stage in system.stages():
+    stages = system.stages()
+    if num_given is not None:
+        num, stages = num_given, stages[1:]
+        yield _given_stage(system, num)
+    for stage in stages:
         num = num_rows(stage, num)
         if stage.appearance != shown:
             floats, shown = floats_shown(stage, system), stage.appearance
@@ -112,6 +122,12 @@ def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
         yield StageForecast(needed, model_bytes, num, programs, seconds, gathered)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
+
+
+def _given_stage(system: System, num: int) -> StageForecast:
+    """Return the forecast of a first stage in whose place a file gives its Gaussians."""
+    model_bytes = BYTES_PER_FLOAT * floats_per_gaussian(system.initial_sh_degree) * num
+    return StageForecast(Bytes(), model_bytes, num, num_programs=0, seconds=0, gathered_bytes=0)
 
 
 def floats_shown(stage: Stage, system: System) -> float:

@@ -13,6 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"\]\((?!\w+:|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
 """Links to files: the path, relative to the page, and the heading."""
 PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
+NOTEBOOK = "notebooks/any.ipynb"
+"""Page that stands for every notebook: all lie in one folder."""
 FILES = "repository"
 """Folder of the site with the files that pages link to."""
 
@@ -74,7 +76,7 @@ def notebook_text(notebook: dict[str, Any]) -> str:
 def _cell_parts(cell: dict[str, Any]) -> list[str]:
     source = "".join(cell["source"])
     if cell["cell_type"] != "code":
-        return [source]
+        return [with_places(source, NOTEBOOK)]
     shown = (_shown(output) for output in cell["outputs"])
     return [f"```python\n{source}\n```", *(part for part in shown if part)]
 
