@@ -1,4 +1,4 @@
-"""Learning rates that follow a Gaussian's size, and fall at the end of a system's last stage."""
+"""Learning rates that follow the size of large Gaussians, and fall at the end of a system's last stage."""
 
 import dataclasses
 
@@ -26,14 +26,14 @@ def gaussians_of(sizes):
 
 def test_sizes_are_relative_to_the_mean_of_live_rows():
     sizes = relative_sizes(gaussians_of([0.5, 2.0, 1.0, 1e-9]), 3)
-    np.testing.assert_allclose(sizes[:3], [0.5, 2.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(relative_sizes(gaussians_of([1e-4, 1e4, 1.0]), 3), [0.2, 5.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(sizes[:3], [1.0, 2.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(relative_sizes(gaussians_of([1e-4, 1e4, 1.0]), 3), [1.0, 5.0, 1.0], rtol=1e-6)
 
 
 def test_rates_of_means_follow_a_power_of_the_size():
     model = Model(gaussians_of([0.5, 2.0, 1.0]))
     rates = LearningRates(means_by_size=0.5).of_gaussians(jnp.float32(1e-3), model)
-    np.testing.assert_allclose(rates.means, 1e-3 * np.sqrt([[0.5], [2.0], [1.0]]), rtol=1e-6)
+    np.testing.assert_allclose(rates.means, 1e-3 * np.sqrt([[1.0], [2.0], [1.0]]), rtol=1e-6)
     assert LearningRates().of_gaussians(jnp.float32(1e-3), model).means.shape == ()
 
 
@@ -71,5 +71,5 @@ def test_a_step_moves_each_gaussian_at_its_own_rate():
     for progress, factor in ((0.0, 1.0), (1.0, 0.1)):
         (moved, _), _ = optimized(stage, state, grads, jnp.float32(1e-3), jnp.float32(progress))
         means, logits = (getattr(moved, name) - getattr(model.gaussians, name) for name in ("means", "logit_opacities"))
-        np.testing.assert_allclose(means, np.full((3, 3), -1e-3 * factor) * [[0.5], [2.0], [1.0]], rtol=1e-3)
+        np.testing.assert_allclose(means, np.full((3, 3), -1e-3 * factor) * [[1.0], [2.0], [1.0]], rtol=1e-3)
         np.testing.assert_allclose(logits, -5e-2 * factor, rtol=1e-4)

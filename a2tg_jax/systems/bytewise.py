@@ -20,6 +20,7 @@ from a2tg_jax.systems.stage1 import (
     PRUNE_OPTIONS,
     PRUNE_RANGES,
     QUICK,
+    QUICK_RATES,
     SMOKE,
     PruneConfig,
     growing_stage,
@@ -27,9 +28,12 @@ from a2tg_jax.systems.stage1 import (
 )
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import Ranges, System
+from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.stage import Stage
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
+OWN_RATES = {"means_by_size": 0.7, "cooldown": 0.4}
+"""Learning rates in which it differs from the other systems."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +82,7 @@ class Bytewise(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
+    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(**OWN_RATES))
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
@@ -154,10 +159,11 @@ class Bytewise(System):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
+        quick = dataclasses.replace(QUICK_RATES, **OWN_RATES)
         return {
             "paper": cls(),
-            "quick": cls(**QUICK, densify=CapConfig(QUICK_CAP)),
-            "smoke": cls(**SMOKE, stage2_iterations=120, densify=CapConfig(SMOKE_CAP)),
+            "quick": cls(**(QUICK | {"rates": quick}), densify=CapConfig(QUICK_CAP)),
+            "smoke": cls(**(SMOKE | {"rates": quick}), stage2_iterations=120, densify=CapConfig(SMOKE_CAP)),
         }
 
     def check(self) -> None:

@@ -15,7 +15,7 @@ from a2tg_jax.model import Model
 COOLED = 0.1
 """Factor of all learning rates at the end of a cooldown."""
 LARGEST_RATIO = 5.0
-"""Largest ratio between the size of a Gaussian and the mean of all that its learning rate follows."""
+"""Largest ratio of a Gaussian's size to the mean of all that its learning rate follows."""
 
 
 @jax.tree_util.register_dataclass
@@ -38,8 +38,8 @@ class LearningRates:
     sh_rest: float = 1.25e-4
     """Learning rate of the other spherical harmonics."""
     means_by_size: float = static(default=0.0, is_addition=True)
-    """Power p of size in the means' learning rate, which is multiplied by (size / mean size)^p; 0: the same for all.
-    Sizes are geometric means, and their ratio stays between 1/5 and 5."""
+    """Power p of size in the means' learning rate. Gaussians larger than the mean of all have (size / mean)^p times the
+    rate, at most 5^p; 0: the same for all. Sizes and their mean are geometric means."""
     cooldown: float = static(default=0.0, is_addition=True)
     """Share of the last stage, at its end, in which all learning rates fall linearly to a tenth; 0: they do not."""
 
@@ -47,7 +47,7 @@ class LearningRates:
         """Return one rate per field of the model's Gaussians, which broadcasts against it.
 
         Args:
-          rate_of_means: present rate of the means, for Gaussians of mean size.
+          rate_of_means: present rate of the means, for Gaussians that are not larger than the mean of all.
           model: N Gaussians.
         """
         gaussians = model.gaussians
@@ -68,7 +68,7 @@ class LearningRates:
 
 
 def relative_sizes(gaussians: Gaussians, num_live: Array | int) -> Array:
-    """Return [N] sizes relative to the geometric mean of the live Gaussians, between 1/5 and 5.
+    """Return [N] sizes relative to the geometric mean of the live Gaussians, between 1 and 5.
 
     Args:
       gaussians: N rows.
@@ -77,4 +77,4 @@ def relative_sizes(gaussians: Gaussians, num_live: Array | int) -> Array:
     log_sizes = jnp.mean(gaussians.log_scales, axis=1)
     is_live = jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
     mean = jnp.sum(jnp.where(is_live, log_sizes, 0.0)) / jnp.maximum(num_live, 1).astype(log_sizes.dtype)
-    return jnp.clip(jnp.exp(log_sizes - mean), 1 / LARGEST_RATIO, LARGEST_RATIO)
+    return jnp.clip(jnp.exp(log_sizes - mean), 1.0, LARGEST_RATIO)
