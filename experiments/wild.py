@@ -20,6 +20,7 @@ import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
 from lab.kept import KeptFigures, parser_of
+from lab.outdoors import outdoors
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_depths
@@ -92,6 +93,11 @@ def tone_mapped(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return changed
 
 
+def few_points() -> a2tg.Scene:
+    """Return the capture with a sixth of its points, so that parts of the room are without any."""
+    return dataclasses.replace(whole(), points=whole().points[::6], colors=whole().colors[::6])
+
+
 def painted(scene: a2tg.Scene, change: Callable[[int, np.ndarray], np.ndarray]) -> a2tg.Scene:
     """Return the scene with changed training photographs."""
     views = [dataclasses.replace(view, picture=change(index, view.image)) for index, view in enumerate(scene.train)]
@@ -141,6 +147,11 @@ CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
     "few views, depths": (lambda: with_depths(few_views()), {f"depth_weight {weight}": depth_weight(weight)
                                                              for weight in (0.1, 0.3, 1)}),
     "whole, depths": (lambda: with_depths(whole()), {"depth_weight 0.3": depth_weight(0.3)}),
+    "outdoors": (lambda: outdoors(*SIZE), {
+        "plain": {}, "background random": {"background": "random"}, "background white": {"background": "white"},
+        **{f"sky_gaussians {num}": {"sky_gaussians": num} for num in (250, 500, 1_000)},
+    }),
+    "few points": (few_points, {"plain": {}, "sky_gaussians 250": {"sky_gaussians": 250}}),
     "processed": (processed, {"plain": {}, "affine": {"exposure": True}, "grid": GRID}),
 }  # fmt: skip
 """Captures and, for each, the options to compare."""

@@ -94,7 +94,7 @@ class StageForecast:
 
 def forecast_stages(scene: Scene, system: System) -> Iterator[StageForecast]:
     """Yield the forecast of each stage of a system (host; nothing is compiled)."""
-    num, floats, shown = min(initial_number(scene, system), len(scene.points)), 0.0, None
+    num, floats, shown = initial_number(scene, system), 0.0, None
     for stage in system.stages():
         num = num_rows(stage, num)
         if stage.appearance != shown:
