@@ -17,7 +17,7 @@ from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.registry import with_changes
-from a2tg_jax.training.sky import cell_rays, fibonacci, sky_of, sphere
+from a2tg_jax.training.sky import cell_rays, fibonacci, sky_of, sphere, spread
 from a2tg_jax.training.start import check_start, initial_model
 
 WIDTH, HEIGHT, NUM = 48, 36, 60
@@ -147,6 +147,14 @@ def test_directions_are_even():
     assert cKDTree(directions).query(directions, k=2)[0][:, 1].min() > 0.8 * np.sqrt(4 * np.pi / 500)
 
 
+def test_directions_are_chosen_among_those_that_are_sky():
+    directions, angle = spread(50, lambda directions: directions[:, 0] > 0.9)
+    assert directions.shape == (50, 3) and (directions[:, 0] > 0.9).all()
+    assert angle == pytest.approx(np.sqrt(2 * np.pi * 0.1 / 50), rel=0.1), "a cap of height 0.1, shared by 50"
+    with pytest.raises(ValueError, match="too few training views see the same part of a sky"):
+        spread(50, lambda directions: np.zeros(len(directions), bool))
+
+
 class TestStart:
     def test_the_sky_counts_among_the_initial_gaussians(self, scene):
         model = initial_model(scene, mcmc(initial_gaussians=100, sky_gaussians=20))
@@ -196,7 +204,7 @@ class TestStart:
     def test_a_scene_without_a_sky_is_refused(self, scene):
         above = np.concatenate([ground(view.camera, np.random.default_rng(0), 0) for view in scene.train])
         full = dataclasses.replace(scene, points=np.concatenate([scene.points, above]))
-        with pytest.raises(ValueError, match=r"sky_gaussians is 20, but the training views show no sky: \d"):
+        with pytest.raises(ValueError, match=r"--sky-gaussians is 20, but the training views show no sky: \d"):
             check_start(full, mcmc(sky_gaussians=20))
         masked = changed(scene, mask=np.tile(np.arange(HEIGHT)[:, None] >= HORIZON, (1, WIDTH)))
         with pytest.raises(ValueError, match=r"the training views show no sky: 0\.0% .*: leave it out"):

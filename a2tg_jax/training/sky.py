@@ -102,7 +102,7 @@ def check_share(empty: Sequence[np.ndarray], num: int) -> None:
     share = float(np.mean(np.concatenate(empty)))
     if share < LEAST_EMPTY:
         raise ValueError(
-            f"sky_gaussians is {num:,}, but the training views show no sky: {share:.1%} of them is above the horizon "
+            f"--sky-gaussians is {num:,}, but the training views show no sky: {share:.1%} of them is above the horizon "
             f"and without points, less than {LEAST_EMPTY:.0%}: leave it out"
         )
 
@@ -198,7 +198,7 @@ def spread(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.nda
     shares = (is_sky(fibonacci(tried)).mean() for tried in NUMS_TRIED)
     share = next((share for share in shares if share), 0.0)
     if not share:
-        raise ValueError("sky_gaussians: most training views have points wherever others have none: leave it out")
+        raise ValueError("--sky-gaussians: too few training views see the same part of a sky: leave it out")
     total, found = int(num / share), np.zeros((0, 3))
     while len(found) < num:
         total = int(MORE * total) + 1
