@@ -152,9 +152,9 @@ class System:
     initial_gaussians: int | None = None
     """Number of Gaussians to start from; None: one per point, at most the cap."""
     sky_gaussians: int = dataclasses.field(default=0, metadata={"is_addition": True})
-    """Number of the initial Gaussians that show the sky of an outdoor capture; 0: none. They start on a sphere around
-    the cameras, where training views see no points. Its radius is 10 times the distance of the farthest points, 1 % of
-    them left out."""
+    """Number of the initial Gaussians that start as the sky of an outdoor capture, on a sphere around the cameras,
+    where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
+    left out."""
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from."""
     memory_budget: float | str | None = None

@@ -141,8 +141,8 @@ def is_empty(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
     """
     rays, spacing = cell_rays(camera)
     towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
-    empty: np.ndarray = cKDTree(towards).query(rays)[0] > REACH * spacing
-    return empty & (rays @ up > LOWEST)
+    empty: np.ndarray = (cKDTree(towards).query(rays)[0] > REACH * spacing) & (rays @ up > LOWEST)
+    return empty
 
 
 def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
