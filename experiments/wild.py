@@ -20,6 +20,7 @@ import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
 from lab.kept import KeptFigures, parser_of
+from lab.outdoors import outdoors
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_depths
@@ -28,6 +29,8 @@ from a2tg_jax.training.registry import with_changes
 
 SIZE = 128, 96
 OPTIONS = {"stage1_iterations": 800, "stage2_iterations": 0, "densify": {"cap": 2_500}}
+SMALL, SHORT = (64, 48), {"stage1_iterations": 500, "densify": {"cap": 1_000}}
+"""Image size and options of the captures with a sky."""
 SEEDS = 0, 1
 """Seeds of the trainings; the captures are the same."""
 NUM_FEW, NUM_FLOATERS = 6, 400
@@ -92,6 +95,12 @@ def tone_mapped(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return changed
 
 
+def few_points() -> a2tg.Scene:
+    """Return the small capture with a sixth of its points, so that parts of the room are without any."""
+    scene = whole(SMALL[0])
+    return dataclasses.replace(scene, points=scene.points[::6], colors=scene.colors[::6])
+
+
 def painted(scene: a2tg.Scene, change: Callable[[int, np.ndarray], np.ndarray]) -> a2tg.Scene:
     """Return the scene with changed training photographs."""
     views = [dataclasses.replace(view, picture=change(index, view.image)) for index, view in enumerate(scene.train)]
@@ -141,6 +150,12 @@ CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
     "few views, depths": (lambda: with_depths(few_views()), {f"depth_weight {weight}": depth_weight(weight)
                                                              for weight in (0.1, 0.3, 1)}),
     "whole, depths": (lambda: with_depths(whole()), {"depth_weight 0.3": depth_weight(0.3)}),
+    "outdoors": (lambda: outdoors(*SMALL), {
+        "plain": SHORT, "background random": {**SHORT, "background": "random"},
+        "background white": {**SHORT, "background": "white"},
+        **{f"sky_gaussians {num}": {**SHORT, "sky_gaussians": num} for num in (100, 250, 500)},
+    }),
+    "few points": (few_points, {"plain": SHORT, "sky_gaussians 250": {**SHORT, "sky_gaussians": 250}}),
     "processed": (processed, {"plain": {}, "affine": {"exposure": True}, "grid": GRID}),
 }  # fmt: skip
 """Captures and, for each, the options to compare."""

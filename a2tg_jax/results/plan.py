@@ -122,8 +122,10 @@ def _trains_alike(a: System, b: System, index: int) -> bool:
 
 
 def _common_options(system: System) -> list[Any]:
-    """Return the options that training reads from the system itself."""
-    return [getattr(system, field.name) for field in dataclasses.fields(System) if field.name not in STAGE_OPTIONS]
+    """Return the options that training reads from the system itself; additions not asked for are left out."""
+    own = [(field, getattr(system, field.name)) for field in dataclasses.fields(System)]
+    asked = [(field, value) for field, value in own if field.name not in STAGE_OPTIONS and not _is_absent(field, value)]
+    return [(field.name, value) if _is_addition(field) else value for field, value in asked]
 
 
 def _is_equal(a: Stage, b: Stage) -> bool:
@@ -166,10 +168,14 @@ def _described(value: Any) -> Any:
 
 
 def _is_absent(field: dataclasses.Field[Any], value: Any) -> bool:
-    """Return whether it is a tuple that is empty, as it is by default, or an addition (`events.static`) not asked
-    for."""
-    is_addition = field.metadata.get("is_addition", False)
-    return (isinstance(value, tuple) and not value and field.default == ()) or (is_addition and value == field.default)
+    """Return whether it is a tuple that is empty, as it is by default, or an addition not asked for."""
+    is_empty = isinstance(value, tuple) and not value and field.default == ()
+    return is_empty or (_is_addition(field) and value == field.default)
+
+
+def _is_addition(field: dataclasses.Field[Any]) -> bool:
+    """Return whether trainings of earlier versions, which did not know the field, are those with its default."""
+    return bool(field.metadata.get("is_addition", False))
 
 
 def _name_of(value: Any) -> str:

@@ -146,6 +146,8 @@ class RunRecord:
         plan = plan_run(self.systems)
         if self.init is not None and len(plan.main) < 2:
             raise ValueError(f"init takes the place of a first stage, and {self.name} has no second one")
+        if self.init is not None and self.system.sky_gaussians:
+            raise ValueError("init takes the place of a first stage, and sky_gaussians start in one: leave one out")
 
     def leaves(self) -> dict[str, Any]:
         """Return every option by the name of its flag, without the dashes."""

@@ -100,7 +100,7 @@ def forecast_stages(scene: Scene, system: System, num_given: int | None = None) 
       system: with its options.
       num_given: Gaussians of a file in place of the first stage, which takes nothing then; None: it is trained.
     """
-    num, floats, shown = min(initial_number(scene, system), len(scene.points)), 0.0, None
+    num, floats, shown = initial_number(scene, system), 0.0, None
     stages = system.stages()
     if num_given is not None:
         num, stages = num_given, stages[1:]

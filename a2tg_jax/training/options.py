@@ -152,6 +152,10 @@ class System:
     """Views per iteration."""
     initial_gaussians: int | None = None
     """Number of Gaussians to start from; None: one per point, at most the cap."""
+    sky_gaussians: int = dataclasses.field(default=0, metadata={"is_addition": True})
+    """Number of the initial Gaussians that start as the sky of an outdoor capture, on a sphere around the cameras,
+    where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
+    left out."""
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from."""
     memory_budget: float | str | None = None
@@ -301,7 +305,19 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in stages:
             stage.check()
+        self._check_sky(stages)
         self._check_learned(stages)
+
+    def _check_sky(self, stages: Sequence[Stage]) -> None:
+        """Refuse a sky that leaves no room for the Gaussians at points."""
+        caps = [most for event in stages[0].events if (most := event.most_gaussians) is not None]
+        room = min([*caps, self.initial_gaussians or math.inf])
+        if self.sky_gaussians and self.sky_gaussians > room - 2:
+            names = " and ".join(self.limits()) if room in caps else "initial_gaussians"
+            raise ValueError(
+                f"sky_gaussians must leave room for 2 others among the {room:,} that training starts from at most; got "
+                f"{self.sky_gaussians:,}: lower it, or raise {names}"
+            )
 
     def _check_learned(self, stages: Sequence[Stage]) -> None:
         """Refuse corrections and pruning that are asked for and would do nothing."""
@@ -401,6 +417,7 @@ FEW_GAUSSIANS = 100
 RANGES = {
     "batch_size": (1, math.inf),
     "initial_gaussians": (2, math.inf),
+    "sky_gaussians": (0, math.inf),
     "sh_degree": (0, 3),
     "seed": (0, 2**31 - 1),
     "tile_size": (1, MAX_TILE_SIZE),

@@ -16,6 +16,7 @@ from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_depths
 from a2tg_jax.training.options import System
+from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
 
 NO_ROW_LOG_SCALE = -10.0
@@ -27,11 +28,14 @@ SMALLEST_SIDE = 1e-6
 
 
 def initial_model(scene: Scene, system: System) -> Model:
-    """Return Gaussians at the scene's points, as many as the first stage has room for."""
-    num, degree = initial_number(scene, system), system.initial_sh_degree
+    """Return Gaussians at the scene's points and of its sky, as many as the first stage has room for."""
+    num, degree, opacity = initial_number(scene, system), system.initial_sh_degree, system.initial_opacity
+    num_sky = system.sky_gaussians
     gaussians = init_from_points(
-        scene.points, scene.colors, num, system.seed, opacity=system.initial_opacity, sh_degree=degree
+        scene.points, scene.colors, num - num_sky, system.seed, opacity=opacity, sh_degree=degree
     )
+    if num_sky:
+        gaussians = _followed_by(gaussians, sky_of(scene, num_sky, opacity=opacity, sh_degree=degree))
     adapted = fainter_where_dense if system.stages()[0].appearance.has_low_pass else wider_where_dense
     return Model(adapted(gaussians, [view.camera for view in scene.train]))
 
@@ -79,18 +83,20 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 
 
 def check_start(scene: Scene, system: System) -> None:
-    """Refuse a first stage whose events cannot work with the initial number of Gaussians, and depth priors of a scene
-    without depth maps.
+    """Refuse a first stage whose events cannot work with the initial number of Gaussians, depth priors of a scene
+    without depth maps, and Gaussians of a sky that no view sees.
 
     Raises:
       ValueError: naming the options to change.
     """
-    first, num = system.stages()[0], min(initial_number(scene, system), len(scene.points))
+    first, num = system.stages()[0], initial_number(scene, system)
     with system.naming_options():
         _rows_needed(first, num, system)
     system.check_number(num)
     if any(stage.has_depths for stage in system.stages()):
         check_depths(scene.train)
+    if system.sky_gaussians:
+        check_sky(scene, system.sky_gaussians)
 
 
 def _rows_needed(stage: Stage, num: int, system: System) -> int:
@@ -106,8 +112,10 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 
 
 def initial_number(scene: Scene, system: System) -> int:
-    """Return the number of initial Gaussians: as requested, up to the room of the first stage."""
-    num = system.initial_gaussians or len(scene.points)
+    """Return the number of initial Gaussians: as requested, up to one for each point beside those of the sky, and up to
+    the room of the first stage."""
+    most = len(scene.points) + system.sky_gaussians
+    num = min(system.initial_gaussians or most, most)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
 
@@ -153,9 +161,12 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
     num = room - gaussians.num
     if num == 0:
         return gaussians
-    empty = no_rows(num, gaussians.sh.shape[1], gaussians.means.dtype)
-    filled: Gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, empty)
-    return filled
+    return _followed_by(gaussians, no_rows(num, gaussians.sh.shape[1], gaussians.means.dtype))
+
+
+def _followed_by(gaussians: Gaussians, others: Gaussians) -> Gaussians:
+    joined: Gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, others)
+    return joined
 
 
 def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:

@@ -1,0 +1,235 @@
+"""A sky for the start of training: Gaussians on a distant sphere, where views look and no points lie.
+
+Each view is divided into cells. A cell is empty if no point of the scene projects near it. A direction belongs to the
+sky if at least half of the views that look there see an empty cell. All of it is on the host.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.capture import vertical_of
+from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.data.scene import Scene, View
+
+DISTANCE = 10.0
+"""Radius of the sphere, in distances of the far points from the cameras' mean."""
+FAR_SHARE = 0.99
+"""Share of the points that are no farther than the far points."""
+CELLS = 24
+"""Number of cells along the shorter side of a view."""
+REACH = 1.5
+"""Smallest distance of points from an empty cell, in cells."""
+LEAST_SHARE = 0.25
+"""Smallest share of the views that look in a direction of the sky and see an empty cell there."""
+MOST_POINTS = 50_000
+"""Number of points beyond which evenly chosen ones stand for all."""
+LEAST_EMPTY = 0.01
+"""Smallest share of empty cells."""
+NUMS_TRIED = 20_000, 200_000
+"""Directions all around that tell how much of them is sky; the second number if there is none among the first."""
+LOWEST = -0.2
+"""Smallest sine of the angle of the sky above the horizon; hills and buildings may end below it."""
+NOWHERE = 9.0
+"""Coordinate of cells without a ray, far from all unit directions."""
+MORE = 1.02
+"""Factor of the number of directions as long as too few are sky."""
+
+
+class Cells(NamedTuple):
+    """Cells of one view."""
+
+    center: np.ndarray
+    """[3] position of the camera."""
+    tree: cKDTree
+    """Unit directions [C, 3] of the cells' centres in the world."""
+    spacing: float
+    """Largest distance of neighbours among these."""
+    is_empty: np.ndarray
+    """[C] whether no point projects near, and the photograph counts there."""
+    colors: np.ndarray
+    """[C, 3] mean colours in [0, 1]."""
+
+
+def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussians:
+    """Return Gaussians of the sky, evenly spread over the directions that training views see without points.
+
+    They face the cameras' mean, are as wide as they lie apart, and have the mean colour of the photographs there.
+
+    Args:
+      scene: its training photographs are each read once.
+      num: number of Gaussians.
+      opacity: of each.
+      sh_degree: highest degree of spherical harmonics, 0 to 3; those above 0 are 0.
+
+    Raises:
+      ValueError: if no training view sees a sky.
+    """
+    up = up_of(scene)
+    cells = [cells_of(view, scene.points, up) for view in scene.train]
+    check_share([view.is_empty for view in cells], num)
+    center, radius = sphere(scene)
+    directions, spacing = spread(num, lambda directions: votes(cells, center + radius * directions)[0])
+    means = center + radius * directions
+    colors = votes(cells, means)[1]
+    facing = directions * np.where(directions[:, 2:] < 0, -1, 1)  # Splats have two sides.
+    x, y, z = facing.T
+    quats = np.stack([1 + z, -y, x, np.zeros(num)], axis=1)
+    sh = np.zeros((num, NUM_BASES[sh_degree], 3), np.float32)
+    sh[:, 0] = (colors - 0.5) / SH_C0
+    return Gaussians(
+        means=jnp.asarray(means, jnp.float32),
+        quats=jnp.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), jnp.float32),
+        log_scales=jnp.full((num, 2), np.log(radius * spacing), jnp.float32),
+        logit_opacities=jnp.full(num, np.log(opacity / (1 - opacity)), jnp.float32),
+        sh=jnp.asarray(sh),
+    )
+
+
+def check_sky(scene: Scene, num: int) -> None:
+    """Raise ValueError if the training views show no sky, whatever their masks are; photographs are not read."""
+    up = up_of(scene)
+    check_share([is_empty(view.camera, scene.points, up) for view in scene.train], num)
+
+
+def check_share(empty: Sequence[np.ndarray], num: int) -> None:
+    """Raise ValueError unless enough cells of the views are empty for `num` Gaussians."""
+    share = float(np.mean(np.concatenate(empty)))
+    if share < LEAST_EMPTY:
+        raise ValueError(
+            f"--sky-gaussians is {num:,}, but the training views show no sky: {share:.1%} of them is above the horizon "
+            f"and without points, less than {LEAST_EMPTY:.0%}: leave it out"
+        )
+
+
+def up_of(scene: Scene) -> np.ndarray:
+    """Return the vertical [3] of the training cameras."""
+    return vertical_of(np.stack([np.asarray(view.camera.viewmat, np.float64) for view in scene.train]))
+
+
+def sphere(scene: Scene) -> tuple[np.ndarray, float]:
+    """Return the centre [3] and the radius of the sphere, in the normalised world."""
+    center = np.mean([np.asarray(view.camera.center, np.float64) for view in scene.train], axis=0)
+    distances = np.linalg.norm(scene.points - center, axis=1)
+    return center, DISTANCE * float(np.quantile(distances, FAR_SHARE))
+
+
+def cells_of(view: View, points: np.ndarray, up: np.ndarray) -> Cells:
+    """Return the cells of a view; its photograph is read. Arguments as of `is_empty`."""
+    rays, spacing = cell_rays(view.camera)
+    counts = np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
+    pixels = view.picture.read()
+    if view.has_alpha:
+        counts = counts & (pixels[..., 3] == 255)
+    empty = is_empty(view.camera, points, up) & (_blocks(counts[..., None], view.camera)[:, 0] == 1)
+    center = np.asarray(view.camera.center, np.float64)
+    return Cells(center, cKDTree(rays), spacing, empty, _blocks(pixels[..., :3], view.camera) / 255)
+
+
+def is_empty(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return [C] whether a cell of a view is above the ground, and no point [P, 3] projects near it.
+
+    Args:
+      camera: of the view.
+      points: [P, 3] of the scene.
+      up: [3] its vertical.
+    """
+    rays, spacing = cell_rays(camera)
+    towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
+    empty: np.ndarray = (cKDTree(towards).query(rays)[0] > REACH * spacing) & (rays @ up > LOWEST)
+    return empty
+
+
+def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
+    """Return unit directions [C, 3] of the cells' centres in the world, and the largest distance of neighbours.
+
+    Cells of a lens that is no pinhole, whose centres have no ray, lie nowhere.
+    """
+    step = _step(camera)
+    rows, columns = (step * np.arange(side // step) + step // 2 for side in (camera.height, camera.width))
+    if camera.rays is None:
+        x, y = np.meshgrid(columns + 0.5, rows + 0.5)
+    else:
+        x, y = np.moveaxis(np.asarray(camera.rays, np.float64)[np.ix_(rows, columns)], -1, 0)
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    to_world = np.linalg.inv(np.asarray(camera.K, np.float64)).T @ np.asarray(camera.viewmat, np.float64)[:3, :3]
+    rays = _units(pixels @ to_world)
+    gaps = [np.linalg.norm(np.diff(rays, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    spacing = float(np.max(np.concatenate(gaps), initial=0.0, where=np.isfinite(np.concatenate(gaps))))
+    return np.where(np.isfinite(rays), rays, NOWHERE).reshape(-1, 3), spacing
+
+
+def votes(cells: Sequence[Cells], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return whether positions [M, 3] are sky, and the mean colours [M, 3] of the empty cells that they are seen in."""
+    num_looking, num_empty = np.zeros((2, len(positions)))
+    colors = np.zeros((len(positions), 3))
+    for view in cells:
+        rows, at = _seen(view, positions)
+        num_looking[rows] += 1
+        rows, at = rows[view.is_empty[at]], at[view.is_empty[at]]
+        num_empty[rows] += 1
+        colors[rows] += view.colors[at]
+    is_sky = (num_empty > 0) & (num_empty >= LEAST_SHARE * num_looking)
+    return is_sky, colors / np.maximum(num_empty, 1)[:, None]
+
+
+def _seen(view: Cells, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (rows, cells) [S] of the positions that a view sees."""
+    distances, at = view.tree.query(_units(positions - view.center), distance_upper_bound=REACH / 2 * view.spacing)
+    rows = np.flatnonzero(np.isfinite(distances))
+    return rows, at[rows]
+
+
+def spread(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
+    """Return evenly spread unit directions [num, 3] that are sky, and the angle between neighbours.
+
+    Args:
+      num: how many.
+      is_sky: returns [M] bool for directions [M, 3].
+
+    Raises:
+      ValueError: if there is none.
+    """
+    shares = (is_sky(fibonacci(tried)).mean() for tried in NUMS_TRIED)
+    share = next((share for share in shares if share), 0.0)
+    if not share:
+        raise ValueError("--sky-gaussians: too few training views see the same part of a sky: leave it out")
+    total, found = int(num / share), np.zeros((0, 3))
+    while len(found) < num:
+        total = int(MORE * total) + 1
+        found = fibonacci(total)
+        found = found[is_sky(found)]
+    return found[np.linspace(0, len(found) - 1, num).round().astype(int)], float(np.sqrt(4 * np.pi / total))
+
+
+def fibonacci(num: int) -> np.ndarray:
+    """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice."""
+    index = np.arange(num) + 0.5
+    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def _step(camera: Camera) -> int:
+    """Return the side of a cell in pixels."""
+    return max(1, min(camera.height, camera.width) // CELLS)
+
+
+def _blocks(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the mean [C, channels] of an image [H, W, channels] over each cell."""
+    step = _step(camera)
+    rows, columns = camera.height // step, camera.width // step
+    blocks = image[: rows * step, : columns * step].reshape(rows, step, columns, step, -1)
+    means: np.ndarray = blocks.mean(axis=(1, 3)).reshape(rows * columns, -1)
+    return means
+
+
+def _units(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors [..., 3] of length 1; 0 of 0."""
+    units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+    return units

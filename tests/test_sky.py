@@ -1,0 +1,216 @@
+"""The sky that training starts from: where it lies, what it looks like, and where it is refused."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import a2tg_jax as a2tg
+from a2tg_jax.core.cameras import intrinsics, looking
+from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.densify.pruning import blending_weights
+from a2tg_jax.results.plan import fingerprint, plan_run
+from a2tg_jax.results.record import RunRecord, SceneSource
+from a2tg_jax.training import SYSTEMS
+from a2tg_jax.training.cost import forecast_stages
+from a2tg_jax.training.registry import with_changes
+from a2tg_jax.training.sky import cell_rays, fibonacci, sky_of, sphere, spread
+from a2tg_jax.training.start import check_start, initial_model
+
+WIDTH, HEIGHT, NUM = 48, 36, 60
+HORIZON = HEIGHT // 2
+BLUE, BROWN = (60, 120, 240), (120, 80, 40)
+K = intrinsics(WIDTH, HEIGHT, np.deg2rad(58))
+
+
+def camera_at(x: float) -> a2tg.Camera:
+    """A level camera that looks along y; z is up."""
+    viewmat = looking(np.array([x, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    return a2tg.Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), WIDTH, HEIGHT)
+
+
+def ground(camera: a2tg.Camera, rng: np.random.Generator, top: float = HORIZON + 1) -> np.ndarray:
+    """Points under random pixels lower than a row, one below the camera, or above it."""
+    pixels = np.stack([rng.uniform(0, WIDTH, 2_000), rng.uniform(top, HEIGHT, 2_000), np.ones(2_000)], axis=1)
+    rays = pixels @ np.linalg.inv(K).T @ np.asarray(camera.viewmat)[:3, :3]
+    points: np.ndarray = np.asarray(camera.center) + rays / np.abs(rays[:, 2:])
+    return points.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Three views of a brown ground with points, under a blue sky."""
+    rng, cameras = np.random.default_rng(0), [camera_at(x) for x in (-0.5, 0.0, 0.5)]
+    image = np.full((HEIGHT, WIDTH, 3), BROWN, np.uint8)
+    image[:HORIZON] = BLUE
+    views = tuple(a2tg.View(f"{index}.png", camera, image) for index, camera in enumerate(cameras))
+    points = np.concatenate([ground(camera, rng) for camera in cameras])
+    colors = np.full_like(points, 0.4)
+    return a2tg.Scene("plain", views, views, points, colors, Similarity(1.0, np.eye(3), np.zeros(3)), 1.0)
+
+
+def projected(camera: a2tg.Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows of points before a camera."""
+    viewmat = np.asarray(camera.viewmat, np.float64)
+    x, y, depth = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
+    assert (depth > 0).all()
+    return x / depth, y / depth
+
+
+def directions_of(gaussians, scene) -> np.ndarray:
+    offsets = np.asarray(gaussians.means, np.float64) - sphere(scene)[0]
+    return offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+
+
+def changed(scene, **changes):
+    return dataclasses.replace(scene, train=tuple(dataclasses.replace(view, **changes) for view in scene.train))
+
+
+def mcmc(**options):
+    return with_changes(a2tg.find_system("gaussians-2d-mcmc").preset("smoke"), options, "test")
+
+
+@pytest.fixture(scope="module")
+def sky(scene):
+    return sky_of(scene, NUM, opacity=0.3, sh_degree=1)
+
+
+class TestSky:
+    def test_it_lies_far_off_where_views_see_no_points(self, scene, sky):
+        center, radius = sphere(scene)
+        distances = np.linalg.norm(scene.points - center, axis=1)
+        assert (distances < radius / 9.99).mean() == pytest.approx(0.99, abs=1e-3)
+        np.testing.assert_allclose(np.linalg.norm(np.asarray(sky.means) - center, axis=1), radius, rtol=1e-5)
+        found = [projected(view.camera, np.asarray(sky.means, np.float64)) for view in scene.train]
+        is_seen = [(x > -1) & (x < WIDTH + 1) & (y > -1) & (y < HORIZON + 1) for x, y in found]
+        assert np.any(is_seen, axis=0).all()
+
+    def test_it_fills_what_views_see(self, scene, sky):
+        """No direction of a view's upper half is farther from a Gaussian than twice its angle."""
+        x, y = np.meshgrid(np.arange(1, WIDTH), np.arange(1, HORIZON - 2))
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
+        rays = rays @ np.asarray(scene.train[1].camera.viewmat)[:3, :3]
+        gaps = cKDTree(directions_of(sky, scene)).query(rays / np.linalg.norm(rays, axis=1, keepdims=True))[0]
+        assert gaps.max() < 2 * float(sky.scales[0, 0]) / sphere(scene)[1]
+
+    def test_it_faces_the_cameras_evenly_in_their_colours(self, scene, sky):
+        directions = directions_of(sky, scene)
+        normals = np.asarray(rotation_matrices(sky.quats))[:, :, 2]
+        np.testing.assert_allclose(np.abs((normals * directions).sum(axis=1)), 1, atol=1e-5)
+        angles = cKDTree(directions).query(directions, k=2)[0][:, 1]
+        np.testing.assert_allclose(angles, np.asarray(sky.scales)[:, 0] / sphere(scene)[1], rtol=0.25)
+        np.testing.assert_allclose(0.5 + SH_C0 * sky.sh[:, 0], np.tile(np.array(BLUE) / 255, (NUM, 1)), atol=1e-5)
+        assert sky.sh.shape == (NUM, 4, 3) and not sky.sh[:, 1:].any()
+        np.testing.assert_allclose(sky.opacities, 0.3, rtol=1e-5)
+
+    @pytest.mark.parametrize("kind", ["mask", "alpha"])
+    def test_what_photographs_leave_out_is_no_sky(self, scene, kind):
+        counts = np.tile(np.arange(WIDTH) >= WIDTH // 2, (HEIGHT, 1))
+        pixels = np.dstack([scene.train[0].image, np.where(counts, 255, 0).astype(np.uint8)])
+        left_out = changed(scene, **({"mask": counts} if kind == "mask" else {"picture": pixels}))
+        sky = sky_of(left_out, NUM, opacity=0.3, sh_degree=0)
+        found = np.stack([projected(view.camera, np.asarray(sky.means, np.float64))[0] for view in scene.train])
+        assert found.max(axis=0).min() > WIDTH // 2 - 1
+
+    def test_the_ground_is_no_sky(self, scene):
+        """Without a point nearby, the ground is still no sky."""
+        bare = dataclasses.replace(scene, points=scene.points + np.float32([500, 0, 0]))
+        sky = sky_of(bare, NUM, opacity=0.3, sh_degree=0)
+        sines = directions_of(sky, bare)[:, 2]
+        assert sines.min() > -0.25 and (sines < -0.1).any()
+
+    def test_it_shows(self, scene, sky):
+        weights = blending_weights(a2tg.Model(sky), scene.train)
+        assert weights.min() > 1 and 0.6 * 3 * WIDTH * HORIZON < weights.sum() < 1.1 * 3 * WIDTH * HORIZON
+
+
+def test_rays_of_a_lens_are_those_of_its_pixels():
+    camera = camera_at(0.0)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([x, y], axis=-1)
+    rays[:, : WIDTH // 2] = np.nan
+    pinhole, spacing = cell_rays(camera)
+    lens, same = cell_rays(dataclasses.replace(camera, rays=jnp.asarray(rays)))
+    assert same == pytest.approx(spacing, rel=1e-6) and len(pinhole) == WIDTH * HEIGHT
+    has_ray = np.abs(lens) <= 1
+    assert has_ray.mean() == 0.5
+    np.testing.assert_allclose(lens[has_ray], pinhole[has_ray], atol=1e-6)
+
+
+def test_directions_are_even():
+    directions = fibonacci(500)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    np.testing.assert_allclose(directions.mean(axis=0), 0, atol=2e-3)
+    assert cKDTree(directions).query(directions, k=2)[0][:, 1].min() > 0.8 * np.sqrt(4 * np.pi / 500)
+
+
+def test_directions_are_chosen_among_those_that_are_sky():
+    directions, angle = spread(50, lambda directions: directions[:, 0] > 0.9)
+    assert directions.shape == (50, 3) and (directions[:, 0] > 0.9).all()
+    assert angle == pytest.approx(np.sqrt(2 * np.pi * 0.1 / 50), rel=0.1), "a cap of height 0.1, shared by 50"
+    with pytest.raises(ValueError, match="too few training views see the same part of a sky"):
+        spread(50, lambda directions: np.zeros(len(directions), bool))
+
+
+class TestStart:
+    def test_the_sky_counts_among_the_initial_gaussians(self, scene):
+        model = initial_model(scene, mcmc(initial_gaussians=100, sky_gaussians=20))
+        others = initial_model(scene, mcmc(initial_gaussians=80))
+        assert model.num == 100
+        for own, other in zip(model.gaussians[:80].__dict__.values(), others.gaussians.__dict__.values(), strict=True):
+            np.testing.assert_array_equal(own, other)
+        np.testing.assert_allclose(
+            np.linalg.norm(np.asarray(model.gaussians.means)[80:] - sphere(scene)[0], axis=1),
+            sphere(scene)[1],
+            rtol=1e-5,
+        )
+
+    @pytest.mark.parametrize("name", SYSTEMS)
+    def test_every_system_forecasts_what_it_starts_from(self, scene, name):
+        few = dataclasses.replace(scene, points=scene.points[::20], colors=scene.colors[::20])
+        system = type(a2tg.find_system(name)).preset("smoke", initial_gaussians=None, sky_gaussians=20)
+        model = initial_model(few, system)
+        assert model.num == len(few.points) + 20
+        assert next(forecast_stages(few, system)).num_rows >= model.num
+
+    def test_trainings_without_a_sky_are_those_of_earlier_versions(self):
+        plain, other = mcmc(), mcmc(sky_gaussians=20)
+        assert fingerprint(a2tg.Gaussians2dMcmc(), 0).startswith("([1, None, 0.1, 'black', 3, 0, 8], ")
+        assert fingerprint(plain, 0) != fingerprint(other, 0)
+        assert len(plan_run({"plain": plain, "sky": other}).stages) == 2
+
+    @pytest.mark.parametrize(
+        "options, message",
+        [
+            ({"sky_gaussians": -1}, "sky_gaussians must be at least 0; got -1"),
+            (
+                {"sky_gaussians": 99, "densify": {"cap": 100}},
+                r"room for 2 others among the 100 that training starts from at most; got 99: .* raise densify\.cap$",
+            ),
+            ({"sky_gaussians": 60, "initial_gaussians": 60}, "among the 60 .* got 60: lower it, or raise initial_gau"),
+            (
+                {"sky_gaussians": 50, "memory_budget": "10kB", "initial_gaussians": None},
+                "among the 43 .* or raise memory_budget$",
+            ),
+        ],
+    )
+    def test_a_sky_that_leaves_no_room_is_refused(self, options, message):
+        with pytest.raises(ValueError, match=message):
+            mcmc(**options).check()
+
+    def test_a_scene_without_a_sky_is_refused(self, scene):
+        above = np.concatenate([ground(view.camera, np.random.default_rng(0), 0) for view in scene.train])
+        full = dataclasses.replace(scene, points=np.concatenate([scene.points, above]))
+        with pytest.raises(ValueError, match=r"--sky-gaussians is 20, but the training views show no sky: \d"):
+            check_start(full, mcmc(sky_gaussians=20))
+        masked = changed(scene, mask=np.tile(np.arange(HEIGHT)[:, None] >= HORIZON, (1, WIDTH)))
+        with pytest.raises(ValueError, match=r"the training views show no sky: 0\.0% .*: leave it out"):
+            initial_model(masked, mcmc(sky_gaussians=20))
+
+    def test_a_first_stage_from_a_file_has_no_sky(self):
+        record = RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg(sky_gaussians=20), init="a.ply")
+        with pytest.raises(ValueError, match="sky_gaussians start in one: leave one out"):
+            record.check()
