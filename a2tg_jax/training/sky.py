@@ -1,7 +1,7 @@
 """A sky for the start of training: Gaussians on a distant sphere, where views look and no points lie.
 
 Each view is divided into cells. A cell is empty if no point of the scene projects near it. A direction belongs to the
-sky if at least half of the views that look there see an empty cell. All of it is on the host.
+sky if at least a quarter of the views that look there see an empty cell. All of it is on the host.
 """
 
 from collections.abc import Callable, Sequence

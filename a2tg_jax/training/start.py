@@ -114,8 +114,8 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 def initial_number(scene: Scene, system: System) -> int:
     """Return the number of initial Gaussians: as requested, up to one for each point beside those of the sky, and up to
     the room of the first stage."""
-    most = len(scene.points) + system.sky_gaussians
-    num = min(system.initial_gaussians or most, most)
+    room = len(scene.points) + system.sky_gaussians
+    num = min(system.initial_gaussians or room, room)
     caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
 
