@@ -32,9 +32,9 @@ def test_sizes_are_relative_to_the_mean_of_live_rows():
 
 def test_rates_of_means_follow_a_power_of_the_size():
     model = Model(gaussians_of([0.5, 2.0, 1.0]))
-    rates = LearningRates(means_by_size=0.5).of_gaussians(jnp.float32(1e-3), model)
-    np.testing.assert_allclose(rates.means, 1e-3 * np.sqrt([[1.0], [2.0], [1.0]]), rtol=1e-6)
-    assert LearningRates().of_gaussians(jnp.float32(1e-3), model).means.shape == ()
+    rates = LearningRates(means_by_size=0.5).of_means(jnp.float32(1e-3), model)
+    np.testing.assert_allclose(rates, 1e-3 * np.sqrt([[1.0], [2.0], [1.0]]), rtol=1e-6)
+    assert LearningRates().of_means(jnp.float32(1e-3), model).shape == ()
 
 
 @pytest.mark.parametrize(("progress", "factor"), [(0.0, 1.0), (0.6, 1.0), (0.8, 0.55), (1.0, 0.1)])

@@ -43,20 +43,27 @@ class LearningRates:
     cooldown: float = static(default=0.0, is_addition=True)
     """Share of the last stage, at its end, in which all learning rates fall linearly to a tenth; 0: they do not."""
 
-    def of_gaussians(self, rate_of_means: Array, model: Model) -> Gaussians:
-        """Return one rate per field of the model's Gaussians, which broadcasts against it.
+    def of_gaussians(self, means: Any, sh_degree: int = 3) -> Gaussians:
+        """Return one rate per field of the Gaussians, which broadcasts against it.
 
         Args:
-          rate_of_means: present rate of the means, for Gaussians that are not larger than the mean of all.
-          model: N Gaussians.
+          means: present rate of the means, a scalar or [N, 1] (`of_means`).
+          sh_degree: degree of spherical harmonics of the Gaussians, 0 to 3.
         """
-        gaussians = model.gaussians
-        means = rate_of_means
-        if self.means_by_size:
-            means = rate_of_means * relative_sizes(gaussians, model.live_count)[:, None] ** self.means_by_size
-        sh = jnp.full((1, NUM_BASES[gaussians.sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
+        sh = jnp.full((1, NUM_BASES[sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
         fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
         return Gaussians(*fields)
+
+    def of_means(self, rate: Array, model: Model) -> Array:
+        """Return the present rates of the means: [N, 1] where they follow the sizes, or else the one rate.
+
+        Args:
+          rate: of Gaussians that are not larger than the mean of all.
+          model: N Gaussians.
+        """
+        if not self.means_by_size:
+            return rate
+        return rate * relative_sizes(model.gaussians, model.live_count)[:, None] ** self.means_by_size
 
     def cooled(self, rates: Any, progress: Array) -> Any:
         """Return learning rates, a pytree, at a share of the stage: lower ones during the cooldown."""

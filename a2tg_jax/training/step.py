@@ -300,8 +300,9 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
       progress: share of the stage that is done.
     """
     model = state.model
+    of_gaussians = stage.rates.of_gaussians(stage.rates.of_means(rate_of_means, model), model.gaussians.sh_degree)
     of_params = stage.appearance.rates(stage.params_rate, model.params)
-    rates = stage.rates.cooled((stage.rates.of_gaussians(rate_of_means, model), of_params), progress)
+    rates = stage.rates.cooled((of_gaussians, of_params), progress)
     return adam_update((model.gaussians, model.params), grads, state.moments, rates)
 
 
