@@ -273,6 +273,11 @@ def static(*, default: Any = dataclasses.MISSING, is_addition: bool = False) -> 
     return dataclasses.field(default=default, metadata={"static": True, "is_addition": is_addition})
 
 
+def is_addition(field: dataclasses.Field[Any]) -> bool:
+    """Return whether trainings of earlier versions, which did not know a field, are those with its default."""
+    return bool(field.metadata.get("is_addition", False))
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
 def event(cls: type[T]) -> type[T]:
     """Decorate a class: make it a frozen dataclass that is a pytree of its numbers."""

@@ -12,7 +12,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.model import Model
 from a2tg_jax.results.plan import fingerprint
 from a2tg_jax.training import LearningRates
-from a2tg_jax.training.rates import relative_sizes
+from a2tg_jax.training.rates import excess_sizes
 from a2tg_jax.training.registry import SYSTEMS, find_system, with_changes
 from a2tg_jax.training.step import initial_state, optimized
 
@@ -25,9 +25,9 @@ def gaussians_of(sizes):
 
 
 def test_sizes_are_relative_to_the_mean_of_live_rows():
-    sizes = relative_sizes(gaussians_of([0.5, 2.0, 1.0, 1e-9]), 3)
+    sizes = excess_sizes(gaussians_of([0.5, 2.0, 1.0, 1e-9]), 3)
     np.testing.assert_allclose(sizes[:3], [1.0, 2.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(relative_sizes(gaussians_of([1e-4, 1e4, 1.0]), 3), [1.0, 5.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(excess_sizes(gaussians_of([1e-4, 1e4, 1.0]), 3), [1.0, 5.0, 1.0], rtol=1e-6)
 
 
 def test_rates_of_means_follow_a_power_of_the_size():
@@ -39,7 +39,7 @@ def test_rates_of_means_follow_a_power_of_the_size():
 
 @pytest.mark.parametrize(("progress", "factor"), [(0.0, 1.0), (0.6, 1.0), (0.8, 0.55), (1.0, 0.1)])
 def test_all_rates_fall_linearly_in_the_cooldown(progress, factor):
-    rates = {"one": 0.5, "array": jnp.asarray([[2e-3], [1e-3]])}
+    rates = {"one": 0.5, "whole": 2, "array": jnp.asarray([[2e-3], [1e-3]])}
     found = LearningRates(cooldown=0.4).cooled(rates, jnp.float32(progress))
     jax.tree.map(lambda new, old: np.testing.assert_allclose(new, np.asarray(old) * factor, rtol=1e-5), found, rates)
     assert LearningRates().cooled(rates, jnp.float32(progress)) is rates

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from a2tg_jax.core.jit import classes_of
+from a2tg_jax.events import is_addition
 from a2tg_jax.training import Stage, System
 
 PACKAGE = "a2tg_jax"
@@ -125,7 +126,7 @@ def _common_options(system: System) -> list[Any]:
     """Return the options that training reads from the system itself; additions not asked for are left out."""
     own = [(field, getattr(system, field.name)) for field in dataclasses.fields(System)]
     asked = [(field, value) for field, value in own if field.name not in STAGE_OPTIONS and not _is_absent(field, value)]
-    return [(field.name, value) if _is_addition(field) else value for field, value in asked]
+    return [(field.name, value) if is_addition(field) else value for field, value in asked]
 
 
 def _is_equal(a: Stage, b: Stage) -> bool:
@@ -170,12 +171,7 @@ def _described(value: Any) -> Any:
 def _is_absent(field: dataclasses.Field[Any], value: Any) -> bool:
     """Return whether it is a tuple that is empty, as it is by default, or an addition not asked for."""
     is_empty = isinstance(value, tuple) and not value and field.default == ()
-    return is_empty or (_is_addition(field) and value == field.default)
-
-
-def _is_addition(field: dataclasses.Field[Any]) -> bool:
-    """Return whether trainings of earlier versions, which did not know the field, are those with its default."""
-    return bool(field.metadata.get("is_addition", False))
+    return is_empty or (is_addition(field) and value == field.default)
 
 
 def _name_of(value: Any) -> str:

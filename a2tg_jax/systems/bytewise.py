@@ -32,8 +32,8 @@ from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.stage import Stage
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
-OWN_RATES = {"means_by_size": 0.7, "cooldown": 0.4}
-"""Learning rates in which it differs from the other systems."""
+PACE = {"means_by_size": 0.7, "cooldown": 0.4}
+"""Options of learning rates in which it differs from the other systems."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Bytewise(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
-    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(**OWN_RATES))
+    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(**PACE))
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
@@ -159,7 +159,7 @@ class Bytewise(System):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        quick = dataclasses.replace(QUICK_RATES, **OWN_RATES)
+        quick = dataclasses.replace(QUICK_RATES, **PACE)
         return {
             "paper": cls(),
             "quick": cls(**(QUICK | {"rates": quick}), densify=CapConfig(QUICK_CAP)),

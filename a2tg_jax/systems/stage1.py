@@ -146,7 +146,8 @@ def growing_stage(
     params_rate: Any = 0.0,
     name: str = "gaussians",
 ) -> Stage:
-    """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
+    """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned; it does not cool
+    down."""
     return Stage(
         name=name,
         appearance=appearance,

@@ -13,7 +13,7 @@ from a2tg_jax.events import static
 from a2tg_jax.model import Model
 
 COOLED = 0.1
-"""Factor of all learning rates at the end of a cooldown."""
+"""Factor of learning rates at the end of a cooldown."""
 LARGEST_RATIO = 5.0
 """Largest ratio of a Gaussian's size to the mean of all that its learning rate follows."""
 
@@ -41,7 +41,8 @@ class LearningRates:
     """Power p of size in the means' learning rate. Gaussians larger than the mean of all have (size / mean)^p times the
     rate, at most 5^p; 0: the same for all. Sizes and their mean are geometric means."""
     cooldown: float = static(default=0.0, is_addition=True)
-    """Share of the last stage, at its end, in which all learning rates fall linearly to a tenth; 0: they do not."""
+    """Share of a stage, at its end, in which the rates of the Gaussians and of what they show fall linearly to a tenth;
+    0: they do not. The systems of this library cool down in their last stage only."""
 
     def of_gaussians(self, means: Any, sh_degree: int = 3) -> Gaussians:
         """Return one rate per field of the Gaussians, which broadcasts against it.
@@ -63,7 +64,7 @@ class LearningRates:
         """
         if not self.means_by_size:
             return rate
-        return rate * relative_sizes(model.gaussians, model.live_count)[:, None] ** self.means_by_size
+        return rate * excess_sizes(model.gaussians, model.live_count)[:, None] ** self.means_by_size
 
     def cooled(self, rates: Any, progress: Array) -> Any:
         """Return learning rates, a pytree, at a share of the stage: lower ones during the cooldown."""
@@ -71,11 +72,11 @@ class LearningRates:
             return rates
         done = jnp.clip((progress - (1 - self.cooldown)) / self.cooldown, 0.0, 1.0)
         factor = 1 - (1 - COOLED) * done
-        return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate)), rates)
+        return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
 
 
-def relative_sizes(gaussians: Gaussians, num_live: Array | int) -> Array:
-    """Return [N] sizes relative to the geometric mean of the live Gaussians, between 1 and 5.
+def excess_sizes(gaussians: Gaussians, num_live: Array | int) -> Array:
+    """Return [N] ratios of sizes to the geometric mean of the live Gaussians, at least 1 and at most 5.
 
     Args:
       gaussians: N rows.

@@ -177,7 +177,8 @@ def attempt(
     gaussians, params = step.params
     moments: AdamState = step.state
     model = dataclasses.replace(state.model, gaussians=gaussians, params=stage.appearance.project(params))
-    now = Now(keys[1:], iteration, rate, jnp.asarray(clock.num_iterations), scene_scale)
+    cooled = stage.rates.cooled(rate, progress)
+    now = Now(keys[1:], iteration, cooled, jnp.asarray(clock.num_iterations), scene_scale)
     seen = _seen(stage, batch, own, found)
     model, moments, events, info = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
     corrections = tuple(
