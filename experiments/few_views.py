@@ -30,7 +30,7 @@ SCENES = ("fox", "snowmiku", "lego", "herz_jesus_p25")
 WHITE_BEHIND = ("lego",)
 BUDGET = 0.6
 NUM_KEPT, NUM_SCORED, NUM_FOLDS = 24, 12, 5
-FIRST_RATES = {"rates": {"means_by_size": 0.0, "cooldown": 0.0}}
+FIRST_RATES = {"rates": {"cooldown": 0.0}}
 """Learning rates of `bytewise` when the kept figures were measured."""
 WITHOUT_DETAILS = {**FIRST_RATES, "view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
 REFERENCE = "MCMC, degree 0"

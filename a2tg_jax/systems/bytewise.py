@@ -32,8 +32,8 @@ from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.stage import Stage
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
-PACE = {"means_by_size": 0.7, "cooldown": 0.4}
-"""Options of learning rates in which it differs from the other systems."""
+COOLDOWN = 0.4
+"""Share of the second stage in which learning rates fall."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Bytewise(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
-    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(**PACE))
+    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(cooldown=COOLDOWN))
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
@@ -159,7 +159,7 @@ class Bytewise(System):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        quick = dataclasses.replace(QUICK_RATES, **PACE)
+        quick = dataclasses.replace(QUICK_RATES, cooldown=COOLDOWN)
         return {
             "paper": cls(),
             "quick": cls(**(QUICK | {"rates": quick}), densify=CapConfig(QUICK_CAP)),
