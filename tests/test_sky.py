@@ -16,6 +16,7 @@ from a2tg_jax.results.plan import fingerprint, plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages
+from a2tg_jax.training.options import SKY_SYSTEMS
 from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.sky import cell_rays, fibonacci, sky_of, sphere, spread
 from a2tg_jax.training.start import check_start, initial_model
@@ -168,13 +169,22 @@ class TestStart:
             rtol=1e-5,
         )
 
-    @pytest.mark.parametrize("name", SYSTEMS)
-    def test_every_system_forecasts_what_it_starts_from(self, scene, name):
+    @pytest.mark.parametrize("name", SKY_SYSTEMS)
+    def test_systems_forecast_what_they_start_from(self, scene, name):
         few = dataclasses.replace(scene, points=scene.points[::20], colors=scene.colors[::20])
         system = type(a2tg.find_system(name)).preset("smoke", initial_gaussians=None, sky_gaussians=20)
+        system.check()
         model = initial_model(few, system)
         assert model.num == len(few.points) + 20
         assert next(forecast_stages(few, system)).num_rows >= model.num
+
+    @pytest.mark.parametrize("name", sorted(set(SYSTEMS) - set(SKY_SYSTEMS)))
+    @pytest.mark.parametrize("budget", [None, "1MB"])
+    def test_systems_that_would_prune_it_refuse_it(self, name, budget):
+        """Adaptive density control would prune each of its splats after the first reset of opacities."""
+        system = type(a2tg.find_system(name)).preset("smoke", sky_gaussians=20, memory_budget=budget)
+        with pytest.raises(ValueError, match=r"leave out sky_gaussians, .*: a2tg, gaussians-2d-mcmc, .*, bytewise$"):
+            system.check()
 
     def test_trainings_without_a_sky_are_those_of_earlier_versions(self):
         plain, other = mcmc(), mcmc(sky_gaussians=20)
