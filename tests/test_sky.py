@@ -16,8 +16,10 @@ from a2tg_jax.results.plan import fingerprint, plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages
+from a2tg_jax.training.directions import MOST_TRIED, even_directions, fibonacci
+from a2tg_jax.training.options import SKY_SYSTEMS
 from a2tg_jax.training.registry import with_changes
-from a2tg_jax.training.sky import cell_rays, fibonacci, sky_of, sphere, spread
+from a2tg_jax.training.sky import cell_rays, is_bare, sky_of, sphere
 from a2tg_jax.training.start import check_start, initial_model
 
 WIDTH, HEIGHT, NUM = 48, 36, 60
@@ -67,6 +69,11 @@ def directions_of(gaussians, scene) -> np.ndarray:
 
 def changed(scene, **changes):
     return dataclasses.replace(scene, train=tuple(dataclasses.replace(view, **changes) for view in scene.train))
+
+
+def with_cameras(scene, cameras):
+    views = (dataclasses.replace(view, camera=camera) for view, camera in zip(scene.train, cameras, strict=True))
+    return dataclasses.replace(scene, train=tuple(views))
 
 
 def mcmc(**options):
@@ -127,17 +134,34 @@ class TestSky:
         assert weights.min() > 1 and 0.6 * 3 * WIDTH * HORIZON < weights.sum() < 1.1 * 3 * WIDTH * HORIZON
 
 
+def with_lens(camera: a2tg.Camera, has_ray: np.ndarray) -> a2tg.Camera:
+    """The camera with the rays of its pixels, NaN where it has none [H, W]."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.where(has_ray[..., None], np.stack([x, y], axis=-1), np.nan)
+    return dataclasses.replace(camera, rays=jnp.asarray(rays))
+
+
+LEFT = np.tile(np.arange(WIDTH) < WIDTH // 2, (HEIGHT, 1))
+UPPER = np.tile(np.arange(HEIGHT)[:, None] < HORIZON - 4, (1, WIDTH))
+
+
 def test_rays_of_a_lens_are_those_of_its_pixels():
     camera = camera_at(0.0)
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([x, y], axis=-1)
-    rays[:, : WIDTH // 2] = np.nan
     pinhole, spacing = cell_rays(camera)
-    lens, same = cell_rays(dataclasses.replace(camera, rays=jnp.asarray(rays)))
+    lens, same = cell_rays(with_lens(camera, ~LEFT))
     assert same == pytest.approx(spacing, rel=1e-6) and len(pinhole) == WIDTH * HEIGHT
-    has_ray = np.abs(lens) <= 1
-    assert has_ray.mean() == 0.5
+    has_ray = np.abs(lens).max(axis=1) <= 1
+    np.testing.assert_array_equal(has_ray, ~LEFT.ravel())
     np.testing.assert_allclose(lens[has_ray], pinhole[has_ray], atol=1e-6)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1)])
+def test_corners_without_a_ray_are_not_empty(scene, up):
+    camera, points = scene.train[0].camera, scene.points + np.float32([0, 0, 500])
+    pinhole = is_bare(camera, points, np.array(up, np.float64))
+    lens = is_bare(with_lens(camera, ~LEFT), points, np.array(up, np.float64))
+    assert pinhole[LEFT.ravel()].any()
+    np.testing.assert_array_equal(lens, pinhole & ~LEFT.ravel())
 
 
 def test_directions_are_even():
@@ -147,12 +171,42 @@ def test_directions_are_even():
     assert cKDTree(directions).query(directions, k=2)[0][:, 1].min() > 0.8 * np.sqrt(4 * np.pi / 500)
 
 
-def test_directions_are_chosen_among_those_that_are_sky():
-    directions, angle = spread(50, lambda directions: directions[:, 0] > 0.9)
-    assert directions.shape == (50, 3) and (directions[:, 0] > 0.9).all()
-    assert angle == pytest.approx(np.sqrt(2 * np.pi * 0.1 / 50), rel=0.1), "a cap of height 0.1, shared by 50"
-    with pytest.raises(ValueError, match="too few training views see the same part of a sky"):
-        spread(50, lambda directions: np.zeros(len(directions), bool))
+class TestEvenDirections:
+    @pytest.mark.parametrize("height, num", [(0.1, 50), (0.1, 400), (1e-3, 50), (3e-4, 20)])
+    def test_they_fill_a_cap(self, height, num):
+        asked = []
+
+        def is_sky(directions):
+            asked.append(len(directions))
+            return directions[:, 0] > 1 - height
+
+        directions, angle = even_directions(num, is_sky)
+        assert directions.shape == (num, 3) and (directions[:, 0] > 1 - height).all()
+        assert angle == pytest.approx(np.sqrt(2 * np.pi * height / num), rel=0.05), "the cap, shared by all"
+        assert len(asked) <= 5 and asked[0] == 20_000 and asked[-1] < 10 * num
+
+    def test_the_angle_is_right_if_more_are_found_than_asked(self):
+        """What is first found tells too small a share."""
+        sparse = iter([2])
+        directions, angle = even_directions(
+            100, lambda directions: (directions[:, 0] > 0.9) & (np.arange(len(directions)) % next(sparse, 1) == 0)
+        )
+        assert directions.shape == (100, 3)
+        assert angle == pytest.approx(np.sqrt(2 * np.pi * 0.1 / 100), rel=0.05)
+
+    @pytest.mark.parametrize(
+        "num, height, message",
+        [
+            (50, 0.0, "too few training views see the same part of a sky.*: leave out sky_gaussians$"),
+            (50, 1e-6, "too few training views"),
+            (2_000_000, 0.1, r"is 2,000,000, but the sky .* with room for about 9\d,\d{3}: lower sky_gaussians$"),
+        ],
+    )
+    def test_what_has_no_room_is_refused_at_once(self, num, height, message):
+        asked = []
+        with pytest.raises(ValueError, match=message):
+            even_directions(num, lambda directions: asked.append(len(directions)) or directions[:, 0] > 1 - height)
+        assert sum(asked) <= 220_000 < MOST_TRIED
 
 
 class TestStart:
@@ -168,13 +222,22 @@ class TestStart:
             rtol=1e-5,
         )
 
-    @pytest.mark.parametrize("name", SYSTEMS)
-    def test_every_system_forecasts_what_it_starts_from(self, scene, name):
+    @pytest.mark.parametrize("name", SKY_SYSTEMS)
+    def test_systems_forecast_what_they_start_from(self, scene, name):
         few = dataclasses.replace(scene, points=scene.points[::20], colors=scene.colors[::20])
         system = type(a2tg.find_system(name)).preset("smoke", initial_gaussians=None, sky_gaussians=20)
+        system.check()
         model = initial_model(few, system)
         assert model.num == len(few.points) + 20
         assert next(forecast_stages(few, system)).num_rows >= model.num
+
+    @pytest.mark.parametrize("name", sorted(set(SYSTEMS) - set(SKY_SYSTEMS)))
+    @pytest.mark.parametrize("budget", [None, "1MB"])
+    def test_systems_that_would_prune_it_refuse_it(self, name, budget):
+        """Adaptive density control would prune each of its splats after the first reset of opacities."""
+        system = type(a2tg.find_system(name)).preset("smoke", sky_gaussians=20, memory_budget=budget)
+        with pytest.raises(ValueError, match=r"leave out sky_gaussians, .*: a2tg, gaussians-2d-mcmc, .*, bytewise$"):
+            system.check()
 
     def test_trainings_without_a_sky_are_those_of_earlier_versions(self):
         plain, other = mcmc(), mcmc(sky_gaussians=20)
@@ -190,7 +253,10 @@ class TestStart:
                 {"sky_gaussians": 99, "densify": {"cap": 100}},
                 r"room for 2 others among the 100 that training starts from at most; got 99: .* raise densify\.cap$",
             ),
-            ({"sky_gaussians": 60, "initial_gaussians": 60}, "among the 60 .* got 60: lower it, or raise initial_gau"),
+            (
+                {"sky_gaussians": 60, "initial_gaussians": 60},
+                "among the 60 .* got 60: lower sky_gaussians, or raise init",
+            ),
             (
                 {"sky_gaussians": 50, "memory_budget": "10kB", "initial_gaussians": None},
                 "among the 43 .* or raise memory_budget$",
@@ -204,11 +270,28 @@ class TestStart:
     def test_a_scene_without_a_sky_is_refused(self, scene):
         above = np.concatenate([ground(view.camera, np.random.default_rng(0), 0) for view in scene.train])
         full = dataclasses.replace(scene, points=np.concatenate([scene.points, above]))
-        with pytest.raises(ValueError, match=r"--sky-gaussians is 20, but the training views show no sky: \d"):
+        with pytest.raises(ValueError, match=r"^sky_gaussians is 20, but the training views show no sky: \d"):
             check_start(full, mcmc(sky_gaussians=20))
-        masked = changed(scene, mask=np.tile(np.arange(HEIGHT)[:, None] >= HORIZON, (1, WIDTH)))
-        with pytest.raises(ValueError, match=r"the training views show no sky: 0\.0% .*: leave it out"):
-            initial_model(masked, mcmc(sky_gaussians=20))
+        lens = [with_lens(view.camera, ~LEFT) for view in full.train]
+        with pytest.raises(ValueError, match=r"the training views show no sky: 0\.0% .*: leave out sky_gaussians$"):
+            check_start(with_cameras(full, lens), mcmc(sky_gaussians=20))
+
+    def test_masks_that_leave_the_sky_out_are_told_before_training(self, scene):
+        ground_only = np.tile(np.arange(HEIGHT)[:, None] >= HORIZON, (1, WIDTH))
+        masked = changed(scene, mask=ground_only)
+        for start in (check_start, initial_model):
+            with pytest.raises(ValueError, match=r"masks or .* the sky out: 4\d\.\d% .* and 0\.0% counts: leave out"):
+                start(masked, mcmc(sky_gaussians=20))
+        pixels = np.dstack([scene.train[0].image, np.where(ground_only, 255, 0).astype(np.uint8)])
+        with pytest.raises(ValueError, match="alpha channels leave the sky out"):
+            initial_model(changed(scene, picture=pixels), mcmc(sky_gaussians=20))
+        check_start(changed(scene, mask=~ground_only), mcmc(sky_gaussians=20))
+
+    def test_shares_are_of_what_lenses_see(self, scene):
+        lens = [with_lens(view.camera, UPPER) for view in scene.train]
+        masked = changed(with_cameras(scene, lens), mask=np.zeros((HEIGHT, WIDTH), bool))
+        with pytest.raises(ValueError, match=r"the sky out: 100\.0% of"):
+            check_start(masked, mcmc(sky_gaussians=20))
 
     def test_a_first_stage_from_a_file_has_no_sky(self):
         record = RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg(sky_gaussians=20), init="a.ply")

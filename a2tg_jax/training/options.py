@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
+from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.densify.floaters import PruneFloaters
 from a2tg_jax.densify.pruning import during_growth
 from a2tg_jax.events import Event, FieldError, StepEvent, from_options, is_addition, with_names
@@ -155,7 +156,7 @@ class System:
     sky_gaussians: int = dataclasses.field(default=0, metadata={"is_addition": True})
     """Number of the initial Gaussians that start as the sky of an outdoor capture, on a sphere around the cameras,
     where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
-    left out."""
+    left out. `gaussians-2d` and `supergaussians` refuse it: they prune splats of that size."""
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from."""
     memory_budget: float | str | None = None
@@ -309,14 +310,19 @@ class System:
         self._check_learned(stages)
 
     def _check_sky(self, stages: Sequence[Stage]) -> None:
-        """Refuse a sky that leaves no room for the Gaussians at points."""
+        """Refuse a sky that would be pruned for its size, or that leaves no room for the Gaussians at points."""
+        if self.sky_gaussians and any(isinstance(e, CloneSplitPrune) for stage in stages for e in stage.events):
+            raise ValueError(
+                "sky_gaussians are as large as what adaptive density control prunes: leave out sky_gaussians, or take "
+                f"a system that grows otherwise: {', '.join(SKY_SYSTEMS)}"
+            )
         caps = [most for event in stages[0].events if (most := event.most_gaussians) is not None]
         room = min([*caps, self.initial_gaussians or math.inf])
         if self.sky_gaussians and self.sky_gaussians > room - 2:
             names = " and ".join(self.limits()) if room in caps else "initial_gaussians"
             raise ValueError(
                 f"sky_gaussians must leave room for 2 others among the {room:,} that training starts from at most; got "
-                f"{self.sky_gaussians:,}: lower it, or raise {names}"
+                f"{self.sky_gaussians:,}: lower sky_gaussians, or raise {names}"
             )
 
     def _check_learned(self, stages: Sequence[Stage]) -> None:
@@ -412,6 +418,8 @@ BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
 """Options whose place a memory budget takes."""
 LARGEST_GRID = 64
 """Largest number of nodes of a bilateral grid along each of its axes."""
+SKY_SYSTEMS = "a2tg", "gaussians-2d-mcmc", "textured-gaussians", "bbsplat", "bytewise"
+"""Systems of this library that take a sky, for advice."""
 FEW_GAUSSIANS = 100
 """Number of Gaussians below which a memory budget is likely to be a mistake."""
 RANGES = {

@@ -4,7 +4,7 @@ Each view is divided into cells. A cell is empty if no point of the scene projec
 sky if at least a quarter of the views that look there see an empty cell. All of it is on the host.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from a2tg_jax.core.capture import vertical_of
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.training.directions import even_directions
 
 DISTANCE = 10.0
 """Radius of the sphere, in distances of the far points from the cameras' mean."""
@@ -31,14 +32,21 @@ MOST_POINTS = 50_000
 """Number of points beyond which evenly chosen ones stand for all."""
 LEAST_EMPTY = 0.01
 """Smallest share of empty cells."""
-NUMS_TRIED = 20_000, 200_000
-"""Directions all around that tell how much of them is sky; the second number if there is none among the first."""
 LOWEST = -0.2
 """Smallest sine of the angle of the sky above the horizon; hills and buildings may end below it."""
 NOWHERE = 9.0
 """Coordinate of cells without a ray, far from all unit directions."""
-MORE = 1.02
-"""Factor of the number of directions as long as too few are sky."""
+
+
+class Emptiness(NamedTuple):
+    """What is empty in one view; [C] bool of its cells."""
+
+    has_ray: np.ndarray
+    """Whether the lens has a ray there."""
+    is_bare: np.ndarray
+    """Whether the cell has a ray, is above the ground, and no point projects near."""
+    is_empty: np.ndarray
+    """Whether it is bare, and all of its pixels count."""
 
 
 class Cells(NamedTuple):
@@ -50,8 +58,7 @@ class Cells(NamedTuple):
     """Unit directions [C, 3] of the cells' centres in the world."""
     spacing: float
     """Largest distance of neighbours among these."""
-    is_empty: np.ndarray
-    """[C] whether no point projects near, and the photograph counts there."""
+    found: Emptiness
     colors: np.ndarray
     """[C, 3] mean colours in [0, 1]."""
 
@@ -72,9 +79,9 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
     """
     up = up_of(scene)
     cells = [cells_of(view, scene.points, up) for view in scene.train]
-    check_share([view.is_empty for view in cells], num)
+    check_shares([view.found for view in cells], num)
     center, radius = sphere(scene)
-    directions, spacing = spread(num, lambda directions: votes(cells, center + radius * directions)[0])
+    directions, spacing = even_directions(num, lambda directions: votes(cells, center + radius * directions)[0])
     means = center + radius * directions
     colors = votes(cells, means)[1]
     facing = directions * np.where(directions[:, 2:] < 0, -1, 1)  # Splats have two sides.
@@ -92,18 +99,27 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
 
 
 def check_sky(scene: Scene, num: int) -> None:
-    """Raise ValueError if the training views show no sky, whatever their masks are; photographs are not read."""
+    """Raise ValueError if the training views show no sky, or masks leave it out. Photographs are not read, so that
+    alpha channels do not count here."""
     up = up_of(scene)
-    check_share([is_empty(view.camera, scene.points, up) for view in scene.train], num)
+    check_shares([emptiness(view, scene.points, up, counts_of(view)) for view in scene.train], num)
 
 
-def check_share(empty: Sequence[np.ndarray], num: int) -> None:
+def check_shares(views: Sequence[Emptiness], num: int) -> None:
     """Raise ValueError unless enough cells of the views are empty for `num` Gaussians."""
-    share = float(np.mean(np.concatenate(empty)))
-    if share < LEAST_EMPTY:
+    num_cells = sum(view.has_ray.sum() for view in views)
+    bare = sum(view.is_bare.sum() for view in views) / num_cells
+    empty = sum(view.is_empty.sum() for view in views) / num_cells
+    if bare < LEAST_EMPTY:
         raise ValueError(
-            f"--sky-gaussians is {num:,}, but the training views show no sky: {share:.1%} of them is above the horizon "
-            f"and without points, less than {LEAST_EMPTY:.0%}: leave it out"
+            f"sky_gaussians is {num:,}, but the training views show no sky: {bare:.1%} of them is above the horizon "
+            f"and without points, less than {LEAST_EMPTY:.0%}: leave out sky_gaussians"
+        )
+    if empty < LEAST_EMPTY:
+        raise ValueError(
+            f"sky_gaussians is {num:,}, but masks or alpha channels leave the sky out: {bare:.1%} of the training "
+            f"views is above the horizon and without points, and {empty:.1%} counts: leave out sky_gaussians, or take "
+            "masks that keep the sky"
         )
 
 
@@ -119,20 +135,30 @@ def sphere(scene: Scene) -> tuple[np.ndarray, float]:
     return center, DISTANCE * float(np.quantile(distances, FAR_SHARE))
 
 
+def counts_of(view: View) -> np.ndarray:
+    """Return [H, W] whether a pixel counts by its mask."""
+    return np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
+
+
 def cells_of(view: View, points: np.ndarray, up: np.ndarray) -> Cells:
-    """Return the cells of a view; its photograph is read. Arguments as of `is_empty`."""
+    """Return the cells of a view; its photograph is read. Arguments as of `is_bare`."""
     rays, spacing = cell_rays(view.camera)
-    counts = np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
-    pixels = view.picture.read()
+    counts, pixels = counts_of(view), view.picture.read()
     if view.has_alpha:
         counts = counts & (pixels[..., 3] == 255)
-    empty = is_empty(view.camera, points, up) & (_blocks(counts[..., None], view.camera)[:, 0] == 1)
-    center = np.asarray(view.camera.center, np.float64)
-    return Cells(center, cKDTree(rays), spacing, empty, _blocks(pixels[..., :3], view.camera) / 255)
+    found, center = emptiness(view, points, up, counts), np.asarray(view.camera.center, np.float64)
+    return Cells(center, cKDTree(rays), spacing, found, _blocks(pixels[..., :3], view.camera) / 255)
 
 
-def is_empty(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return [C] whether a cell of a view is above the ground, and no point [P, 3] projects near it.
+def emptiness(view: View, points: np.ndarray, up: np.ndarray, counts: np.ndarray) -> Emptiness:
+    """Return what is empty in a view, of which the pixels `counts` [H, W] count. Other arguments as of `is_bare`."""
+    bare = is_bare(view.camera, points, up)
+    is_whole = _blocks(counts[..., None], view.camera)[:, 0] == 1
+    return Emptiness(has_ray(cell_rays(view.camera)[0]), bare, bare & is_whole)
+
+
+def is_bare(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return [C] whether a cell of a view has a ray, is above the ground, and no point [P, 3] projects near it.
 
     Args:
       camera: of the view.
@@ -141,8 +167,15 @@ def is_empty(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
     """
     rays, spacing = cell_rays(camera)
     towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
-    empty: np.ndarray = (cKDTree(towards).query(rays)[0] > REACH * spacing) & (rays @ up > LOWEST)
-    return empty
+    is_far = cKDTree(towards).query(rays)[0] > REACH * spacing
+    bare: np.ndarray = has_ray(rays) & is_far & (rays @ up > LOWEST)
+    return bare
+
+
+def has_ray(rays: np.ndarray) -> np.ndarray:
+    """Return [C] whether cells with the rays [C, 3] of `cell_rays` lie somewhere."""
+    somewhere: np.ndarray = np.any(rays != NOWHERE, axis=1)
+    return somewhere
 
 
 def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
@@ -171,7 +204,8 @@ def votes(cells: Sequence[Cells], positions: np.ndarray) -> tuple[np.ndarray, np
     for view in cells:
         rows, at = _seen(view, positions)
         num_looking[rows] += 1
-        rows, at = rows[view.is_empty[at]], at[view.is_empty[at]]
+        is_empty = view.found.is_empty[at]
+        rows, at = rows[is_empty], at[is_empty]
         num_empty[rows] += 1
         colors[rows] += view.colors[at]
     is_sky = (num_empty > 0) & (num_empty >= LEAST_SHARE * num_looking)
@@ -183,36 +217,6 @@ def _seen(view: Cells, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distances, at = view.tree.query(_units(positions - view.center), distance_upper_bound=REACH / 2 * view.spacing)
     rows = np.flatnonzero(np.isfinite(distances))
     return rows, at[rows]
-
-
-def spread(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return evenly spread unit directions [num, 3] that are sky, and the angle between neighbours.
-
-    Args:
-      num: how many.
-      is_sky: returns [M] bool for directions [M, 3].
-
-    Raises:
-      ValueError: if there is none.
-    """
-    shares = (is_sky(fibonacci(tried)).mean() for tried in NUMS_TRIED)
-    share = next((share for share in shares if share), 0.0)
-    if not share:
-        raise ValueError("--sky-gaussians: too few training views see the same part of a sky: leave it out")
-    total, found = int(num / share), np.zeros((0, 3))
-    while len(found) < num:
-        total = int(MORE * total) + 1
-        found = fibonacci(total)
-        found = found[is_sky(found)]
-    return found[np.linspace(0, len(found) - 1, num).round().astype(int)], float(np.sqrt(4 * np.pi / total))
-
-
-def fibonacci(num: int) -> np.ndarray:
-    """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice."""
-    index = np.arange(num) + 0.5
-    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
 
 def _step(camera: Camera) -> int:
