@@ -117,10 +117,10 @@ def test_views_of_panoramas_have_names_of_their_own(tmp_path, panorama):
     assert all((found.folder / name).is_file() for name in found.names)
 
 
-@pytest.fixture(params=["panoramas", "stereo"])
+@pytest.fixture(params=["panoramas", "refined", "stereo"])
 def rig_scene(request, tmp_path):
-    """Three views at each of five places, of one point or a little apart, named 0/0.png, 0/1.png, ..."""
-    apart = 0.1 if request.param == "stereo" else 0.0
+    """Three views at each of five places, of one point (refined: nearly) or apart, named 0/0.png, 0/1.png, ..."""
+    apart = {"panoramas": 0.0, "refined": 1e-5, "stereo": 0.1}[request.param]
     options = pycolmap().SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=5, num_points3D=9, camera_width=16, camera_height=12,
         camera_model_id=pycolmap().CameraModelId.PINHOLE, camera_params=[16.0, 16.0, 8.0, 6.0],
@@ -144,9 +144,9 @@ def test_the_views_of_a_panorama_are_held_out_together(rig_scene):
         train, test = ([PurePosixPath(view.name).stem for view in views] for views in (made.train, made.test))
         sizes.append((len(train), len(test)))
         common.append(bool({*train} & {*test}))
-    assert sizes == ([(6, 9), (3, 3)] if kind == "panoramas" else [(7, 8), (6, 1)])
+    assert sizes == ([(6, 9), (3, 3)] if kind != "stereo" else [(7, 8), (6, 1)])
     assert common == [kind == "stereo"] * 2
-    if kind == "panoramas":
+    if kind != "stereo":
         one = load_scene(folder, test_every=4)
         assert {view.name for view in one.test} == {f"{camera}/{place}.png" for camera in (1, 2, 3) for place in (1, 5)}
         with pytest.raises(ValueError, match="there is 1 panorama, cut into 3 views"):
