@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from a2tg_jax.data import run_sfm as run_sfm
     from a2tg_jax.data import synthetic_scene as synthetic_scene
     from a2tg_jax.data import view_image as view_image
+    from a2tg_jax.data import with_validation_views as with_validation_views
     from a2tg_jax.densify.clone_split import CloneSplitPrune as CloneSplitPrune
     from a2tg_jax.densify.clone_split import FillingDensity as FillingDensity
     from a2tg_jax.densify.clone_split import OpacityReset as OpacityReset
@@ -173,7 +174,17 @@ _NAMES = {
     "a2tg_jax.core.paths": ("look_at", "path_through", "smooth_path"),
     "a2tg_jax.core.similarity": ("Similarity",),
     "a2tg_jax.core.transform": ("transform_gaussians",),
-    "a2tg_jax.data": ("Mask", "Picture", "Scene", "View", "load_scene", "run_sfm", "synthetic_scene", "view_image"),
+    "a2tg_jax.data": (
+        "Mask",
+        "Picture",
+        "Scene",
+        "View",
+        "load_scene",
+        "run_sfm",
+        "synthetic_scene",
+        "view_image",
+        "with_validation_views",
+    ),
     "a2tg_jax.densify.clone_split": ("CloneSplitPrune", "FillingDensity", "OpacityReset"),
     "a2tg_jax.densify.floaters": ("PruneFloaters",),
     "a2tg_jax.densify.pruning": ("Prune",),

@@ -304,6 +304,7 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
         ):
             start(scene, system)
     check_start(scene, smoke(name, memory_budget="60kB"))
+    check_start(scene, system, num_given=120)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

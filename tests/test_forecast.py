@@ -103,10 +103,24 @@ def test_rows_and_bytes_are_those_that_training_reaches():
     assert (first.num_programs, second.num_programs) == (1, 3)
 
 
+def test_advice_for_splats_of_a_file_is_a_smaller_file():
+    scene, system = scene_of(24, 16), a2tg.A2tg.preset("smoke")
+    own = plan_run({"a": system})
+    with pytest.raises(ValueError, match="change --batch-size, --sh-degree, or a smaller --init file, or allow"):
+        tell_forecast(scene, own, 3 * 10**9, num_given=10**7)
+    found = forecast_run(scene, plan_run({"a": system, "b": a2tg.Gaussians2d.preset("smoke")}), 10**7)
+    assert found.of_file == {"a-gaussians", "a-textures"}
+    gathered = dataclasses.replace(found, gathered={"a-textures": 2.0, "b-gaussians": 1.0})
+    with pytest.raises(ValueError, match="change --sh-degree, or a smaller --init file"):
+        gathered.check_one_device(1)
+    with pytest.raises(ValueError, match=r"change --densify\.cap, --"):
+        dataclasses.replace(gathered, of_file=frozenset()).check_one_device(1)
+
+
 def test_splats_of_a_file_are_forecast_in_place_of_the_first_stage():
     scene, system = scene_of(24, 16), a2tg.A2tg.preset("smoke")
     first, second = forecast_stages(scene, system, 10**6)
-    assert (first.num_rows, first.num_programs, first.seconds, second.num_rows) == (10**6, 0, 0, 10**6)
+    assert (first.num_rows, first.is_trained, first.seconds, second.num_rows) == (10**6, False, 0, 10**6)
     plan = plan_run({"a": system, "b": a2tg.Gaussians2d.preset("smoke")})
     own, given = (forecast_run(scene, plan, num) for num in (None, 10**6))
     assert own.phases.keys() - given.phases.keys() == {"a-gaussians"}

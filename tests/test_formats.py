@@ -26,6 +26,7 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.appearance import Textured
+from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
@@ -274,8 +275,23 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
     with pytest.raises(RuntimeError, match="the second stage"):
         begin_run(record, tmp_path / "run", overwrite=False, progress=False)
     assert read == [tmp_path / "a.ply"]
-    assert told[0][-1] == first_stage.number_given(RunFolder(tmp_path / "run"), record) == 40
+    run, given = RunFolder(tmp_path / "run"), first_stage.given_splats(record)
+    assert told[0][-1] == first_stage.number_given(run, record, given) == 40
     assert len(read) == 1, "a resumed run counts the model of its first stage"
+    run.model("a2tg-gaussians").unlink()
+    monkeypatch.setattr(train, "tell_forecast", lambda *args: told.append(args))
+    monkeypatch.setattr(SceneSource, "load", lambda self, room=None: scene)
+    with pytest.raises(RuntimeError, match="the second stage"):
+        main(["train", "--out", str(run.path), "--resume", "--quiet"])
+    assert told[1][-1] == 40 and len(read) == 2, "a resumed run without that model reads the file once"
+
+
+def test_splats_of_a_file_are_taken_once(tmp_path):
+    save_ply(tmp_path / "a.ply", some_gaussians(40))
+    given = GivenSplats(tmp_path / "a.ply")
+    assert given.splats is given.taken()
+    with pytest.raises(RuntimeError, match="were taken already"):
+        given.splats  # noqa: B018
 
 
 def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):

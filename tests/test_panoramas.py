@@ -1,5 +1,6 @@
 """Panoramas are cut into perspective views that agree with direct renders of the built-in scene."""
 
+import dataclasses
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -8,10 +9,10 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
-from a2tg_jax.data import load_scene, synthetic
+from a2tg_jax.data import load_scene, synthetic, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.panoramas import cut_view, directions, is_panorama, view_size
-from a2tg_jax.data.scene import with_validation_views
+from a2tg_jax.data.scene import split_views, with_validation_views
 
 CENTER = np.array([0.3, -1.2, 1.2])
 WIDTH, FACE = 640, 224
@@ -116,10 +117,10 @@ def test_views_of_panoramas_have_names_of_their_own(tmp_path, panorama):
     assert all((found.folder / name).is_file() for name in found.names)
 
 
-@pytest.fixture(params=["panoramas", "stereo"])
+@pytest.fixture(params=["panoramas", "refined", "stereo"])
 def rig_scene(request, tmp_path):
-    """Three views at each of five places, of one point or a little apart, named 0/0.png, 0/1.png, ..."""
-    apart = 0.1 if request.param == "stereo" else 0.0
+    """Three views at each of five places, of one point (refined: nearly) or apart, named 0/0.png, 0/1.png, ..."""
+    apart = {"panoramas": 0.0, "refined": 1e-5, "stereo": 0.1}[request.param]
     options = pycolmap().SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=5, num_points3D=9, camera_width=16, camera_height=12,
         camera_model_id=pycolmap().CameraModelId.PINHOLE, camera_params=[16.0, 16.0, 8.0, 6.0],
@@ -143,10 +144,17 @@ def test_the_views_of_a_panorama_are_held_out_together(rig_scene):
         train, test = ([PurePosixPath(view.name).stem for view in views] for views in (made.train, made.test))
         sizes.append((len(train), len(test)))
         common.append(bool({*train} & {*test}))
-    assert sizes == ([(6, 9), (3, 3)] if kind == "panoramas" else [(7, 8), (6, 1)])
+    assert sizes == ([(6, 9), (3, 3)] if kind != "stereo" else [(7, 8), (6, 1)])
     assert common == [kind == "stereo"] * 2
-    if kind == "panoramas":
+    if kind != "stereo":
         one = load_scene(folder, test_every=4)
         assert {view.name for view in one.test} == {f"{camera}/{place}.png" for camera in (1, 2, 3) for place in (1, 5)}
         with pytest.raises(ValueError, match="there is 1 panorama, cut into 3 views"):
             with_validation_views(with_validation_views(scene))
+
+
+def test_views_of_one_name_are_views_of_their_own():
+    view = synthetic_scene(num_views=2, width=8, height=6, num_points=9).train[0]
+    panorama = [dataclasses.replace(view, panorama=0)] * 2
+    kept, held_out = split_views([view, *panorama, view, view], 2)
+    assert [one.panorama for one in kept] == [0, 0, None] and [one.panorama for one in held_out] == [None, None]

@@ -14,12 +14,16 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.paths import smooth_path
-from a2tg_jax.data import View, view_image
+from a2tg_jax.data import View, synthetic_scene, view_image
+from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.io.model_file import save_model
 from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics, evaluate
 from a2tg_jax.measure.metrics import psnr
+from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
 from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
+from a2tg_jax.results.held_out import check_held_out
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.images import error_picture, largest_gain, level_colors, side_by_side, to_uint8
 from a2tg_jax.results.plan import plan_run
@@ -32,6 +36,8 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.replacement import OLD, drop_old, set_aside
+from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import (
     ModelResult,
     RunResult,
@@ -436,6 +442,22 @@ def test_history_round_trip(tmp_path):
 
 
 # Pictures
+
+
+def test_views_of_the_training_are_not_scored_as_held_out(tmp_path):
+    scene = synthetic_scene(num_views=4, width=8, height=6, num_points=9)
+    grown = dataclasses.replace(scene, train=scene.train[1:], test=(*scene.test, scene.train[0]))
+    run = create_run(tmp_path / "run")
+    write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", A2tg.preset("smoke")))
+    gaussians = init_from_points(scene.points, scene.colors)
+    save_model(run.model("a2tg-gaussians"), Model(gaussians, origin=origin_of_scene(scene)))
+    told = rf"a2tg-gaussians.npz was trained on 1 view that synthetic now holds out, such as {scene.train[0].name}"
+    with pytest.raises(ValueError, match=told):
+        evaluate_run(run, grown)
+    with pytest.raises(ValueError, match=told):
+        train_run(run, grown, progress=False)
+    check_held_out(Model(gaussians, origin=origin_of_scene(grown)), scene, run.path)
+    check_held_out(Model(gaussians), grown, run.path)
 
 
 def test_largest_gain_finds_the_square():

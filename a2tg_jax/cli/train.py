@@ -21,7 +21,7 @@ from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.host.processes import Place, Team, joined
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.results.first_stage import number_given
+from a2tg_jax.results.first_stage import given_splats, number_given
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
 from a2tg_jax.results.lock import opened
@@ -211,7 +211,8 @@ class Train:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
             check_lenses(scene.train, session.num_devices)
-            tell_forecast(scene, record.plan, most, session.num_devices, number_given(run, record))
+            given = given_splats(record)
+            tell_forecast(scene, record.plan, most, session.num_devices, number_given(run, record, given))
             result = go_on(
                 run,
                 scene,
@@ -220,6 +221,7 @@ class Train:
                 session=session,
                 progress=not self.quiet,
                 tensorboard=self.tensorboard,
+                given=given,
             )
             tell_result(result, self.out)
 

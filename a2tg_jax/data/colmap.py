@@ -1,14 +1,17 @@
 """COLMAP scenes: a sparse model (.bin or .txt) beside a folder of images."""
 
+import dataclasses
 import logging
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.colmap_binary import RECORDS, check_binary
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.colmap_text import check_text
@@ -28,6 +31,8 @@ EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
 """A points3D file with no points in it."""
 POINTS_PLY = "points3D.ply"
 """Points of models without COLMAP's points3D."""
+SAME_PLACE = 1e-3
+"""Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames."""
 
 logger = logging.getLogger(__name__)
 
@@ -69,9 +74,11 @@ def load_colmap(
     shelf = Shelf(room)
     registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
     _log_unregistered(images_folder, len(registered))
+    reach = SAME_PLACE * spacing(registered)
 
     def shoot(image: Any) -> Shot:
-        return _shot(image, lenses[image.camera_id], images_folder, downscale, shelf)
+        shot = _shot(image, lenses[image.camera_id], images_folder, downscale, shelf)
+        return dataclasses.replace(shot, panorama=panorama_of(image, reach))
 
     shots = map_in_threads(shoot, registered)
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
@@ -134,16 +141,31 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
     kept = shelf.keep(pixels, file if pixels is photograph else None)
     depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)
-    return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth, panorama_of(image))
+    return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth)
 
 
-def panorama_of(image: Any) -> int | None:
-    """Return the number of the frame of a pycolmap.Image whose rig looks around from one point; None of others."""
+def spacing(images: Sequence[Any]) -> float:
+    """Return the median distance of a frame of images (pycolmap.Image) to the nearest other one; 0 of one frame."""
+    viewmats = {image.frame_id: viewmat_of(image) for image in images}
+    if len(viewmats) < 2:
+        return 0.0
+    centers = camera_centers(np.stack(list(viewmats.values())))
+    distances, _ = cKDTree(centers).query(centers, k=2)
+    return float(np.median(distances[:, 1]))
+
+
+def panorama_of(image: Any, reach: float = 0.0) -> int | None:
+    """Return the number of the frame of a pycolmap.Image whose rig looks around from one point; None of others.
+
+    Args:
+      image: a registered image.
+      reach: largest distance of a camera from the rig's origin, for what a refinement of the rig leaves of zero.
+    """
     rig = image.frame.rig
     if rig.num_sensors() < 2:
         return None
     poses = rig.non_ref_sensors.values()
-    is_one_point = all(pose is not None and not np.any(pose.translation) for pose in poses)
+    is_one_point = all(pose is not None and np.linalg.norm(pose.translation) <= reach for pose in poses)
     return int(image.frame_id) if is_one_point else None
 
 

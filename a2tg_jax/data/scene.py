@@ -305,7 +305,7 @@ def with_validation_views(scene: Scene) -> Scene:
     Raises:
       ValueError: if there is one training view, or one panorama, only.
     """
-    train, held_out = split(scene.train, VALIDATION_EVERY)
+    train, held_out = split_views(scene.train, VALIDATION_EVERY)
     if not train:
         only = "1" if len(scene.train) == 1 else f"1 panorama, cut into {len(scene.train)} views"
         raise ValueError(f"{scene.name}: validation views are taken from at least 2 training views; there is {only}")
@@ -321,19 +321,19 @@ def check_test_every(test_every: int) -> None:
 def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
     """Return (train, test): test shots are 0, k, 2k, … in order of names; none for k = 0. Shots of a panorama count as
     one."""
-    return split(sorted(shots, key=lambda shot: shot.name), test_every)
+    return split_views(sorted(shots, key=lambda shot: shot.name), test_every)
 
 
-def split(views: Sequence[Held], every: int) -> tuple[list[Held], list[Held]]:
+def split_views(views: Sequence[Held], every: int) -> tuple[list[Held], list[Held]]:
     """Return the views that are kept, and those that are held out: 0, k, 2k, …; none for k = 0.
 
     The views of a panorama count as one. Alone, a held-out view would have training views from the same point.
     """
-    numbers: dict[int | str, int] = {}
+    numbers: dict[tuple[int | None, int], int] = {}
     kept: list[Held] = []
     held_out: list[Held] = []
-    for view in views:
-        number = numbers.setdefault(view.name if view.panorama is None else view.panorama, len(numbers))
+    for index, view in enumerate(views):
+        number = numbers.setdefault((view.panorama, index if view.panorama is None else 0), len(numbers))
         (held_out if every and number % every == 0 else kept).append(view)
     return kept, held_out
 

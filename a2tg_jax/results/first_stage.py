@@ -32,17 +32,20 @@ class GivenSplats:
         """
         self.file = file
         self._splats: Model | None = None
+        self._is_taken = False
 
     @property
     def splats(self) -> Model:
-        """What the file holds."""
+        """What the file holds. After `taken`, there is nothing left to read."""
+        if self._is_taken:
+            raise RuntimeError(f"the splats of {self.file} were taken already")
         if self._splats is None:
             self._splats = load_splats(self.file)
         return self._splats
 
     def taken(self) -> Model:
         """Return the splats, and release them."""
-        splats, self._splats = self.splats, None
+        splats, self._splats, self._is_taken = self.splats, None, True
         return splats
 
 
@@ -51,9 +54,14 @@ def given_splats(record: RunRecord) -> GivenSplats | None:
     return None if record.init is None else GivenSplats(Path(record.init))
 
 
-def number_given(run: RunFolder, record: RunRecord) -> int | None:
-    """Return the number of Gaussians in place of the first stage of a run that was begun; None if it is trained."""
-    given, first = given_splats(record), run.model(record.plan.main[0])
+def number_given(run: RunFolder, record: RunRecord, given: GivenSplats | None) -> int | None:
+    """Return the number of Gaussians in place of the first stage of a run that was begun; None if it is trained.
+
+    Args:
+      run, record: the run folder, and its record.
+      given: its splats, which are read only if the run has not taken them yet.
+    """
+    first = run.model(record.plan.main[0])
     if given is None:
         return None
     return load_model(first).num if first.is_file() else given.splats.num

@@ -55,6 +55,11 @@ OPTIONS = {
     "corrections": "--corrections.grid-size or --downscale",
 }
 """Options to change, by what needs most of the memory; `limits` are those of the systems' number of Gaussians."""
+OPTIONS_OF_FILES = {
+    "model": "--sh-degree, or a smaller --init file",
+    "gradients": "--batch-size, --sh-degree, or a smaller --init file",
+}
+"""Options to change where a file decides on the number of Gaussians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +76,8 @@ class RunForecast:
     """Names of the options that limit the number of Gaussians."""
     gathered: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Bytes on one of several devices at the events on the host, by stage; 0 without such."""
+    of_file: frozenset[str] = frozenset()
+    """Names of the phases whose number of Gaussians is that of a file."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -107,7 +114,7 @@ class RunForecast:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
         advice = (
-            f"change {self._told_options(largest)}, or"
+            f"change {self._told_options(largest, phase)}, or"
             if largest != "program"
             else (f"the program itself takes about {in_bytes(needed.program)} of it:")
         )
@@ -126,12 +133,14 @@ class RunForecast:
         if needed > limit:
             raise ValueError(
                 f"pruning and the growth of textures gather the whole state of {phase} on one device: that takes about "
-                f"{in_bytes(needed)}, and {in_bytes(limit)} may be used: change {self._told_options('model')}, or "
-                "leave these events out"
+                f"{in_bytes(needed)}, and {in_bytes(limit)} may be used: change "
+                f"{self._told_options('model', phase)}, or leave these events out"
             )
 
-    def _told_options(self, largest: str) -> str:
-        """Return the options to change if this part of the memory is the largest."""
+    def _told_options(self, largest: str, phase: str) -> str:
+        """Return the options to change if this part of a phase's memory is the largest."""
+        if phase in self.of_file and largest in OPTIONS_OF_FILES:
+            return OPTIONS_OF_FILES[largest]
         own = (f"--{name.replace('_', '-')}" for name in self.limits if name != "memory_budget")
         return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
 
@@ -148,7 +157,7 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None) -> R
     stages = _stages(scene, plan, num_given)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
-        if not stage.num_programs:
+        if not stage.is_trained:
             continue
         resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
         compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)  # before there are any of these
@@ -164,7 +173,9 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None) -> R
     limits = tuple(dict.fromkeys(name for system in systems for name in system.limits()))
     disk = _disk_bytes(scene, plan, list(stages.values()))
     gathered = {name: stage.gathered_bytes for name, stage in stages.items()}
-    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, gathered)
+    of_file = {name for name in stages if num_given == stages[name].num_rows and plan.begins_like_main(name)}
+    of_file |= {"evaluation"} if of_file == stages.keys() else set()
+    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, gathered, frozenset(of_file))
 
 
 def quick_downscale(longest_side: int) -> int:
@@ -207,7 +218,7 @@ def _training_seconds(scene: Scene, plan: RunPlan, downscale: int, num_given: in
         * planned.system.batch_size
         * iteration_seconds(scene.train, forecasts[planned.name].num_rows, downscale)
         for planned in plan.stages
-        if forecasts[planned.name].num_programs
+        if forecasts[planned.name].is_trained
     )
 
 
@@ -265,7 +276,7 @@ def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) ->
     views = scene.test or scene.train
     pixels = sum(view.camera.width * view.camera.height for view in views)
     num_pictures = 3 + max(1, len(plan.chains) - 1)
-    kept = sum((KEPT_STATES * STATES * (stage.num_programs > 0) + 1) * stage.model_bytes for stage in stages)
+    kept = sum((KEPT_STATES * STATES * stage.is_trained + 1) * stage.model_bytes for stage in stages)
     return kept + PICTURE_PER_PIXEL * num_pictures * pixels
 
 

@@ -60,7 +60,7 @@ def check_new_run(
     scene = record.scene.load(room_for_photographs(max_memory))
     check_lenses(scene.train, num_devices)
     for system in record.systems.values():
-        check_start(scene, system)
+        check_start(scene, system, num_given if system is record.system else None)
     check_room(record, scene, out, num_given)
     warn_of_small_budget(record.system)
     tell_forecast(scene, record.plan, max_memory, num_devices, num_given)

@@ -17,6 +17,7 @@ from a2tg_jax.render import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.corrected import measure_corrected, write_corrections
 from a2tg_jax.results.folder import RunFolder, resuming_command, write_json
+from a2tg_jax.results.held_out import check_held_out
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,
@@ -51,6 +52,7 @@ def evaluate_run(
 
     Raises:
       FileNotFoundError: if no stage is finished, or the scene or the weights are missing.
+      ValueError: if a model was trained on views that the scene holds out.
     """
     record = read_record(run)
     plan = record.plan
@@ -58,6 +60,8 @@ def evaluate_run(
     if not models:
         raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
     scene = scene or record.scene.load()
+    for name, model in models.items():
+        check_held_out(model, scene, run.model(name))
     measured = {
         name: dataclasses.replace(
             _measure(model, scene, plan, plan[name].system, _seconds(run, name), lpips_weights, record.scene.held_out),

@@ -9,8 +9,10 @@ from a2tg_jax.host.machine import this_machine
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.model_file import FORMAT, load_model, save_model
+from a2tg_jax.model import Model
 from a2tg_jax.results.first_stage import GivenSplats, given_splats, write_first_stage
 from a2tg_jax.results.folder import RunFolder, iteration_of
+from a2tg_jax.results.held_out import check_held_out
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
 from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
@@ -125,12 +127,13 @@ class _Training:
             self.events.skip(resume.history)
         resumed = None if resume is None else self.run.checkpoint(planned.name, resume.iteration)
         start = None if planned.start is None else self.run.model(planned.start)
+        model = None if start is None else self._checked_model(start)
         tell_stage(planned.name, resumed, start, num_restored)
         return fit_stage(
             self.scene,
             planned.system,
             planned.index,
-            None if start is None else load_model(start),
+            model,
             resume=resume,
             on_checkpoint=keep,
             checkpoint_every=planned.checkpoint_every,
@@ -141,6 +144,12 @@ class _Training:
             watch=self.watch,
             session=self.session,
         )
+
+    def _checked_model(self, path: Path) -> Model:
+        """Return the model that the stage starts from, unless it was trained on views that are held out now."""
+        model = load_model(path)
+        check_held_out(model, self.scene, path)
+        return model
 
     def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:
         """Save the state before the diverged step, and return the number of the next order of views.

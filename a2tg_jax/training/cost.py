@@ -91,6 +91,11 @@ class StageForecast:
     gathered_bytes: float
     """Bytes on one device while an event on the host changes the state; 0 without such events."""
 
+    @property
+    def is_trained(self) -> bool:
+        """Whether the stage is trained, and no file takes its place."""
+        return self.num_programs > 0
+
 
 def forecast_stages(scene: Scene, system: System, num_given: int | None = None) -> Iterator[StageForecast]:
     """Yield the forecast of each stage of a system (host; nothing is compiled).

@@ -82,16 +82,22 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
     return largest
 
 
-def check_start(scene: Scene, system: System) -> None:
+def check_start(scene: Scene, system: System, num_given: int | None = None) -> None:
     """Refuse a first stage whose events cannot work with the initial number of Gaussians, depth priors of a scene
     without depth maps, and Gaussians of a sky that no view sees.
+
+    Args:
+      scene: its photographs and points.
+      system: with its options.
+      num_given: Gaussians of a file in place of the first stage; None: it is trained.
 
     Raises:
       ValueError: naming the options to change.
     """
-    first, num = system.stages()[0], initial_number(scene, system)
-    with system.naming_options():
-        _rows_needed(first, num, system)
+    num = initial_number(scene, system) if num_given is None else num_given
+    if num_given is None:
+        with system.naming_options():
+            _rows_needed(system.stages()[0], num, system)
     system.check_number(num)
     if any(stage.has_depths for stage in system.stages()):
         check_depths(scene.train)
