@@ -101,8 +101,7 @@ def measured(folder: Path, name: str, use: str) -> dict[str, float]:
     if not (folder / "transforms.json").is_file():
         write_scene(folder, name)
     scene, kept = read_scene(folder, use), read_scene(folder, "keep")
-    rates = {"cooldown": 0.0}  # as they were when the kept figures were measured
-    system = a2tg.Bytewise.preset("quick", memory_budget=BUDGET, rates=rates)
+    system = dataclasses.replace(a2tg.find_system("bytewise").preset("quick"), memory_budget=BUDGET)
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     is_cropped = seen_when_undistorted(name)
     masked = [dataclasses.replace(view, mask=is_cropped & counted(view)) for view in kept.test]

@@ -15,7 +15,6 @@ A configuration file says the same or less; what it leaves out has the value tha
 import dataclasses
 import os
 import shlex
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +24,6 @@ from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.data.scene import scene_name, with_validation_views
-from a2tg_jax.events import is_addition
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -181,30 +179,7 @@ class RunFile:
         Raises:
           ValueError: if there is no such system or preset, or an option is unknown or of another type.
         """
-        system = chosen_system(self.system, self.preset)
-        return with_changes(system, with_additions(self.options, system), f"{where}: options")
-
-
-def with_additions(options: Mapping[str, Any], config: Any) -> dict[str, Any]:
-    """Return options of a file, nested, with those that an earlier version did not know.
-
-    A group that the file gives whole is a record, and its options that were added later have their fields' defaults,
-    whatever a system's own are. Other groups stay as they are.
-
-    Args:
-      options: of the file.
-      config: the system, or a group of its options.
-    """
-    held = {field: getattr(config, field.name) for field in dataclasses.fields(config)}
-    groups = {
-        field.name: with_additions(options[field.name], value)
-        for field, value in held.items()
-        if dataclasses.is_dataclass(value) and isinstance(options.get(field.name), Mapping)
-    }
-    known = [field.name for field, value in held.items() if value is not None and not is_addition(field)]
-    is_whole = all(name in options for name in known)
-    added = {field.name: field.default for field in held if is_whole and is_addition(field)}
-    return {**added, **options, **groups}
+        return with_changes(chosen_system(self.system, self.preset), self.options, f"{where}: options")
 
 
 def label_of(name: str) -> str:

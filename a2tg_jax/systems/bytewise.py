@@ -20,7 +20,6 @@ from a2tg_jax.systems.stage1 import (
     PRUNE_OPTIONS,
     PRUNE_RANGES,
     QUICK,
-    QUICK_RATES,
     SMOKE,
     PruneConfig,
     growing_stage,
@@ -28,12 +27,9 @@ from a2tg_jax.systems.stage1 import (
 )
 from a2tg_jax.texture import MAX_SIDE
 from a2tg_jax.training.options import Ranges, System
-from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.stage import Stage
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
-COOLDOWN = 0.4
-"""Share of the second stage in which learning rates fall."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +78,6 @@ class Bytewise(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
-    rates: LearningRates = dataclasses.field(default_factory=lambda: LearningRates(cooldown=COOLDOWN))
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
@@ -159,11 +154,10 @@ class Bytewise(System):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        quick = dataclasses.replace(QUICK_RATES, cooldown=COOLDOWN)
         return {
             "paper": cls(),
-            "quick": cls(**(QUICK | {"rates": quick}), densify=CapConfig(QUICK_CAP)),
-            "smoke": cls(**(SMOKE | {"rates": quick}), stage2_iterations=120, densify=CapConfig(SMOKE_CAP)),
+            "quick": cls(**QUICK, densify=CapConfig(QUICK_CAP)),
+            "smoke": cls(**SMOKE, stage2_iterations=120, densify=CapConfig(SMOKE_CAP)),
         }
 
     def check(self) -> None:

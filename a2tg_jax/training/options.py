@@ -11,7 +11,7 @@ from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.densify.floaters import PruneFloaters
 from a2tg_jax.densify.pruning import during_growth
-from a2tg_jax.events import Event, FieldError, StepEvent, from_options, is_addition, with_names
+from a2tg_jax.events import Event, FieldError, StepEvent, from_options, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
@@ -440,23 +440,21 @@ RANGES = {
 def like(kind: type[System] | System, other: System) -> System:
     """Return a system of a kind with the options of another that have the same name and type.
 
-    Additions, whose defaults differ between systems, are taken over only where the other has changed them.
-
     Args:
       kind: class or instance that gives all other options.
       other: the other system.
     """
-    changed: System = _like(kind() if isinstance(kind, type) else kind, other, type(other)())
+    changed: System = _like(kind() if isinstance(kind, type) else kind, other)
     return changed
 
 
-def _like(value: Any, other: Any, usual: Any) -> Any:
+def _like(value: Any, other: Any) -> Any:
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
     changes = {}
     for field in dataclasses.fields(value):
-        own, others, before = (getattr(config, field.name, None) for config in (value, other, usual))
+        own, others = getattr(value, field.name), getattr(other, field.name, None)
         if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
-            changes[field.name] = _like(own, others, before)
-        elif hints[field.name] == other_hints.get(field.name) and not (is_addition(field) and others == before):
+            changes[field.name] = _like(own, others)
+        elif hints[field.name] == other_hints.get(field.name):
             changes[field.name] = others
     return dataclasses.replace(value, **changes)
