@@ -20,10 +20,11 @@ from PIL import Image
 from a2tg_jax.cli import doctor
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import train_defaults
+from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish.compaction import measure_choices
 from a2tg_jax.host import startup
 from a2tg_jax.io.compact import load_compact
-from a2tg_jax.io.model_file import load_model
+from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import compression, finishing, frames, run_training
@@ -442,6 +443,11 @@ def test_validation_views_take_the_place_of_test_views(tiny_run, tmp_path, capsy
     record = dataclasses.replace(read_record(run), scene=SceneSource("synthetic", 5, validation=True))
     write_record(copy, record)
     assert read_record(copy) == record and train_defaults(["--config", str(copy.record)]).validation
+    assert cli.main(["eval", str(copy.path)]) == 2
+    assert "was trained on 3 views that synthetic now holds out" in capsys.readouterr().err
+    origin = origin_of_scene(record.scene.load())
+    for file in (copy.path / "models").glob("*.npz"):
+        save_model(file, dataclasses.replace(load_model(file), origin=origin))
     assert cli.main(["eval", str(copy.path)]) == 0
     assert "validation PSNR (dB)" in capsys.readouterr().out
     per_view = json.loads(copy.per_view.read_text())["a2tg-textures"]
