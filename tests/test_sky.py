@@ -186,7 +186,7 @@ class TestEvenDirections:
         assert len(asked) <= 5 and asked[0] == 20_000 and asked[-1] < 10 * num
 
     def test_the_angle_is_right_if_more_are_found_than_asked(self):
-        """What is first found tells too small a share."""
+        """The first directions that are found tell too small a share."""
         sparse = iter([2])
         directions, angle = even_directions(
             100, lambda directions: (directions[:, 0] > 0.9) & (np.arange(len(directions)) % next(sparse, 1) == 0)

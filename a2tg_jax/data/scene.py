@@ -155,7 +155,7 @@ class PointCloud:
 
 
 Held = TypeVar("Held", Shot, View)
-"""What is held out."""
+"""A photograph before or after its view is made."""
 
 
 def check_are_views(views: Sequence[View], call: str) -> None:

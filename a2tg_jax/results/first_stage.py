@@ -36,7 +36,7 @@ class GivenSplats:
 
     @property
     def splats(self) -> Model:
-        """What the file holds. After `taken`, there is nothing left to read."""
+        """The splats of the file. Reading them after `taken` is an error."""
         if self._is_taken:
             raise RuntimeError(f"the splats of {self.file} were taken already")
         if self._splats is None:

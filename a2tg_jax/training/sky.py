@@ -39,7 +39,7 @@ NOWHERE = 9.0
 
 
 class Emptiness(NamedTuple):
-    """What is empty in one view; [C] bool of its cells."""
+    """Cells of one view without points, [C] bool."""
 
     has_ray: np.ndarray
     """Whether the lens has a ray there."""
