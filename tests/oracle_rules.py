@@ -59,6 +59,15 @@ def glossy(scene: Scene, params: dict[str, Float], i: int, has_low_pass: bool = 
     return hits, Shown(opacity * falloff(hits.rho), residual, np.inf, np.inf, is_relevant)
 
 
+def shaped(scene: Scene, params: dict[str, Float], i: int) -> tuple[Hits, Shown]:
+    """A generalised Gaussian: the exponent of the falloff grows as (ρ + δ)^β, from 0 at ρ = 0 to 1 at ρ = 2."""
+    hits, exponent, delta = hits_of(scene, i), np.exp(np.tanh(params["shapes"][i])), 0.02
+    growth = lambda rho: (rho + delta) ** exponent - delta**exponent  # noqa: E731
+    alpha = lambda rho: sigmoid(scene.logit_opacities[i]) * np.exp(-growth(rho) / growth(2.0))  # noqa: E731
+    is_relevant = alpha(hits.closest_rho) >= 0.99 * MIN_ALPHA
+    return hits, Shown(alpha(hits.rho), np.zeros((*hits.u.shape, 3)), np.inf, np.inf, is_relevant)
+
+
 def movable(scene: Scene, params: dict[str, Float], i: int) -> tuple[Hits, Shown]:
     """SuperGaussians: four kernels, each 10⁻⁴ + exp(−k·distance²), of (u, v) at the hit."""
     hits, opacities = hits_of(scene, i), sigmoid(params["logit_opacities"][i])

@@ -8,7 +8,7 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from test_oracle import FACING, FOCAL, hand_scene
 
 from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appearance, save_model
-from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Textured, appearance_for
+from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Shaped, Textured, appearance_for
 from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.gaussians import logit
@@ -20,6 +20,7 @@ APPEARANCES = {
     "textured": Textured(start=(2, 3)),
     "movable kernels": MovableKernels(),
     "billboards": Billboards(side=5),
+    "shaped": Shaped(Textured(start=(2, 3))),
 }
 
 
@@ -58,7 +59,7 @@ def test_models_are_saved_with_what_they_show(name, tmp_path):
     np.testing.assert_array_equal(loaded.render(camera).color, expected)
 
 
-@pytest.mark.parametrize("name", ["textured", "movable kernels", "billboards"])
+@pytest.mark.parametrize("name", ["textured", "movable kernels", "billboards", "shaped"])
 def test_rows_move_and_are_cleared(name):
     appearance = APPEARANCES[name]
     _, params, layout = allocated(appearance)
@@ -83,7 +84,7 @@ def test_parameters_are_of_the_gaussians_dtype(name):
 
 def test_floats_of_a_splat():
     floats = {name: appearance.num_floats(allocated(appearance)[2], 10) for name, appearance in APPEARANCES.items()}
-    assert floats == {"plain": 0, "textured": 240, "movable kernels": 270, "billboards": 990}
+    assert floats == {"plain": 0, "textured": 240, "movable kernels": 270, "billboards": 990, "shaped": 250}
     assert Billboards().num_floats((), 1) == 1081 - 58
     assert MovableKernels().num_published_floats((), 1) == 74 - 58
 
@@ -125,7 +126,7 @@ def test_billboards_end_one_texel_beyond_the_border(side):
     assert np.count_nonzero(alpha) == {3: 16, 5: 12}[side]
 
 
-@pytest.mark.parametrize("name", ["plain", "movable kernels", "billboards"])
+@pytest.mark.parametrize("name", ["plain", "movable kernels", "billboards", "shaped"])
 def test_limited_opacities(name):
     appearance = APPEARANCES[name]
     gaussians, params, layout = allocated(appearance)
@@ -220,6 +221,8 @@ CAPABILITIES = {
     Own(): (False, True, TextureOptions(), True),
     MovableKernels(): (False, False, None, False),
     Billboards(): (False, False, None, False),
+    Shaped(): (False, True, None, True),
+    Shaped(Textured((2, 3))): (False, True, TextureOptions(), True),
 }
 """is_portable, is_linear, texture_options, has_own_opacities."""
 

@@ -57,6 +57,26 @@ def test_the_highest_degree_is_kept(scene):
     assert set(np.unique(model.layout.bands.degrees)) == {0, 1}
 
 
+def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_path):
+    options = {"view_dependence": {"share": 0.1}, "texture": {"share": 0.05}}
+    system = smoke(kernel={"rate": 0.02}, **options)
+    first = a2tg.fit_stage(scene, system, 0, progress=False).model
+    before = np.asarray(first.appearance.shapes(first.params))
+    assert before.std() > 0.02 and before.max() > 0 > before.min()
+    resting = a2tg.fit_stage(scene, with_changes(system, {"kernel": {"rate": 1e-9}}, "test"), 1, first, progress=False)
+    after = resting.model.appearance.shapes(resting.model.params)
+    np.testing.assert_allclose(after, before, atol=1e-6, err_msg="the second stage goes on from the first one's shapes")
+    result = a2tg.fit_stage(scene, system, 1, first, progress=False)
+    model = result.model
+    assert np.median(np.abs(np.asarray(model.appearance.shapes(model.params)) - before)) > 0.01
+    assert result.history.megabytes.max() <= 0.04 and 0.995 * 40_000 <= model.num_bytes <= 40_000
+    assert first.num == a2tg.fit_stage(scene, smoke(**options), 0, progress=False).model.num * 52 // 56
+    a2tg.save_model(tmp_path / "model.npz", model)
+    camera = scene.test[0].camera
+    again = a2tg.load_model(tmp_path / "model.npz").render(camera).color
+    np.testing.assert_array_equal(again, model.render(camera).color)
+
+
 def test_without_a_budget_the_cap_says_how_many_bytes():
     system = dataclasses.replace(Bytewise.preset("quick"), memory_budget=None)
     degrees, textures = system.stages()[1].events
@@ -79,6 +99,7 @@ def test_beside_another_system_it_stays_what_it_is():
         ({"texture": {"share": 1.5}}, "texture.share must lie in 0..1; got 1.5"),
         ({"view_dependence": {"share": -0.1}}, "view_dependence.share must lie in 0..1; got -0.1"),
         ({"texture": {"rate": -1.0}}, "texture.rate must lie in 0..inf"),
+        ({"kernel": {"rate": -1.0}}, "kernel.rate must lie in 0..inf"),
         ({"texture": {"cap": 32}}, "texture.cap must lie in 1..16; got 32"),
         ({"view_dependence": {"idle": -1.0}}, "view_dependence.idle must lie in 0..inf"),
         ({"sh_degree": 4}, "sh_degree must lie in 0..3"),

@@ -9,7 +9,7 @@ import pytest
 from scenes_random import as_gaussians, draw_scene
 
 from a2tg_jax import adam_init, adam_update, concatenate, value_and_grad
-from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Textured
+from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Shaped, Textured
 from a2tg_jax.appearance.sh_bands import split_sh
 from a2tg_jax.model import Model
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
@@ -48,6 +48,8 @@ APPEARANCES = {
     "movable kernels": MovableKernels(),
     "billboards": Billboards(side=3),
     "banded": Banded(Textured(start=(1, 2))),
+    "shaped": Shaped(),
+    "banded, shaped": Banded(Shaped(Textured(start=(1, 2)))),
 }
 
 

@@ -18,7 +18,8 @@ from test_render import errors
 from test_render_gradients import CLEARANCE, assert_gradients_close, differences, draw_weights
 
 from a2tg_jax import Camera, RenderSettings, Textures, render_appearance
-from a2tg_jax.appearance import AppearanceRule, Billboards, MovableKernelParams, MovableKernels, PlainRule
+from a2tg_jax.appearance import AppearanceRule, Billboards, MovableKernelParams, MovableKernels, PlainRule, Shaped
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.render import render_traced
 from a2tg_jax.texture import plan_layout
@@ -87,6 +88,14 @@ def kernel_rule(params: dict):
     return MovableKernels().rule(MovableKernelParams(**jax.tree.map(jnp.asarray, params)), ())
 
 
+def shaped_params(num: int, dtype="float64") -> dict[str, np.ndarray]:
+    return rounded({"shapes": np.random.default_rng(1).normal(scale=1.5, size=num)}, dtype)
+
+
+def shaped_rule(params: dict):
+    return Shaped().rule(ShapedParams(jnp.asarray(params["shapes"]), ()), ShapedLayout(()))
+
+
 def billboard_params(num: int, dtype="float64") -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
     alpha = rng.uniform(0.1, 0.9, (num, SIDE, SIDE, 1))
@@ -123,6 +132,7 @@ CASES = {
         1,
         0.7,
     ),
+    "shaped": Case(shaped_params, shaped_rule, oracle_rules.shaped, True, 53),
     "movable kernels": Case(kernel_params, kernel_rule, oracle_rules.movable, False, 1),
     "billboards": Case(billboard_params, billboard_rule, oracle_rules.billboard, False, 0),
 }

@@ -11,7 +11,7 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax import Model, load_model, load_ply, plan_render, save_model, save_ply
-from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels, Plain, Textured
+from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels, Plain, Shaped, Textured
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.appearance.sh_bands import allocate_bands, dense_sh, gather_bands, reallocate_bands, split_sh
 from a2tg_jax.core.budget import within_budget
@@ -97,7 +97,9 @@ def test_gradients_are_those_of_the_dense_coefficients():
     np.testing.assert_allclose(of_gaussians.means, expected.means, atol=1e-10)
 
 
-@pytest.mark.parametrize("inner", [Plain(), Textured((2, 1)), Textured((0, 0)), MovableKernels(), Billboards(3)])
+@pytest.mark.parametrize(
+    "inner", [Plain(), Textured((2, 1)), Textured((0, 0)), MovableKernels(), Billboards(3), Shaped()]
+)
 def test_whatever_else_is_shown_is_as_without(inner, tmp_path):
     model, plain, camera = banded(3, inner=inner)
     expected = plain.render(camera).color

@@ -2,7 +2,7 @@
 
 `rule` and `base` are these two interfaces. `base` is made of two small ones: `rows`, which densification calls, and
 `stored`, which files call. `plain`, `textured`, `movable_kernels` and `billboards` implement all of them. `banded` adds
-view dependence to any appearance, and `around` forwards the rest to it.
+view dependence to any appearance and `shaped` the shape of the kernel; `around` forwards the rest to it.
 """
 
 from a2tg_jax.appearance.around import AppearanceAround as AppearanceAround
@@ -28,6 +28,8 @@ from a2tg_jax.appearance.rule_check import Arguments as Arguments
 from a2tg_jax.appearance.rule_check import check_shading as check_shading
 from a2tg_jax.appearance.rule_check import elementwise_rule as elementwise_rule
 from a2tg_jax.appearance.rule_check import takes_arrays as takes_arrays
+from a2tg_jax.appearance.shaped import Shaped as Shaped
+from a2tg_jax.appearance.shaped import ShapedRates as ShapedRates
 from a2tg_jax.appearance.textured import TexelRates as TexelRates
 from a2tg_jax.appearance.textured import Textured as Textured
 from a2tg_jax.appearance.textured import TexturedRule as TexturedRule

@@ -109,6 +109,12 @@ class AppearanceAround(Appearance):
         inner, inner_layout = self.inner.with_bands(params.inner, layout.inner, bands, owners)
         return params._replace(inner=inner), layout._replace(inner=inner_layout)
 
+    def shapes(self, params: Any) -> Array | None:
+        return self.inner.shapes(params.inner)
+
+    def with_shapes(self, params: Any, shapes: Array) -> Any:
+        return params._replace(inner=self.inner.with_shapes(params.inner, shapes))
+
     def arrays(self, params: Any, layout: Any) -> dict[str, np.ndarray]:
         """Return the arrays of the wrapped appearance, as `inner.NAME`."""
         arrays = self.inner.arrays(params.inner, layout.inner)

@@ -93,3 +93,11 @@ class Appearance(MovableRows, StoredArrays):
     def with_bands(self, params: Any, layout: Any, bands: Bands, owners: BandLayout) -> tuple[Any, Any]:
         """Return parameters and layout with other coefficients; unchanged without degrees."""
         return params, layout
+
+    def shapes(self, params: Any) -> Array | None:
+        """Return the shapes [N] of the kernels; None if all are Gaussians."""
+        return None
+
+    def with_shapes(self, params: Any, shapes: Array) -> Any:
+        """Return parameters with other shapes of the kernels; unchanged without shapes."""
+        return params

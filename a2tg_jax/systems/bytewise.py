@@ -6,7 +6,17 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Banded, BandedRates, Plain, TexelRates, Textured, TextureOptions
+from a2tg_jax.appearance import (
+    Appearance,
+    Banded,
+    BandedRates,
+    Plain,
+    Shaped,
+    ShapedRates,
+    TexelRates,
+    Textured,
+    TextureOptions,
+)
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
@@ -38,6 +48,14 @@ class CapConfig:
 
     cap: int = 2_000_000
     """Size of the model, as a number of Gaussians without view dependence and textures."""
+
+
+@dataclasses.dataclass(frozen=True)
+class KernelConfig:
+    """Shapes of the kernels."""
+
+    rate: float = 0.0
+    """Adam's learning rate of the shapes, 0.01 is good; 0: all kernels are Gaussians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +100,7 @@ class Bytewise(System):
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
     prune: PruneConfig = dataclasses.field(default_factory=PruneConfig)
+    kernel: KernelConfig = dataclasses.field(default_factory=KernelConfig)
     view_dependence: ViewDependenceConfig = dataclasses.field(default_factory=ViewDependenceConfig)
     texture: DetailTextureConfig = dataclasses.field(default_factory=DetailTextureConfig)
 
@@ -104,8 +123,8 @@ class Bytewise(System):
 
     def stages(self) -> tuple[Stage, ...]:
         shown, rates = self._appearance()
-        plain = Plain(self.texture.lookup.max_alpha)
-        first = growing_stage(self, self.stage1_iterations, self._growth(), plain)
+        plain, plain_rates = self._shaped(Plain(self.texture.lookup.max_alpha), 0.0)
+        first = growing_stage(self, self.stage1_iterations, self._growth(), plain, plain_rates)
         return first, later_stage(self, "details", shown, self._details(), self.stage2_iterations, rates)
 
     def _growth(self) -> tuple[Event, ...]:
@@ -121,24 +140,38 @@ class Bytewise(System):
 
     def _num_gaussians(self) -> int:
         """Return the number of Gaussians that fill all bytes."""
-        num = self.budget_cap()
+        num = self.budget_cap(self._floats_of_kernel)
         return self.densify.cap if num is None else num
 
     def _num_kept(self) -> int:
         """Return the number of Gaussians that fit beside degrees and texels."""
-        return math.floor(self._num_bytes() * (1 - self._share) / bytes_per_gaussian(self.base_degree))
+        return math.floor(self._num_bytes() * (1 - self._share) / self._own_bytes)
 
     def _num_bytes(self) -> int:
         """Return the bytes of the finished model."""
-        own = int(bytes_per_gaussian(self.base_degree))
-        return self.densify.cap * own if self.budget_bytes is None else self.budget_bytes
+        return self.densify.cap * self._own_bytes if self.budget_bytes is None else self.budget_bytes
 
-    def _appearance(self) -> tuple[Banded, BandedRates]:
+    @property
+    def _own_bytes(self) -> int:
+        """Bytes of a Gaussian without degrees and texels."""
+        return int(bytes_per_gaussian(self.base_degree, self._floats_of_kernel))
+
+    @property
+    def _floats_of_kernel(self) -> int:
+        """Floats of a Gaussian for the shape of its kernel."""
+        return 1 if self.kernel.rate else 0
+
+    def _appearance(self) -> tuple[Appearance, BandedRates]:
         """Textures that are empty at first, if there are any, and rates of all that is shown."""
         lookup = self.texture.lookup
         inner: Any = Textured((0, 0), lookup) if self.texture.share else Plain(lookup.max_alpha)
         of_texels = TexelRates(self.texture.rate, 0.0) if self.texture.share else 0.0
-        return Banded(inner), BandedRates(self.view_dependence.rate, of_texels)
+        shaped, of_inner = self._shaped(inner, of_texels)
+        return Banded(shaped), BandedRates(self.view_dependence.rate, of_inner)
+
+    def _shaped(self, inner: Appearance, rates: Any) -> tuple[Appearance, Any]:
+        """Return an appearance and its rates with shapes of the kernels, if they are trained."""
+        return (Shaped(inner), ShapedRates(self.kernel.rate, rates)) if self.kernel.rate else (inner, rates)
 
     def _details(self) -> tuple[Event, ...]:
         """Return the events of degrees, up to their share of the bytes, then of texels for the rest."""
@@ -165,6 +198,7 @@ class Bytewise(System):
         view, texture = self.view_dependence, self.texture
         ranges = {
             "base_degree": (self.base_degree, 0, self.sh_degree),
+            "kernel.rate": (self.kernel.rate, 0, math.inf),
             "view_dependence.share": (view.share, 0, 1),
             "view_dependence.rate": (view.rate, 0, math.inf),
             "view_dependence.idle": (view.idle, 0, math.inf),

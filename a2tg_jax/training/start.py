@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
@@ -134,8 +135,8 @@ def num_rows(stage: Stage, num: int) -> int:
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
     """Return the model with the appearance of a stage and with spare rows for its events.
 
-    If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew. The number of
-    devices divides that of the rows.
+    If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew, but for the
+    shapes of kernels. The number of devices divides that of the rows.
 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
@@ -147,6 +148,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     if model.appearance != stage.appearance or room > num:
         key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS)
         params, layout = stage.appearance.allocate(key, gaussians)
+        params = _with_known_shapes(stage.appearance, params, model)
     if model.appearance == stage.appearance and room > num:
         leaves = zip(jax.tree.leaves(params), jax.tree.leaves(model.params), strict=False)
         if _rows_of(params) != _rows_of(model.params) or any(len(new) < len(old) for new, old in leaves):
@@ -155,6 +157,12 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
             )
         params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
     return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+
+
+def _with_known_shapes(appearance: Appearance, params: Any, model: Model) -> Any:
+    """Return new parameters with the shapes of the model's kernels, if both have shapes."""
+    new, old = appearance.shapes(params), model.appearance.shapes(model.params)
+    return params if new is None or old is None else appearance.with_shapes(params, new.at[: len(old)].set(old))
 
 
 def _rows_of(params: Any) -> Any:

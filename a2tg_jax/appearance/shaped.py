@@ -1,0 +1,187 @@
+"""Kernels with a shape per Gaussian, in place of the Gaussian falloff of any other appearance.
+
+A generalised Gaussian has an exponent β: β = 1 is the Gaussian, a larger one is flat in the middle and ends at an edge,
+a smaller one is peaked and has long tails (GES, Hamdi et al., 2024). At squared distance ρ, in standard deviations, the
+falloff is
+
+    exp(−((ρ + δ)^β − δ^β) / ((2 + δ)^β − δ^β)),   δ = 0.02
+
+which is 1 at the centre and 1/e at ρ = 2 for every β, as a Gaussian's is. δ keeps the slope at the centre finite.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance.around import AppearanceAround
+from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.plain import Plain
+from a2tg_jax.appearance.rule import Factor, Residual, RuleAround
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.gaussians import Gaussians
+
+SHAPES = "shapes"
+"""Name of the shapes in files."""
+OFFSET = 0.02
+"""δ, in squared standard deviations."""
+LARGEST_LOG_EXPONENT = 1.0
+"""Largest logarithm of an exponent, and of its inverse."""
+LARGEST_RHO = 1e6
+"""Squared distance beyond which the falloff is 0 in any case; its powers stay finite up to there."""
+
+
+class ShapedParams(NamedTuple):
+    """Shapes of the kernels, and the parameters of the inner appearance."""
+
+    shapes: Array
+    """[N] shapes s of the exponents exp(tanh s); 0 is a Gaussian."""
+    inner: Any
+
+
+class ShapedLayout(NamedTuple):
+    """The layout of the inner appearance."""
+
+    inner: Any
+
+
+class ShapedRates(NamedTuple):
+    """Learning rates of the shapes and of the inner appearance."""
+
+    shapes: Any
+    inner: Any = 0.0
+
+
+class Curve(NamedTuple):
+    """The exponent of the falloff as a function of ρ: scale·((ρ + δ)^β − start)."""
+
+    exponents: Array
+    """β [N]."""
+    scales: Array
+    """[N] inverse of its increase from ρ = 0 to 2, so that it is 1 there."""
+    starts: Array
+    """[N] δ^β."""
+
+
+def exponents_of(shapes: Array) -> Array:
+    """Return the exponents β = exp(tanh s), in (1/e, e), of shapes."""
+    return jnp.exp(LARGEST_LOG_EXPONENT * jnp.tanh(shapes))
+
+
+def curves_of(shapes: Array) -> Curve:
+    """Return the curves of shapes [N]."""
+    exponents = exponents_of(shapes)
+    starts = jnp.exp(exponents * np.log(OFFSET))
+    return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ShapedRule(RuleAround):
+    """Another rule, with a kernel of its own shape for each splat."""
+
+    shapes: Array
+    """[N]."""
+
+    def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
+        """Return the numbers of the inner rule, followed by the curve."""
+        return jnp.concatenate(
+            [self.inner.numbers(gaussians, camera), jnp.stack(curves_of(self.shapes), axis=1)], axis=1
+        )
+
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
+        return self.inner.shade(numbers[: -len(Curve._fields)], values, u, v)
+
+    def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
+        curve = Curve(*numbers[-len(Curve._fields) :])
+        rho = jnp.minimum(rho, LARGEST_RHO)
+        return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
+
+    def cutoff(self, opacities: Array) -> Array:
+        # The inner bound, of a Gaussian, says at which exponent of the falloff alpha is below 1/255.
+        curve, bound = curves_of(self.shapes), self.inner.cutoff(opacities)
+        reach = jnp.maximum(bound, 0.0) / (2 * curve.scales) + curve.starts
+        return jnp.where(bound > 0, jnp.exp(jnp.log(reach) / curve.exponents) - OFFSET, bound)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shaped(AppearanceAround):
+    """Appearance with a kernel of its own shape for each Gaussian, around `Plain` or `Textured`; `Banded` goes around
+    it."""
+
+    inner: Appearance = dataclasses.field(default_factory=Plain)
+
+    @property
+    def base(self) -> Appearance:
+        return self
+
+    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[ShapedParams, ShapedLayout]:
+        """Return Gaussians around the parameters of the inner appearance."""
+        params, layout = self.inner.allocate(key, gaussians)
+        return ShapedParams(jnp.zeros(gaussians.num, gaussians.means.dtype), params), ShapedLayout(layout)
+
+    def rule(self, params: ShapedParams, layout: ShapedLayout) -> ShapedRule:
+        return ShapedRule(self.inner.rule(params.inner, layout.inner), params.shapes)
+
+    def rates(self, rate: Any, params: ShapedParams) -> ShapedParams:
+        """Return the rates of `ShapedRates`."""
+        return ShapedParams(rate.shapes, self.inner.rates(rate.inner, params.inner))
+
+    def num_floats(self, layout: ShapedLayout, num: int) -> int:
+        return num + self.inner.num_floats(layout.inner, num)
+
+    def gather(self, params: ShapedParams, layout: ShapedLayout, rows: Array) -> ShapedParams:
+        gathered: ShapedParams = super().gather(params, layout, rows)._replace(shapes=params.shapes[rows])
+        return gathered
+
+    def clear(self, params: ShapedParams, layout: ShapedLayout, is_cleared: Array) -> ShapedParams:
+        shapes = jnp.where(is_cleared, jnp.zeros_like(params.shapes), params.shapes)
+        cleared: ShapedParams = super().clear(params, layout, is_cleared)._replace(shapes=shapes)
+        return cleared
+
+    def first_rows(self, params: ShapedParams, layout: ShapedLayout, num: int) -> tuple[ShapedParams, ShapedLayout]:
+        params, layout = super().first_rows(params, layout, num)
+        return params._replace(shapes=params.shapes[:num]), layout
+
+    def take_rows(
+        self, params: ShapedParams, layout: ShapedLayout, rows: np.ndarray
+    ) -> tuple[ShapedParams, ShapedLayout]:
+        params, layout = super().take_rows(params, layout, rows)
+        return params._replace(shapes=params.shapes[rows]), layout
+
+    def joined(self, parts: Sequence[tuple[ShapedParams, ShapedLayout]]) -> tuple[ShapedParams, ShapedLayout]:
+        shapes = jnp.concatenate([params.shapes for params, _ in parts])
+        params, layout = super().joined(parts)
+        return params._replace(shapes=shapes), layout
+
+    def shapes(self, params: ShapedParams) -> Array:
+        return params.shapes
+
+    def with_shapes(self, params: ShapedParams, shapes: Array) -> ShapedParams:
+        return params._replace(shapes=shapes)
+
+    def check(self, params: ShapedParams, layout: ShapedLayout, gaussians: Gaussians) -> None:
+        if params.shapes.shape != (gaussians.num,):
+            raise ValueError(
+                f"shapes must be [{gaussians.num}], one for each Gaussian; got {list(params.shapes.shape)}"
+            )
+        super().check(params, layout, gaussians)
+
+    def arrays(self, params: ShapedParams, layout: ShapedLayout) -> dict[str, np.ndarray]:
+        """Return `shapes` [N], and the inner appearance's arrays as `inner.NAME`."""
+        return {SHAPES: np.asarray(params.shapes)} | super().arrays(params, layout)
+
+    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[ShapedParams, ShapedLayout]:
+        if SHAPES not in arrays:
+            raise ValueError(f"the array {SHAPES} of {type(self).__name__} is missing")
+        shapes = arrays[SHAPES]
+        if shapes.ndim != 1 or not np.issubdtype(shapes.dtype, np.floating):
+            raise ValueError(f"{SHAPES} must be floats [N]; got {shapes.dtype}{list(shapes.shape)}")
+        params, layout = self.inner_from_arrays(arrays)
+        return ShapedParams(jnp.asarray(shapes), params), ShapedLayout(layout)
