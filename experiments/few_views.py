@@ -30,11 +30,13 @@ SCENES = ("fox", "snowmiku", "lego", "herz_jesus_p25")
 WHITE_BEHIND = ("lego",)
 BUDGET = 0.6
 NUM_KEPT, NUM_SCORED, NUM_FOLDS = 24, 12, 5
-WITHOUT_DETAILS = {"view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
+GAUSSIAN_KERNELS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
+WITHOUT_DETAILS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
 REFERENCE = "MCMC, degree 0"
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE: ("gaussians-2d-mcmc", {"sh_degree": 0, "stage2_iterations": 1_000}),
     "bytewise": ("bytewise", {}),
+    "bytewise, Gaussian kernels": ("bytewise", GAUSSIAN_KERNELS),
     "bytewise without details": ("bytewise", WITHOUT_DETAILS),
     "the same without pruning": ("bytewise", {**WITHOUT_DETAILS, "prune": {"share": 0.0}}),
 }

@@ -54,15 +54,15 @@ class CapConfig:
 class KernelConfig:
     """Shapes of the kernels."""
 
-    rate: float = 0.0
-    """Adam's learning rate of the shapes, 0.01 is good; 0: all kernels are Gaussians."""
+    rate: float = 0.01
+    """Adam's learning rate of the shapes; 0: all kernels are Gaussians, as other programs draw them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewDependenceConfig:
     """Spherical harmonics above the Gaussians' own degree."""
 
-    share: float = 0.23
+    share: float = 0.1
     """Share of the bytes for view dependence; 0: none."""
     rate: float = 2e-3
     """Adam's learning rate of the coefficients."""
