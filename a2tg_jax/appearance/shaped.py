@@ -102,6 +102,12 @@ def curves_of(shapes: Array) -> Curve:
     return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
 
 
+def falloff_of(curve: Curve, rho: Array) -> Array:
+    """Return kernels at squared distances, which broadcast with the numbers of the curve."""
+    rho = jnp.minimum(rho, LARGEST_RHO)
+    return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ShapedRule(RuleAround):
@@ -122,9 +128,7 @@ class ShapedRule(RuleAround):
         return self.inner.shade(numbers[: -len(Curve._fields)], values, u, v)
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
-        curve = Curve(*numbers[-len(Curve._fields) :])
-        rho = jnp.minimum(rho, LARGEST_RHO)
-        return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
+        return falloff_of(Curve(*numbers[-len(Curve._fields) :]), rho)
 
     def cutoff(self, opacities: Array) -> Array:
         # The inner bound, of a Gaussian, says at which exponent of the falloff alpha is below 1/255.

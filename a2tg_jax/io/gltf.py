@@ -108,7 +108,7 @@ def save_gltf(
 
 def _primitive(builder: Builder, model: Model, texels: TexelKind | None) -> dict[str, Any]:
     """Return the points of the mesh; `texels` None leaves textures, degrees and shapes out."""
-    splats = splats_of(model)
+    splats = splats_of(model, keeps_shapes=texels is not None)
     attributes = {
         MEANS: builder.add(splats.means, has_bounds=True),
         ROTATION: builder.add(splats.quats[:, [1, 2, 3, 0]]),
