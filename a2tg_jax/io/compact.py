@@ -82,7 +82,7 @@ class CompactChoices:
     texels: Precision = 7
     """Precision of RGB and alpha, each with its own range."""
     shapes: Precision = 8
-    """Precision of the shapes of kernels: of the logarithms of their exponents as bits, or of the shapes as floats."""
+    """Precision of the logarithms of the kernels' exponents as bits, or of their shapes as floats."""
     coder: Choice = "smallest"
     """Coder of all parts: lzma (Python's own), zstd, webp (lossless images), none, or the smallest for each part."""
 
