@@ -29,7 +29,7 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
 from a2tg_jax.finish import baking
 from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
-from a2tg_jax.finish.distilling import distill, pictures
+from a2tg_jax.finish.distilling import distill, likeness, pictures
 from a2tg_jax.finish.texel_choice import fewest_texels
 from a2tg_jax.results import conversion
 from a2tg_jax.texture import Textures
@@ -101,13 +101,17 @@ def test_a_splat_per_texel_looks_like_the_texture(split):
     assert psnr(split, model) > psnr(as_plain(model.gaussians, model), model) + 5
 
 
-@pytest.mark.parametrize("side", [1, 4])
-def test_kernels_of_other_shapes_look_like_themselves(monkeypatch, side):
-    """Nearer than kernels taken for Gaussians."""
-    monkeypatch.setattr(baking, "texel_weights_of", lambda model, *_: model.textures[0])
-    model = shaped(textured(side=side))
-    taken = dataclasses.replace(model, params=model.params.inner, layout=model.layout.inner, appearance=Textured())
-    assert psnr(split_splats(model, [CAMERA], 2.0), model) > psnr(split_splats(taken, [CAMERA], 2.0), model) + 0.5
+@pytest.mark.parametrize("shape", [-0.8, 0.0, 0.3])
+def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
+    """Their optical depths add up to those of the kernel."""
+    parent = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.asarray([1.0]))
+    axis = kernels(4, "texel-centre")
+    found = baking._grid(parent, np.asarray([shape]), np.ones((1, 4, 4, 4)), axis, axis)
+    mixed = np.exp(-0.5 * ((axis.means[:, None] - axis.means[None]) / axis.scales[None]) ** 2)
+    depths = mixed @ -np.log1p(-np.asarray(found.opacities, np.float64)).reshape(4, 4) @ mixed.T
+    rho = axis.means[:, None] ** 2 + axis.means[None] ** 2
+    kernel = falloff_of(curves_of(jnp.asarray([[shape]])), jnp.asarray(rho))
+    np.testing.assert_allclose(1 - np.exp(-depths), parent.opacities[0] * kernel, atol=3e-3)
 
 
 @pytest.mark.parametrize("log_exponent", [-1.0, -0.55, 0.0, 0.4, 1.0])
@@ -173,7 +177,9 @@ def test_plain_files_hold_the_nearest_gaussians(tmp_path):
     model = shaped(dataclasses.replace(plain, params=(), layout=(), appearance=Plain()))
     save_splats(tmp_path / "a.ply", model)
     found = as_plain(load_splats(tmp_path / "a.ply").gaussians, model)
-    assert psnr(found, model) > psnr(as_plain(model.gaussians, model), model) + 2
+    (wanted,) = pictures(model, [CAMERA])
+    near, taken = (likeness(pictures(own, [CAMERA]), [wanted]) for own in (found, as_plain(model.gaussians, model)))
+    assert near > taken + 2
     np.testing.assert_allclose(
         split_splats(model, [CAMERA], 2.0).gaussians.log_scales, found.gaussians.log_scales, rtol=1e-6
     )
