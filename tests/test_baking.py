@@ -103,7 +103,7 @@ def test_a_splat_per_texel_looks_like_the_texture(split):
 
 @pytest.mark.parametrize("shape", [-0.8, 0.0, 0.3])
 def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
-    """Their optical depths add up to those of the kernel."""
+    """Their optical depths add up to those of the kernel, but at corners, where some would have to be negative."""
     parent = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.asarray([1.0]))
     axis = kernels(4, "texel-centre")
     found = baking._grid(parent, np.asarray([shape]), np.ones((1, 4, 4, 4)), axis, axis)
