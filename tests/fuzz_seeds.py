@@ -1,9 +1,11 @@
 """Sound files for every reader that is tried with changed ones."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from fuzz_commands import write_runs
 from fuzz_readers import PICTURES
@@ -17,18 +19,19 @@ from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write
 import a2tg_jax as a2tg
 from a2tg_jax import save_compact, save_gltf, save_model, save_ply
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.folder import write_json as write_run_json
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.systems.bbsplat import BBSplat
-from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
 from a2tg_jax.systems.supergaussians import SuperGaussians
 from a2tg_jax.training import History, save_checkpoint
 
 SYSTEMS = {
     "a2tg": lambda: a2tg.A2tg(sh_degree=0),
-    "bytewise": Bytewise,
+    "bytewise": lambda: Bytewise(kernel=KernelConfig(rate=0.01)),
     "supergaussians": lambda: SuperGaussians(sh_degree=0),
     "bbsplat": lambda: BBSplat(sh_degree=0),
     "gaussians-2d": lambda: a2tg.Gaussians2d(sh_degree=0),
@@ -47,7 +50,7 @@ def write_seeds(folder: Path) -> None:
     for name in ("models", "compact", "checkpoints", "gaussians", "gltf", "lpips"):
         (folder / name).mkdir()
     for name, system in SYSTEMS.items():
-        model = some_model(system())
+        model = _with_shapes(some_model(system()))
         save_model(folder / "models" / f"{name}.npz", model)
         if name in ("a2tg", "bytewise"):
             save_compact(folder / "compact" / f"{name}.a2tgz", model)
@@ -60,6 +63,14 @@ def write_seeds(folder: Path) -> None:
     _write_run(folder / "run")
     write_runs(folder / "commands")
     jax.clear_caches()
+
+
+def _with_shapes(model: Model) -> Model:
+    """The same model; kernels that have shapes differ."""
+    if model.appearance.shapes(model.params) is None:
+        return model
+    shapes = jnp.linspace(-2.0, 2.0, model.gaussians.num)
+    return dataclasses.replace(model, params=model.appearance.with_shapes(model.params, shapes))
 
 
 def _write_scenes(folder: Path) -> None:

@@ -4,17 +4,20 @@ One small model in each published format, its numbers as text, and the checksums
 written, for coders of later versions may code the same bytes otherwise.
 """
 
+import dataclasses
 import hashlib
 import json
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import CompactChoices, load_compact, load_gltf, load_model, save_compact, save_gltf, save_model
-from a2tg_jax.appearance import Banded, Textured, TextureOptions
+from a2tg_jax.appearance import Banded, Shaped, Textured, TextureOptions
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, log_exponents_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
@@ -26,7 +29,11 @@ from a2tg_jax.texture import textures_from_arrays
 NUM = 10
 SUMS = "SHA256SUMS"
 SIZES = [(0, 0), (1, 1), (2, 3), (4, 1)]
-FILES = ("model.npz", "lzma.a2tgz", "zstd.a2tgz", "webp.a2tgz", "floats.a2tgz", "model.a2tgw", "model.glb", "bytes.glb")
+SHAPED = ("shaped.a2tgz", "shaped.a2tgw")
+FILES = (
+    "model.npz", "lzma.a2tgz", "zstd.a2tgz", "webp.a2tgz", "floats.a2tgz", "model.a2tgw", "model.glb", "bytes.glb",
+    *SHAPED,
+)  # fmt: skip
 FLOATS = CompactChoices(
     means="float32", log_scales="float16", quats="float32", opacities="float32", sh_0="float16", texels="float32",
     coder="none",
@@ -51,6 +58,16 @@ def reference_model() -> Model:
     return Model(gaussians, params, layout, appearance=Banded(Textured(options=TextureOptions())), origin=origin)
 
 
+def shaped_model() -> Model:
+    """The same splats with kernels from long tails to sharp edges."""
+    model = reference_model()
+    (bands, textures), (owners, atlas) = model.params, model.layout
+    shapes = jnp.linspace(-3.0, 3.0, NUM)
+    params, layout = BandedParams(bands, ShapedParams(shapes, textures)), BandedLayout(owners, ShapedLayout(atlas))
+    appearance = Banded(Shaped(Textured(options=TextureOptions())))
+    return dataclasses.replace(model, params=params, layout=layout, appearance=appearance)
+
+
 def load(path: Path) -> Model:
     """Read a file with this library."""
     if path.suffix == ".a2tgw":
@@ -63,7 +80,10 @@ def numbers(model: Model) -> dict[str, np.ndarray]:
     arrays = model.appearance.arrays(model.params, model.layout)
     fields = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales", "opacities")}
     fields |= {"degrees": arrays["degrees"], "sh": model.sh}
-    found = fields | {name: arrays[f"inner.{name}"] for name in ("sizes", "texels")}
+    prefix = model.appearance.array_prefix
+    found = fields | {name: arrays[f"{prefix}{name}"] for name in ("sizes", "texels")}
+    if model.appearance.shapes_name is not None:
+        found["exponents"] = np.exp(log_exponents_of(arrays[model.appearance.shapes_name]))
     return {name: np.asarray(values, np.float64) for name, values in found.items()}
 
 
@@ -76,9 +96,12 @@ def write(folder: Path) -> None:
     (folder / "model.a2tgw").write_bytes(encode_web_scene(model, title="reference"))
     save_gltf(folder / "model.glb", model)
     save_gltf(folder / "bytes.glb", model, texels="uint8")
+    save_compact(folder / SHAPED[0], shaped_model(), choices=CompactChoices(coder="zstd"))
+    (folder / SHAPED[1]).write_bytes(encode_web_scene(shaped_model(), title="shaped"))
     found = {name: numbers(load(folder / name)) for name in FILES}
     text = {name: {key: np.round(x, 6).ravel().tolist() for key, x in held.items()} for name, held in found.items()}
     kept = {name: held for name, held in text.items() if name in ("model.npz", "model.a2tgw")}
+    kept[SHAPED[1]] = {"exponents": text[SHAPED[1]]["exponents"]}
     (folder / "numbers.json").write_text(json.dumps(kept) + "\n")
     (folder / SUMS).write_text("".join(f"{checksum(folder / name)}  {name}\n" for name in (*FILES, "numbers.json")))
 

@@ -213,6 +213,10 @@ class Own(Textured):
     """A texture shown by a rule of one's own, as far as anyone knows."""
 
 
+class OwnShapes(Shaped):
+    """Kernels shown by a rule of one's own, as far as anyone knows."""
+
+
 CAPABILITIES = {
     Appearance(): (False, False, None, True),
     Plain(0.9): (True, True, None, True),
@@ -221,8 +225,11 @@ CAPABILITIES = {
     Own(): (False, True, TextureOptions(), True),
     MovableKernels(): (False, False, None, False),
     Billboards(): (False, False, None, False),
-    Shaped(): (False, True, None, True),
-    Shaped(Textured((2, 3))): (False, True, TextureOptions(), True),
+    Shaped(): (True, True, None, True),
+    Shaped(Textured((2, 3))): (True, True, TextureOptions(), True),
+    Shaped(Own()): (False, True, TextureOptions(), True),
+    Shaped(MovableKernels()): (False, False, None, False),
+    OwnShapes(): (False, True, None, True),
 }
 """is_portable, is_linear, texture_options, has_own_opacities."""
 
@@ -234,6 +241,7 @@ def test_a_wrapper_can_do_what_it_wraps_can(appearance):
         assert found == CAPABILITIES[appearance]
         assert shown.base is appearance and shown.max_alpha == appearance.max_alpha
     assert not appearance.has_degrees and Banded(appearance).has_degrees
+    assert not Shaped(Banded(appearance)).is_portable and not Shaped(Shaped(appearance)).is_portable
     assert not Banded(Banded(appearance)).is_portable and Banded(Banded(appearance)).base is appearance
 
 
@@ -242,3 +250,6 @@ def test_portable_appearances_come_from_their_options():
     assert appearance_for(options, has_textures=False) == Plain(options.max_alpha)
     assert appearance_for(options, has_textures=True) == Textured(options=options)
     assert appearance_for(options, has_textures=True, has_degrees=True) == Banded(Textured(options=options))
+    shaped = appearance_for(options, has_textures=True, has_degrees=True, has_shapes=True)
+    assert shaped == Banded(Shaped(Textured(options=options)))
+    assert appearance_for(options, has_textures=False, has_shapes=True) == Shaped(Plain(options.max_alpha))

@@ -9,15 +9,27 @@ import numpy as np
 import pytest
 from small_values import some_gaussians
 
-from a2tg_jax import Camera, Model, TextureOptions, load_splats, save_model, textures_from_arrays
-from a2tg_jax.appearance import Banded, Textured
+from a2tg_jax import (
+    Camera,
+    Model,
+    TextureOptions,
+    load_gltf,
+    load_splats,
+    save_gltf,
+    save_model,
+    save_splats,
+    textures_from_arrays,
+)
+from a2tg_jax.appearance import Banded, Plain, Shaped, Textured
+from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, curves_of, falloff_of, shapes_of
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
 from a2tg_jax.finish import baking
 from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
-from a2tg_jax.finish.distilling import distill, pictures
+from a2tg_jax.finish.distilling import distill, likeness, pictures
 from a2tg_jax.finish.texel_choice import fewest_texels
 from a2tg_jax.results import conversion
 from a2tg_jax.texture import Textures
@@ -52,6 +64,13 @@ def banded(inner: Model) -> Model:
     return model.with_bands(*split_sh(np.ones((inner.num, 16, 3), np.float32), 3 * (np.arange(inner.num) == 0), 0))
 
 
+def shaped(inner: Model) -> Model:
+    """The same model with kernels of long tails and of sharp edges by turns."""
+    shapes = jnp.asarray(np.resize([-2.0, 2.0], inner.num), jnp.float32)
+    params, layout = ShapedParams(shapes, inner.params), ShapedLayout(inner.layout)
+    return dataclasses.replace(inner, params=params, layout=layout, appearance=Shaped(inner.appearance))
+
+
 def psnr(model: Model, other: Model) -> float:
     (found,), (wanted,) = pictures(model, [CAMERA]), pictures(other, [CAMERA])
     return float(-10 * np.log10(np.mean((found - wanted) ** 2)))
@@ -80,6 +99,32 @@ def test_a_splat_per_texel_looks_like_the_texture(split):
     model = textured()
     assert split.num > 3 * model.num and split.num_bytes <= 2 * model.num_bytes
     assert psnr(split, model) > psnr(as_plain(model.gaussians, model), model) + 5
+
+
+@pytest.mark.parametrize("shape", [-0.8, 0.0, 0.3])
+def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
+    """Their optical depths add up to those of the kernel, but at corners, where some would have to be negative."""
+    parent = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.asarray([1.0]))
+    axis = kernels(4, "texel-centre")
+    found = baking._grid(parent, np.asarray([shape]), np.ones((1, 4, 4, 4)), axis, axis)
+    mixed = np.exp(-0.5 * ((axis.means[:, None] - axis.means[None]) / axis.scales[None]) ** 2)
+    depths = mixed @ -np.log1p(-np.asarray(found.opacities, np.float64)).reshape(4, 4) @ mixed.T
+    rho = axis.means[:, None] ** 2 + axis.means[None] ** 2
+    kernel = falloff_of(curves_of(jnp.asarray([[shape]])), jnp.asarray(rho))
+    np.testing.assert_allclose(1 - np.exp(-depths), parent.opacities[0] * kernel, atol=3e-3)
+
+
+@pytest.mark.parametrize("log_exponent", [-1.0, -0.55, 0.0, 0.4, 1.0])
+def test_the_nearest_gaussian_has_the_least_squared_difference(log_exponent):
+    gaussians = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.zeros(1))
+    found = nearest_gaussians(gaussians, shapes_of(np.asarray([log_exponent])))
+    peak, factor = 2 * float(found.opacities[0]), float(jnp.exp(found.log_scales - gaussians.log_scales)[0, 0])
+    rho = np.linspace(0, 144, 100_001)
+    kernel = np.asarray(falloff_of(curves_of(jnp.asarray(shapes_of(np.asarray([log_exponent])))), jnp.asarray(rho)))
+    difference = lambda a, k: np.mean((a * np.exp(-rho / 2 / k) - kernel) ** 2)  # noqa: E731
+    least = difference(peak, factor**2)
+    others = [difference(peak * a, factor**2 * k) for a, k in ((0.95, 1), (1.05, 1), (1, 0.9), (1, 1.1), (1.05, 0.95))]
+    assert least < min(others) and (log_exponent == 0) == (abs(peak - 1) < 1e-4 and abs(factor - 1) < 1e-4)
 
 
 def test_texels_are_kept_where_pictures_need_them():
@@ -125,6 +170,21 @@ def test_held_out_cameras_do_not_train():
     assert (len(training), len(held_out)) == (2, 1)
     training, held_out = conversion.cameras_apart(Origin.of_cameras(cameras, is_test=[True] * 3))
     assert (len(training), len(held_out)) == (3, 0)
+
+
+def test_plain_files_hold_the_nearest_gaussians(tmp_path):
+    plain = textured()
+    model = shaped(dataclasses.replace(plain, params=(), layout=(), appearance=Plain()))
+    save_splats(tmp_path / "a.ply", model)
+    found = as_plain(load_splats(tmp_path / "a.ply").gaussians, model)
+    (wanted,) = pictures(model, [CAMERA])
+    near, taken = (likeness(pictures(own, [CAMERA]), [wanted]) for own in (found, as_plain(model.gaussians, model)))
+    assert near > taken + 2
+    np.testing.assert_allclose(
+        split_splats(model, [CAMERA], 2.0).gaussians.log_scales, found.gaussians.log_scales, rtol=1e-6
+    )
+    save_gltf(tmp_path / "a.glb", model, textures=False)
+    np.testing.assert_allclose(load_gltf(tmp_path / "a.glb").gaussians.scales, found.gaussians.scales, rtol=1e-5)
 
 
 def test_other_appearances_give_their_gaussians():

@@ -15,9 +15,10 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial import cKDTree
 from small_values import some_gaussians
 
-from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Textured, TextureOptions
+from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Shaped, Textured, TextureOptions
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.io import coders, compact, quantise
@@ -56,6 +57,12 @@ def textured(has_empty: bool = False) -> Model:
     return Model(as_gaussians(SCENE, "float32"), *some_textures(has_empty), appearance=appearance, origin=origin())
 
 
+def shaped(inner: Model) -> Model:
+    shapes = np.random.default_rng(2).normal(size=inner.gaussians.num).astype(np.float32)
+    params, layout = ShapedParams(jnp.asarray(shapes), inner.params), ShapedLayout(inner.layout)
+    return dataclasses.replace(inner, params=params, layout=layout, appearance=Shaped(inner.appearance))
+
+
 def banded(base_degree: int, inner: Model) -> Model:
     degrees = np.random.default_rng(1).integers(base_degree, 4, NUM)
     bands, owners = split_sh(np.asarray(inner.gaussians.sh), degrees, base_degree)
@@ -72,6 +79,8 @@ MODELS = {
     "banded 1": lambda: banded(1, plain()),
     "banded 3": lambda: banded(3, plain()),
     "banded and textured": lambda: banded(0, textured(True)),
+    "shaped": lambda: shaped(plain()),
+    "banded, shaped and textured": lambda: banded(0, shaped(textured(True))),
 }
 every_model = pytest.mark.parametrize("name", MODELS)
 
@@ -95,7 +104,9 @@ def tables(model: Model, order=None) -> dict[str, np.ndarray]:
         "sh_rest": sh[:, 1:],
     }
     arrays = model.appearance.arrays(model.params, model.layout)
-    arrays = {name.removeprefix("inner."): array for name, array in arrays.items()}
+    arrays = {name.rpartition("inner.")[2]: array for name, array in arrays.items()}
+    if "shapes" in arrays:
+        found["shapes"] = log_exponents_of(arrays["shapes"][order])
     if "degrees" in arrays:
         found["degrees"] = arrays["degrees"][order]
     if "sizes" in arrays:
@@ -153,7 +164,7 @@ def test_coders_do_not_change_what_comes_back(coder):
 @pytest.mark.parametrize("precision", [3, 8, 11, 16, "float16"])
 @pytest.mark.parametrize("group", [group for group in GROUPS if group not in ("means", "quats", "texels")])
 def test_errors_are_half_a_step_at_most(group, precision):
-    model = banded(0, plain())
+    model = banded(0, shaped(plain()))
     found = decode_model(encode_model(model, EXACT.keeping({group: precision})))
     order = order_of(model, found)
     wanted, values = tables(model, order)[group], tables(found)[group]
@@ -212,7 +223,7 @@ def test_texels_keep_their_places(precision):
         assert error <= (0 if precision == "float32" else half_step(wanted[:, columns], precision))
 
 
-@pytest.mark.parametrize("name", ["plain 1", "textured", "banded and textured"])
+@pytest.mark.parametrize("name", ["plain 1", "textured", "banded and textured", "shaped"])
 @pytest.mark.parametrize("choices", [EXACT, CompactChoices(), CompactChoices(coder="webp")])
 def test_a_model_of_no_gaussians(name, choices):
     model = dataclasses.replace(MODELS[name](), num_live=jnp.asarray(0, jnp.int32))
@@ -248,6 +259,31 @@ def test_extreme_numbers_are_kept():
     largest = int(np.argmax(np.asarray(found.gaussians.means)[:, 0]))
     np.testing.assert_allclose(found.gaussians.means[largest], [1e11, -1e11, 9e11], rtol=2e-3)
     assert np.asarray(found.gaussians.opacities).min() < 1e-6 and np.asarray(found.gaussians.opacities).max() > 1 - 1e-6
+
+
+def test_files_without_shapes_are_those_of_version_1():
+    """Readers of version 1 refuse the others by their version alone."""
+    version = lambda data: HEAD.unpack_from(data)[1]  # noqa: E731
+    data = encode_model(plain(1))
+    assert version(data) == 1 and "shapes" not in compact._unframed(data)[0]["choices"]
+    assert version(encode_model(shaped(plain(1)))) == 2
+
+
+@pytest.mark.parametrize("bits", [1, 2, 5, 8])
+def test_shapes_of_any_precision_are_finite(bits):
+    """The ends of the range included, which even steps may move outwards."""
+    model = shaped(plain(1))
+    shapes = jnp.asarray(np.resize([-30.0, 30.0, 0.0, 0.3], NUM), jnp.float32)
+    model = dataclasses.replace(model, params=model.appearance.with_shapes(model.params, shapes))
+    found = decode_model(encode_model(model, CompactChoices(shapes=bits)))
+    wanted, values = tables(model, order_of(model, found))["shapes"], tables(found)["shapes"]
+    assert np.abs(values - wanted).max() <= {1: 1.0, 2: 0.5}.get(bits, half_step(wanted, max(bits, 2))) + 1e-6
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e30, 1.6])
+def test_exponents_out_of_range_are_refused(value):
+    with pytest.raises(ValueError, match="logarithms of the exponents of kernels must lie within ±1"):
+        shapes_of(np.asarray([0.0, value]))
 
 
 # What is refused
@@ -294,7 +330,7 @@ def test_missing_file(tmp_path):
 
 
 def whole() -> bytes:
-    return encode_model(banded(0, textured(True)))
+    return encode_model(banded(0, shaped(textured(True))))
 
 
 def refused(tmp_path, data: bytes, match: str | None = None) -> None:
@@ -409,6 +445,12 @@ def sizes_of(*size):
         (header_with(ends__sh_1=[-1e39, 1e39]), "the ends of sh_1 must be 2 numbers"),
         (header_with(ends__sh_1=["a", "b"]), "the ends of sh_1 must be 2 numbers"),
         (header_with(ends__sh_1=[0.5, 0.5]), "the part sh_1 holds bytes where there should be none"),
+        (header_with(ends__shapes=[-3.0, 3.0]), "exponents of kernels must lie within"),
+        (header_with(ends__shapes=[1e30, 1e31]), "exponents of kernels must lie within"),
+        (header_with(ends__shapes=[0.0, "NaN"]), "the ends of shapes must be 2 numbers"),
+        (header_with(lengths__shapes=3), "its parts must have"),
+        (header_with(choices__shapes=16), "the part shapes"),
+        (header_with(choices__shapes="float32"), "the part shapes"),
         (header_with(ends={}), "damaged"),
         (header_with(choices__means=40), r"choices\.means must be"),
         (header_with(choices__coder="pickle"), r"choices\.coder must be"),
@@ -445,7 +487,9 @@ def test_headers_that_are_no_headers_are_refused(tmp_path):
     refused(tmp_path, framed(b"{}", num_text=3), "frame is of 2 bytes")
     refused(tmp_path, framed(b"{}", num_text=2**32 - 1), "announces a header")
     refused(tmp_path, HEAD.pack(compact.MAGIC, 1, 2**31, 5, zlib.crc32(b"")), "announces a header")
-    refused(tmp_path, HEAD.pack(compact.MAGIC, 2, 0, 0, zlib.crc32(b"")), "version 2; this program reads version 1")
+    refused(
+        tmp_path, HEAD.pack(compact.MAGIC, 3, 0, 0, zlib.crc32(b"")), "version 3; this program reads versions 1 and 2"
+    )
 
 
 @pytest.mark.parametrize("coder", coders.CODERS)

@@ -25,7 +25,7 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Shaped, Textured
 from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
@@ -167,6 +167,12 @@ def test_what_a_format_does_not_keep():
     assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
     assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]
     assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
+    params, layout = Shaped(Textured()).allocate(jax.random.key(0), some_gaussians())
+    shaped = Model(some_gaussians(), params, layout, appearance=Shaped(Textured()))
+    assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (--bake turns them into plain splats)"]
+    assert lost_by(shaped, "a.glb") == lost_by(shaped, "a.a2tgz") == ["last digits"]
+    kernels = Model(some_gaussians(), params._replace(inner=()), layout._replace(inner=()), appearance=Shaped())
+    assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (--bake turns them into plain splats)"
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
     model = Model(some_gaussians(), origin=dataclasses.replace(model.origin, corrections=learned))
     assert lost_by(model, "a.npz") == []

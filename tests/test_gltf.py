@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from small_values import some_gaussians, some_world
-from test_compact import MODELS, every_model, plain, textured
+from test_compact import MODELS, every_model, plain, shaped, textured
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Billboards, TextureOptions
@@ -77,6 +77,10 @@ def test_models_come_back(tmp_path, name):
     assert found.num_bytes == model.num_bytes
     for x, y in zip(jax.tree.leaves(found.textures), jax.tree.leaves(model.textures), strict=True):
         np.testing.assert_array_equal(x, y)
+    shapes, wanted = (m.appearance.shapes(m.params) for m in (found, model))
+    assert (shapes is None) == (wanted is None)
+    if shapes is not None:
+        np.testing.assert_allclose(np.tanh(shapes), np.tanh(wanted), atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [TextureOptions(), TextureOptions.official()])
@@ -278,6 +282,23 @@ def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_
     assert (options.uv, options.max_alpha) == (changes.get("uv", "texel-centre"), changes.get("maxAlpha", 0.95))
 
 
+@pytest.mark.parametrize("wrong", [np.full(50, np.nan), np.full(50, 4.0), np.zeros(49)])
+def test_shapes_out_of_range_or_of_another_length_are_refused(tmp_path, monkeypatch, wrong):
+    monkeypatch.setattr(gltf_textures, "log_exponents_of", lambda shapes: wrong)
+    save_gltf(tmp_path / "m.glb", shaped(plain(1)))
+    refused(tmp_path / "m.glb", "shapes must be finite|kernels must lie within|shapes must be 50 numbers; got 49")
+
+
+def test_shapes_are_what_the_extension_says(tmp_path, saved):
+    """Extras of another structure do not count."""
+    save_gltf(tmp_path / "m.glb", shaped(textured()))
+    described, binary = parts_of(tmp_path / "m.glb")
+    del first_primitive(described)["extensions"][SPLATS]["extensions"][EXTENSION]["shapes"]
+    write_parts(tmp_path / "m.glb", described, binary)
+    found = load_gltf(tmp_path / "m.glb")
+    assert found.appearance.shapes_name is None and found.textures is not None
+
+
 def test_other_kernels_and_colours_are_told(tmp_path):
     path = tmp_path / "m.glb"
     save_gltf(path, plain())
@@ -341,6 +362,9 @@ CHANGES = [
     (extended(texelRanges={"rgb": [0, 1e300], "alpha": [0, 1]}), "must be two numbers"),
     (extended(texelRanges=3), "damaged"),
     (extended(degrees=1), "degrees must be SCALAR"),
+    (extended(shapes=1), "shapes must be SCALAR"),
+    (extended(shapes=99), r"has no accessors\[99\]"),
+    (extended(shapes=-1), "accessors"),
     (lambda d: d["bufferViews"][0].update(byteStride=4), "stride"),
     (lambda d: d["bufferViews"][0].update(byteLength=10**9), "reaches beyond its buffer"),
     (lambda d: d["buffers"][0].update(byteLength=10**9), "cut off"),

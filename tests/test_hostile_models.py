@@ -23,7 +23,7 @@ from a2tg_jax.io.ply import load_ply, save_ply
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
-from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
 from a2tg_jax.texture import AtlasLayout, Textures, check_places
 from a2tg_jax.training import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import system_from_dict
@@ -106,6 +106,24 @@ def test_models_that_no_camera_sees(tmp_path, change, message):
     except ValueError as error:  # Not even written: JSON knows no infinity.
         assert "JSON" in str(error)
         return
+    refused(load_model, path, message)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_number("appearance/inner.shapes", np.nan), "must be finite"),
+        (with_number("appearance/inner.shapes", 1e30), "must lie within"),
+        (with_array("appearance/inner.shapes", lambda x: x[1:]), r"shapes must be \[12\], one for each Gaussian"),
+        (with_array("appearance/inner.shapes", lambda x: x[:, None]), r"shapes must be floats \[N\]"),
+        (with_array("appearance/inner.shapes", lambda x: x.astype(int)), r"shapes must be floats \[N\]"),
+        (lambda _, arrays: arrays.pop("appearance/inner.shapes"), "shapes of Shaped is missing"),
+    ],
+)  # fmt: skip
+def test_shapes_of_kernels_that_are_none(tmp_path, change, message):
+    path = tmp_path / "m.npz"
+    save_model(path, some_model(Bytewise(kernel=KernelConfig(rate=0.01))))
+    spoiled(path, MODEL, change)
     refused(load_model, path, message)
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference_model
+from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference_model, shaped_model
 
-from a2tg_jax import save_model
-from a2tg_jax.appearance import Banded, Textured, TextureOptions
+from a2tg_jax import save_splats
+from a2tg_jax.appearance import TextureOptions, appearance_for
 from a2tg_jax.io.web_scene import encode_web_scene
 
 DATA = Path(__file__).parent / "data"
@@ -48,15 +48,22 @@ def test_the_reference_reader_finds_what_this_library_finds(reference, name):
         np.testing.assert_allclose(found[key], values, atol=2e-6, rtol=2e-6, err_msg=key)
 
 
-def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path):
+@pytest.mark.parametrize("has_shapes", [False, True])
+def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has_shapes):
     """It follows the rules of the page alone."""
     read_model, draw = reference
-    model, options = reference_model(), {"outside": "identity"}
-    appearance = Banded(Textured(options=TextureOptions(**options)))
+    model, options = shaped_model() if has_shapes else reference_model(), {"outside": "identity"}
+    shown = TextureOptions(**options)
+    appearance = appearance_for(shown, has_textures=True, has_degrees=True, has_shapes=has_shapes)
     model = dataclasses.replace(model, appearance=appearance)
-    save_model(tmp_path / "m.npz", model)
+    for name in ("m.npz", "m.glb"):
+        save_splats(tmp_path / name, model)
     origin = model.origin
-    image = draw(read_model(tmp_path / "m.npz"), origin.viewmats[0], origin.Ks[0], 64, 48, origin.background, **options)
+    found, again = (read_model(tmp_path / name).get("exponents") for name in ("m.npz", "m.glb"))
+    assert (found is None) == (again is None) == (not has_shapes)
+    np.testing.assert_allclose([] if again is None else again, [] if found is None else found, rtol=1e-6)
+    found = read_model(tmp_path / "m.npz")
+    image = draw(found, origin.viewmats[0], origin.Ks[0], 64, 48, origin.background, **options)
     wanted = np.asarray(model.render(origin.cameras[0]).color)
     assert np.ptp(wanted) > 0.5
     np.testing.assert_allclose(image, wanted, atol=2e-3)

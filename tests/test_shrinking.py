@@ -8,7 +8,7 @@ import pytest
 from test_results import circle
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Banded, MovableKernels, Plain, Textured, TextureOptions
+from a2tg_jax.appearance import Banded, MovableKernels, Plain, Shaped, Textured, TextureOptions
 from a2tg_jax.core.gaussians import SH_C0, init_from_points
 from a2tg_jax.data import View
 from a2tg_jax.finish.shrinking import halved, shrink_textures, taken, texel_weights
@@ -109,14 +109,16 @@ def test_weights_are_the_squared_slopes_of_the_picture():
         np.testing.assert_allclose(weights[place], exact, rtol=0.5)
 
 
-def test_bands_stay_as_they_are():
+def test_bands_and_shapes_stay_as_they_are():
     inner = some_model()
-    banded = Banded(Textured())
+    banded = Banded(Shaped(Textured()))
     params, layout = banded.allocate(None, inner.gaussians)
+    params = banded.with_shapes(params, jnp.linspace(-2.0, 2.0, NUM))
     model = dataclasses.replace(inner, params=params, layout=layout, appearance=banded)
     model = model.with_textures(*inner.textures)
-    small = shrink_textures(model, views_of(inner), max_loss=0.05, background=BACKGROUND)
-    assert isinstance(small.appearance, Banded) and small.num_bytes < model.num_bytes
+    small = shrink_textures(model, views_of(model), max_loss=0.05, background=BACKGROUND)
+    assert small.appearance == banded and small.num_bytes < model.num_bytes
+    np.testing.assert_array_equal(banded.shapes(small.params), banded.shapes(params))
 
 
 def test_what_cannot_shrink_is_refused():

@@ -16,6 +16,7 @@ from PIL import Image
 from small_values import some_gaussians
 from test_compact import textured
 
+from a2tg_jax.appearance import shaped
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.data import synthetic_scene
@@ -214,6 +215,12 @@ def test_the_policy_allows_the_page_its_own_script_and_style_and_nothing_else():
     assert f"script-src {hashed(r'<script[^>]*>(.*?)</script>')};" in policy[1]
     assert f"style-src {hashed(r'<style>(.*?)</style>')};" in policy[1]
     assert len(text) < 300_000 and not re.search(r"""(src|href)=["']?(https?:)?//""", text)
+
+
+def test_the_page_and_the_renderer_have_kernels_of_the_same_numbers():
+    found = re.search(r"const float OFFSET = ([\d.]+), LARGEST_LOG_EXPONENT = ([\d.]+);", viewer_html())
+    assert found is not None
+    assert tuple(map(float, found.groups())) == (shaped.OFFSET, shaped.LARGEST_LOG_EXPONENT)
 
 
 def test_a_page_holds_a_scene():

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_cases import small_model, small_numbers, write_case
+from viewer_cases import shaped_model, small_model, small_numbers, write_case
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.ply import ATTRIBUTES, SCALES
@@ -102,6 +102,8 @@ def test_the_page_shows_what_the_renderer_shows(node, tmp_path):
     # Noise in all that there is, which rounding changes; the page must show what is left all the more exactly.
     for name, options in (("noise", a2tg.TextureOptions()), ("official", a2tg.TextureOptions.official())):
         write_case(tmp_path / name, Source(small_model(options), name), cameras_around(4.0), of=["the file"])
+    shaped = Source(shaped_model(), "shaped")
+    write_case(tmp_path / "shaped", shaped, cameras_around(4.0), ("full", "depth", "normals"), of=["the file"])
     run_node("test:browser", "--", "compare", A2TG_CASES=str(tmp_path))
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_values import some_gaussians
-from test_compact import MODELS, banded, every_model, order_of, plain, tables, textured
+from test_compact import MODELS, banded, every_model, order_of, plain, shaped, tables, textured
 
 from a2tg_jax.appearance import Banded, Billboards, MovableKernels, TextureOptions
 from a2tg_jax.core.cameras import Camera
@@ -51,7 +51,7 @@ def test_numbers_come_back_within_half_a_step(name):
     wanted, values = tables(model, order), tables(found)
     assert set(wanted) == set(values) and found.num_bytes == model.num_bytes
     assert type(found.appearance) is type(model.appearance)
-    for group in ("log_scales", "opacities", "sh_0"):
+    for group in {"log_scales", "opacities", "sh_0", "shapes"} & set(wanted):
         step = np.ptp(wanted[group]) / (2 ** BITS[group] - 2)
         assert np.abs(values[group] - wanted[group]).max() <= step / 2 * 1.001 + 1e-6
     for degree, columns in ((1, slice(0, 3)), (2, slice(3, 8)), (3, slice(8, 15))):
@@ -132,7 +132,7 @@ def test_chunks_of_many_rows():
     assert scene.header["chunk"] < model.num and scene.model.num == model.num
 
 
-@pytest.mark.parametrize("name", ["plain 1", "textured", "banded and textured"])
+@pytest.mark.parametrize("name", ["plain 1", "textured", "banded and textured", "shaped"])
 def test_a_model_of_no_gaussians(name):
     model = dataclasses.replace(MODELS[name](), num_live=jnp.asarray(0, jnp.int32))
     assert again(model).num == 0
@@ -165,7 +165,7 @@ def test_numbers_that_are_not_finite_are_refused():
 
 
 def whole() -> bytes:
-    return encode_web_scene(banded(0, textured(True)))
+    return encode_web_scene(banded(0, shaped(textured(True))))
 
 
 def refused(data: bytes, match: str = "") -> None:
@@ -220,6 +220,19 @@ def test_every_changed_byte_is_noticed():
 def test_headers_that_lie_are_refused(changes):
     assert decode_web_scene(resealed({})).model.num > 0
     refused(resealed(changes))
+
+
+@pytest.mark.parametrize("ends", [[-4.0, 4.0], [1e30, 2e30], [0.0, float("nan")], [0.0]])
+def test_exponents_of_kernels_out_of_range_are_refused(ends):
+    data = whole()
+    num_text = HEAD.unpack_from(data)[2]
+    header = json.loads(data[HEAD.size : HEAD.size + num_text])
+    refused(resealed({"ends": header["ends"] | {"shapes": ends}}), "kernels must lie within|JSON|NaN|damaged")
+
+
+def test_files_without_shapes_are_those_of_version_1():
+    """Readers of version 1 refuse the others by their version alone."""
+    assert HEAD.unpack_from(encode_web_scene(plain(1)))[1] == 1 and HEAD.unpack_from(whole())[1] == 2
 
 
 def test_a_bomb_is_refused():

@@ -11,11 +11,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Banded, Plain, Textured, TextureOptions
+from a2tg_jax.appearance import Banded, Plain, Shaped, Textured, TextureOptions
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
 from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
@@ -46,6 +48,16 @@ def small_model(options: TextureOptions = TextureOptions()) -> Model:  # noqa: B
     origin = Origin.of_cameras([camera], ["<b>a</b>.png"], background=(0.25, 0.5, 0.75))
     params, layout = BandedParams(bands, textures), BandedLayout(owners, atlas)
     return Model(gaussians, params, layout, appearance=Banded(Textured(options=options)), origin=origin)
+
+
+def shaped_model() -> Model:
+    """The same Gaussians with kernels of every exponent from 1/e, with long tails, to e, with a sharp edge."""
+    model = small_model()
+    (bands, textures), (owners, atlas) = model.params, model.layout
+    shapes = np.arctanh(np.linspace(-1, 1, NUM) * (1 - 1e-6))
+    shaped = ShapedParams(jnp.asarray(np.random.default_rng(8).permutation(shapes), jnp.float32), textures)
+    params, layout = BandedParams(bands, shaped), BandedLayout(owners, ShapedLayout(atlas))
+    return dataclasses.replace(model, params=params, layout=layout, appearance=Banded(Shaped(Textured())))
 
 
 def write_small(folder: Path) -> None:

@@ -59,6 +59,10 @@ class AppearanceAround(Appearance):
     def array_prefix(self) -> str:  # type: ignore[override]
         return INNER + self.inner.array_prefix
 
+    @property
+    def shapes_name(self) -> str | None:  # type: ignore[override]
+        return None if self.inner.shapes_name is None else INNER + self.inner.shapes_name
+
     def project(self, params: Any) -> Any:
         return params._replace(inner=self.inner.project(params.inner))
 

@@ -31,6 +31,10 @@ OFFSET = 0.02
 """δ, in squared standard deviations."""
 LARGEST_LOG_EXPONENT = 1.0
 """Largest logarithm of an exponent, and of its inverse."""
+MOST_SHARE = 1 - 1e-7
+"""Largest tanh of a shape that is read, so that the shape is finite."""
+MOST_ROUNDED = 1.5
+"""Largest tanh of a shape in a file: half the coarsest step beyond the range."""
 LARGEST_RHO = 1e6
 """Squared distance beyond which the falloff is 0 in any case; its powers stay finite up to there."""
 
@@ -72,11 +76,36 @@ def exponents_of(shapes: Array) -> Array:
     return jnp.exp(LARGEST_LOG_EXPONENT * jnp.tanh(shapes))
 
 
+def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
+    """Return the logarithms of the exponents of shapes, within ±1, as files keep them (host)."""
+    return LARGEST_LOG_EXPONENT * np.tanh(np.asarray(shapes, np.float64))
+
+
+def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
+    """Return the shapes of logarithms of exponents in a file (host).
+
+    Rounding may move a logarithm beyond ±1; it counts as ±1.
+
+    Raises:
+      ValueError: if one is NaN or farther out than rounding moves it.
+    """
+    shares = np.asarray(log_exponents, np.float64) / LARGEST_LOG_EXPONENT
+    if not (np.abs(shares) <= MOST_ROUNDED).all():
+        raise ValueError(f"the logarithms of the exponents of kernels must lie within ±{LARGEST_LOG_EXPONENT:g}")
+    return np.arctanh(np.clip(shares, -MOST_SHARE, MOST_SHARE))
+
+
 def curves_of(shapes: Array) -> Curve:
     """Return the curves of shapes [N]."""
     exponents = exponents_of(shapes)
     starts = jnp.exp(exponents * np.log(OFFSET))
     return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
+
+
+def falloff_of(curve: Curve, rho: Array) -> Array:
+    """Return kernels at squared distances, which broadcast with the numbers of the curve."""
+    rho = jnp.minimum(rho, LARGEST_RHO)
+    return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
 
 
 @jax.tree_util.register_dataclass
@@ -99,9 +128,7 @@ class ShapedRule(RuleAround):
         return self.inner.shade(numbers[: -len(Curve._fields)], values, u, v)
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
-        curve = Curve(*numbers[-len(Curve._fields) :])
-        rho = jnp.minimum(rho, LARGEST_RHO)
-        return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
+        return falloff_of(Curve(*numbers[-len(Curve._fields) :]), rho)
 
     def cutoff(self, opacities: Array) -> Array:
         # The inner bound, of a Gaussian, says at which exponent of the falloff alpha is below 1/255.
@@ -120,6 +147,15 @@ class Shaped(AppearanceAround):
     @property
     def base(self) -> Appearance:
         return self
+
+    @property
+    def is_portable(self) -> bool:
+        has_more = self.inner.has_degrees or self.inner.shapes_name is not None
+        return type(self) is Shaped and self.inner.is_portable and not has_more
+
+    @property
+    def shapes_name(self) -> str:  # type: ignore[override]
+        return SHAPES
 
     def allocate(self, key: Array, gaussians: Gaussians) -> tuple[ShapedParams, ShapedLayout]:
         """Return Gaussians around the parameters of the inner appearance."""

@@ -16,7 +16,9 @@ class StoredArrays:
     """Parameters and layout as named arrays. The defaults suit parameters with one row per Gaussian and no layout."""
 
     array_prefix: str = ""
-    """Prefix of the array names of `Appearance.base`."""
+    """Prefix of the array names of `texture_options`' textures."""
+    shapes_name: str | None = None
+    """Name of the array of the shapes of kernels; None if all are Gaussians."""
     max_alpha: float = 0.99
     """Upper limit of a splat's alpha."""
     has_low_pass: bool = True
@@ -24,7 +26,7 @@ class StoredArrays:
 
     @property
     def is_portable(self) -> bool:
-        """Whether Gaussians, degrees, textures and `max_alpha` define the appearance completely.
+        """Whether Gaussians, degrees, shapes, textures and `max_alpha` define the appearance completely.
 
         Compact files, web scenes and `shrink_textures` need this. A subclass of a portable class is not portable.
         """

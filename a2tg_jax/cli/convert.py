@@ -18,8 +18,9 @@ class Convert:
     *.usdc and *.usdz. Reads checkpoints of gsplat, Nerfstudio, 3DGS and 2DGS (*.pt, *.pth, *.ckpt), too. Gaussians of
     3DGS are flattened along their thinnest axis. Files of other programs hold the original world.
 
-    Other programs know no textures. --bake turns a textured splat into plain ones, as many as its texels or fewer, and
-    trains them on pictures of the model from its training cameras. The photographs are not needed.
+    Other programs know no textures, and no kernels but Gaussians. --bake turns a textured splat into plain ones, as
+    many as its texels or fewer, and trains them on pictures of the model from its training cameras. The photographs
+    are not needed.
 
     Examples:
       a2tg convert runs/fox fox.sog --bake
@@ -34,7 +35,7 @@ class Convert:
     """Name of a run's model, as a2tg info prints it."""
 
     bake: bool = False
-    """Turn textured splats into plain ones."""
+    """Turn splats with textures, or with kernels of other shapes, into plain ones."""
     bake_growth: float = BakeOptions.growth
     """Largest ratio of bytes of the numbers after --bake to those before."""
     bake_iterations: int = BakeOptions.iterations

@@ -4,8 +4,9 @@ Textures shrink where that changes pictures least, until a splat per texel makes
 Gaussian then becomes a grid of smaller ones in its plane: texel j of an axis takes the Gaussian with the mass, mean and
 variance of w_j(u)·exp(−u²/2), w_j being the texel's bilinear kernel. The kernels add up to 1, so that the smaller
 Gaussians add up to about the large one. Their opacities are such that their optical depths −log(1 − alpha) add up to
-that of the textured splat at each of their centres. Splats smaller than a pixel are still drawn a pixel wide. Training
-on pictures of the textured model, without photographs, therefore follows (`distilling`).
+that of the textured splat at each of their centres, with the kernel that it has; a splat of one texel becomes the
+Gaussian nearest to its kernel. Splats smaller than a pixel are still drawn a pixel wide. Training on pictures of the
+textured model, without photographs, therefore follows (`distilling`).
 """
 
 import dataclasses
@@ -16,8 +17,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.appearance import Plain
+from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
+from a2tg_jax.appearance.shaped import curves_of, falloff_of
 from a2tg_jax.appearance.textured import shown_textures, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
@@ -58,8 +62,8 @@ def bake(
     """Return a plain model that looks like a textured one (host).
 
     Args:
-      model: of any appearance. `Textured`, and `Banded` around it, becomes a splat per texel or fewer; of others the
-        Gaussians are taken.
+      model: of any appearance. `Textured`, and `Shaped` or `Banded` around it, becomes a splat per texel or fewer; of
+        others the Gaussians are taken, those nearest to kernels of other shapes.
       cameras: views that the new model is trained on.
       growth: largest ratio of the bytes of all floats to those of the model. If the Gaussians differ in their degree,
         the common one is lowered until one splat for each fits.
@@ -88,7 +92,7 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     weights = texel_weights_of(model, cameras, model.background)
     tables = fewest_texels(shown, model.textures[1], weights, most_splats(model, degree, growth))
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
-    return as_plain(_split(whole, tables, options.uv), model)
+    return as_plain(_split(whole, model.appearance.shapes(model.params), tables, options.uv), model)
 
 
 def as_plain(gaussians: Gaussians, model: Model) -> Model:
@@ -140,12 +144,15 @@ def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
     return found
 
 
-def _split(gaussians: Gaussians, tables: Tables, convention: str) -> Gaussians:
-    """Return the Gaussians of all splats."""
-    pieces = [
-        _grid(gaussians[ids], texels, kernels(texels.shape[1], convention), kernels(texels.shape[2], convention))
-        for ids, texels in (_looked_up(*table, convention) for table in tables)
-    ]
+def _split(gaussians: Gaussians, shapes: Array | None, tables: Tables, convention: str) -> Gaussians:
+    """Return the Gaussians of all splats, given the shapes [N] of their kernels if they are not Gaussians."""
+    pieces = []
+    for ids, texels in (_looked_up(*table, convention) for table in tables):
+        parents, own, size = gaussians[ids], None, texels.shape[1:3]
+        if shapes is not None:
+            own = np.asarray(shapes)[ids]
+            parents, own = (nearest_gaussians(parents, own), None) if size == (1, 1) else (parents, own)
+        pieces.append(_grid(parents, own, texels, kernels(size[0], convention), kernels(size[1], convention)))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
     is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
     return joined[is_seen if is_seen.any() else slice(None)]
@@ -158,7 +165,14 @@ def _looked_up(ids: np.ndarray, texels: np.ndarray, convention: str) -> tuple[np
     return ids, found
 
 
-def _grid(parents: Gaussians, texels: np.ndarray, v: Kernels, u: Kernels) -> Gaussians:
+def _falloff(shapes: np.ndarray | None, rho: np.ndarray) -> np.ndarray:
+    """Return kernels of shapes [n] at squared distances [Tv, Tu], that of a Gaussian without shapes."""
+    if shapes is None:
+        return np.exp(-0.5 * rho)
+    return np.asarray(falloff_of(curves_of(jnp.asarray(shapes)[:, None, None]), jnp.asarray(rho)[None]), np.float64)
+
+
+def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: Kernels, u: Kernels) -> Gaussians:
     """Return n·Tv·Tu Gaussians in place of n that show textures [n, Tv, Tu, 4] at their centres."""
     tv, tu = texels.shape[1:3]
     places, scales = (
@@ -166,7 +180,7 @@ def _grid(parents: Gaussians, texels: np.ndarray, v: Kernels, u: Kernels) -> Gau
         for own_u, own_v in zip(u, v, strict=True)
     )
     opacities = np.asarray(parents.opacities, np.float64)[:, None, None]
-    shown = opacities * texels[..., 3] * np.exp(-0.5 * (v.means[:, None] ** 2 + u.means[None, :] ** 2))
+    shown = opacities * texels[..., 3] * _falloff(shapes, v.means[:, None] ** 2 + u.means[None, :] ** 2)
     depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
     own = np.einsum("vw,nwx,xu->nvu", _unmixed(v), depths, _unmixed(u).T)
     alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)

@@ -33,6 +33,7 @@ LADDER: Ladder = MappingProxyType(
         "sh_0": (4, 5, 6, 7, 8, 10),
         "sh_rest": (2, 3, 4, 5, 6, 8, 10),
         "texels": (3, 4, 5, 6, 7, 8, 10),
+        "shapes": (3, 4, 5, 6, 8, 10),
     }
 )
 """Candidate precisions of each group, from coarse to fine."""

@@ -176,8 +176,8 @@ def _check(model: Model, views: Sequence[View]) -> None:
     if not model.appearance.is_linear:
         kind = type(model.appearance.base).__name__
         raise ValueError(
-            f"a picture is not linear in what {kind} shows: Plain, Textured with signed RGB, or Banded around one of "
-            "these can be polished"
+            f"a picture is not linear in what {kind} shows: Plain, Textured with signed RGB, or Shaped or Banded "
+            "around one of these can be polished"
         )
 
 

@@ -38,7 +38,7 @@ def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.
     """Return the model with smaller textures and as many Gaussians as before (host).
 
     Args:
-      model: of `Textured` with signed RGB, or of `Banded` around it.
+      model: of `Textured` with signed RGB, or of `Shaped` or `Banded` around it.
       views: views to measure the loss on, such as the training views.
       max_loss: largest loss of PSNR in dB, as a mean over the views.
       background: [3] colour; None is the model's own.
@@ -75,7 +75,7 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
     if not can_shrink(model):
         raise ValueError(
             f"{type(model.appearance.base).__name__} has no textures that can shrink: Textured with signed RGB and "
-            "projected alpha, or Banded around it, has"
+            "projected alpha, or Shaped or Banded around it, has"
         )
 
 

@@ -19,7 +19,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
+from a2tg_jax.appearance.shaped import log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.atomic import replacing
@@ -45,7 +47,8 @@ from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
 
 MAGIC = b"a2tgz\r\n\x1a"
-VERSION = 1
+VERSION, SHAPED_VERSION = 1, 2
+"""Versions of files without and with shapes of kernels, which readers of version 1 refuse."""
 HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
 MOST_BYTES = 1 << 32
@@ -78,6 +81,8 @@ class CompactChoices:
     """Precision of the higher degrees, each with its own range."""
     texels: Precision = 7
     """Precision of RGB and alpha, each with its own range."""
+    shapes: Precision = 8
+    """Precision of the logarithms of the kernels' exponents as bits, or of their shapes as floats."""
     coder: Choice = "smallest"
     """Coder of all parts: lzma (Python's own), zstd, webp (lossless images), none, or the smallest for each part."""
 
@@ -105,7 +110,7 @@ def save_compact(path: str | os.PathLike[str], model: Model, *, choices: Compact
 
     Args:
       path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
-      model: one that shows Plain, Textured, or Banded of these.
+      model: one that shows Plain, Textured, or Shaped or Banded of these.
       choices: how finely its numbers are kept.
 
     Raises:
@@ -190,19 +195,25 @@ def _encoded(model: Model, choices: CompactChoices) -> tuple[bytes, int]:
         writer.indices("sizes", indices.reshape(-1), len(sizes))
         writer.numbers("texel_colors", rows.texels[:, :3].T, choices.texels, is_color=True)
         writer.numbers("texel_alphas", rows.texels[:, 3:].T, choices.texels)
+    if rows.shapes is None:
+        del header["choices"]["shapes"]
+    else:
+        is_bits = isinstance(choices.shapes, int)
+        writer.numbers("shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes)
     if model.origin is not None:
         header["origin"] = origin_to_dict(model.origin)
         for name, array in origin_arrays(model.origin).items():
             writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
     header |= dataclasses.asdict(writer.layout)
-    return _framed(header, writer.body), writer.num_unpacked
+    version = VERSION if rows.shapes is None else SHAPED_VERSION
+    return _framed(header, writer.body, version), writer.num_unpacked
 
 
-def _framed(header: Mapping[str, Any], body: bytes) -> bytes:
+def _framed(header: Mapping[str, Any], body: bytes, version: int = VERSION) -> bytes:
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
     coded = encode("zstd", np.frombuffer(text, np.uint8)[None])
     rest = coded + body
-    return HEAD.pack(MAGIC, VERSION, len(coded), len(text), zlib.crc32(rest)) + rest
+    return HEAD.pack(MAGIC, version, len(coded), len(text), zlib.crc32(rest)) + rest
 
 
 def _opacities(logits: np.ndarray, is_bits: bool) -> np.ndarray:
@@ -218,7 +229,7 @@ def _decoded(data: bytes) -> Model:
     appearance = appearance_from_dict(header["appearance"], ())
     check_encodable(appearance)
     reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
-    rows = _rows_of(reader, header, choices, appearance.has_degrees)
+    rows = _rows_of(reader, header, choices, appearance)
     origin = _origin_of(reader, header["origin"]) if "origin" in header else None
     reader.end()
     return model_of(rows, header["base_degree"], appearance, origin)
@@ -229,8 +240,9 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
         raise ValueError("is not a compact scene of a2tg-jax")
     _, version, num_coded, num_text, checksum = HEAD.unpack_from(data)
-    if version != VERSION:
-        raise ValueError(f"is a compact scene of version {version}; this program reads version {VERSION}")
+    if version not in (VERSION, SHAPED_VERSION):
+        versions = f"{VERSION} and {SHAPED_VERSION}"
+        raise ValueError(f"is a compact scene of version {version}; this program reads versions {versions}")
     rest = data[HEAD.size :]
     if zlib.crc32(rest) != checksum:
         raise ValueError("is damaged or cut off")
@@ -247,7 +259,7 @@ def _room(data: bytes) -> int:
     return FREE_ROOM + LARGEST_RATIO * len(data)
 
 
-def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices, has_degrees: bool) -> Rows:
+def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance) -> Rows:
     """Return the tables of a file, of no more rows than it can hold."""
     num, base, table = header["num"], header["base_degree"], header["degrees"]
     if type(num) is not int or num < 0 or type(base) is not int or not 0 <= base <= MAX_DEGREE:
@@ -256,7 +268,7 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices,
     log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
     quats = with_w(reader.numbers("quats", 3, num, choices.quats))
     opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
-    highest = MAX_DEGREE if has_degrees else base
+    highest = MAX_DEGREE if appearance.has_degrees else base
     if not set(table) <= set(range(base, highest + 1)):
         raise ValueError(f"degrees must lie in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
@@ -269,8 +281,12 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices,
     sizes, texels = None, None
     if "sizes" in header:
         sizes, texels = _textures_of(reader, header["sizes"], num, choices)
+    shapes = None
+    if appearance.shapes_name is not None:
+        shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
+        shapes = shapes_of(shapes) if isinstance(choices.shapes, int) else shapes
     logits = _logits(opacities) if isinstance(choices.opacities, int) else opacities
-    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels)
+    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
 
 
 def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:

@@ -53,12 +53,13 @@ class Splats(NamedTuple):
     """[N, K, 3] coefficients, as in `Gaussians`."""
 
 
-def splats_of(model: Model) -> Splats:
+def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
     """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
 
-    If splats have degrees of their own, coefficients go up to the highest of these.
+    If splats have degrees of their own, coefficients go up to the highest of these. `keeps_shapes` is as in
+    `plain_gaussians`.
     """
-    gaussians = plain_gaussians(dataclasses.replace(model, origin=None))
+    gaussians = plain_gaussians(dataclasses.replace(model, origin=None), keeps_shapes=keeps_shapes)
     quats = np.asarray(gaussians.quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])

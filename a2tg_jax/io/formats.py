@@ -24,6 +24,8 @@ LEARNED = {
     "pose": "learned motions of cameras",
 }
 """Corrections of photographs in words, by name."""
+BAKES = "(--bake turns them into plain splats)"
+"""Remedy for what plain splats do not keep."""
 Reader = Callable[[Path], Model | Gaussians]
 Writer = Callable[[Path, Model], None]
 
@@ -170,13 +172,25 @@ def file_bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in files_of(path))
 
 
+def beside_gaussians(model: Model) -> str:
+    """Return in words what a model shows beside plain splats, of what baking turns into these; "" if nothing."""
+    has_textures, has_shapes = model.textures is not None, model.appearance.shapes_name is not None
+    return " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
+
+
+def _lost_appearance(model: Model) -> list[str]:
+    """Return in words what plain splats do not keep of what a model shows."""
+    if bakeable := beside_gaussians(model):
+        return [f"{bakeable} {BAKES}"]
+    kind = type(model.appearance.base).__name__
+    return [] if kind == "Plain" else [f"what {kind} shows beside Gaussians"]
+
+
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     """Return in words what a file of some suffix does not keep of a model."""
     into, lost = format_of(path), list[str]()
-    if model.textures is not None and not into.keeps_appearance:
-        lost.append("textures (--bake turns them into plain splats)")
-    elif type(model.appearance.base).__name__ != "Plain" and not into.keeps_appearance:
-        lost.append(f"what {type(model.appearance.base).__name__} shows beside Gaussians")
+    if not into.keeps_appearance:
+        lost += _lost_appearance(model)
     degree = model.gaussians.sh_degree if model.bands is None else 3
     if degree > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")

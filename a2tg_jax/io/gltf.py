@@ -72,9 +72,9 @@ def save_gltf(
     Args:
       path: the file. *.gltf has its numbers in a *.bin beside it, any other name is one *.glb. Older ones are replaced
         once the new ones are whole.
-      model: any model without textures, or one that shows Plain, Textured, or Banded of these.
-      textures: write textures and degrees, too, as the extension A2TG_splat_textures. False writes plain splats of
-        any model, as `save_ply` does.
+      model: any model without textures, or one that shows Plain, Textured, or Shaped or Banded of these.
+      textures: write textures, degrees and shapes of kernels, too, as the extension A2TG_splat_textures. False writes
+        plain splats of any model, as `save_ply` does.
       texels: what keeps them, "float32" exactly or "uint8" in a quarter of the bytes.
 
     Raises:
@@ -107,8 +107,8 @@ def save_gltf(
 
 
 def _primitive(builder: Builder, model: Model, texels: TexelKind | None) -> dict[str, Any]:
-    """Return the points of the mesh; `texels` None leaves textures and degrees out."""
-    splats = splats_of(model)
+    """Return the points of the mesh; `texels` None leaves textures, degrees and shapes out."""
+    splats = splats_of(model, keeps_shapes=texels is not None)
     attributes = {
         MEANS: builder.add(splats.means, has_bounds=True),
         ROTATION: builder.add(splats.quats[:, [1, 2, 3, 0]]),
@@ -228,7 +228,7 @@ def _splats(document: Document, primitive: Mapping[str, Any]) -> Splats:
 
 def _rows(splats: Splats, shown: Shown, path: Path) -> Rows:
     """Return the tables of splats that show textures or have degrees."""
-    gaussians = gaussians_of(splats, path, is_flat=shown.sizes is not None)
+    gaussians = gaussians_of(splats, path, is_flat=shown.sizes is not None or shown.shapes is not None)
     num, highest = splats.sh.shape[:2]
     dense = np.zeros((num, NUM_BASES[-1] if shown.degrees is not None else highest, 3), np.float32)
     dense[:, :highest] = splats.sh
@@ -240,7 +240,7 @@ def _rows(splats: Splats, shown: Shown, path: Path) -> Rows:
     ]
     return Rows(
         np.asarray(gaussians.means), np.asarray(gaussians.quats), np.asarray(gaussians.log_scales),
-        np.asarray(gaussians.logit_opacities), degrees, tuple(bands), shown.sizes, shown.texels,
+        np.asarray(gaussians.logit_opacities), degrees, tuple(bands), shown.sizes, shown.texels, shown.shapes,
     )  # fmt: skip
 
 

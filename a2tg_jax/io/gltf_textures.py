@@ -1,4 +1,4 @@
-"""The extension A2TG_splat_textures of glTF: textures and degrees of splats beside KHR_gaussian_splatting.
+"""The extension A2TG_splat_textures of glTF: textures, degrees and kernels of splats beside KHR_gaussian_splatting.
 
 docs/formats.md describes it. Programs that do not know it show the plain splats.
 """
@@ -10,6 +10,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
+from a2tg_jax.appearance.shaped import log_exponents_of, shapes_of
 from a2tg_jax.appearance.textured import EXTENT
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict
@@ -29,7 +30,7 @@ RANGES = {"rgb": slice(0, 3), "alpha": slice(3, 4)}
 
 
 class Shown(NamedTuple):
-    """Textures and degrees of splats, beside their own colours."""
+    """Textures, degrees and kernels of splats, beside their own colours."""
 
     appearance: Appearance
     sizes: np.ndarray | None
@@ -40,6 +41,8 @@ class Shown(NamedTuple):
     """Degrees [N] of the spherical harmonics."""
     base_degree: int
     """Degree that all splats have."""
+    shapes: np.ndarray | None
+    """Shapes [N] of the kernels."""
 
 
 def add_textures(
@@ -56,6 +59,9 @@ def add_textures(
     if appearance.has_degrees:
         described["baseDegree"] = base_degree
         described["degrees"] = builder.add(rows.degrees.astype(np.uint8), is_attribute=False)
+    if rows.shapes is not None:
+        described["shapes"] = builder.add(log_exponents_of(rows.shapes).astype(np.float32), is_attribute=False)
+    if described:
         described.setdefault("maxAlpha", appearance.max_alpha)
     return described
 
@@ -75,15 +81,16 @@ def shown_of(document: Document, described: Mapping[str, Any], num: int, sh_degr
     Raises:
       ValueError: if a field is missing, out of range, or does not fit the others.
     """
-    has_textures, has_degrees = "sizes" in described, "degrees" in described
+    has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))
     names = {field: described[name] for name, field in OPTIONS.items() if name in described}
     options = config_from_dict(TextureOptions, names, EXTENSION)
     if not 0 < options.max_alpha < 1:
         raise ValueError(f"{EXTENSION}.maxAlpha must lie in (0, 1); got {options.max_alpha!r}")
-    appearance = appearance_for(options, has_textures=has_textures, has_degrees=has_degrees)
+    appearance = appearance_for(options, has_textures=has_textures, has_degrees=has_degrees, has_shapes=has_shapes)
     sizes, texels = _textures(document, described, num) if has_textures else (None, None)
     degrees, base = _degrees(document, described, num, sh_degree) if has_degrees else (None, sh_degree)
-    return Shown(appearance, sizes, texels, degrees, base)
+    shapes = _shapes(document, described["shapes"], num) if has_shapes else None
+    return Shown(appearance, sizes, texels, degrees, base, shapes)
 
 
 def _textures(document: Document, described: Mapping[str, Any], num: int) -> tuple[np.ndarray, np.ndarray]:
@@ -116,6 +123,13 @@ def _degrees(document: Document, described: Mapping[str, Any], num: int, sh_degr
     return degrees, base
 
 
+def _shapes(document: Document, index: Any, num: int) -> np.ndarray:
+    log_exponents = document.numbers(index, ("SCALAR",), f"{EXTENSION}.shapes")[:, 0]
+    if len(log_exponents) != num:
+        raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
+    return shapes_of(log_exponents)
+
+
 def _integers(document: Document, index: Any, kind: str, name: str, num: int, most: int) -> np.ndarray:
     """Return the integers [num, columns] of an accessor."""
     values = document.numbers(index, (kind,), f"{EXTENSION}.{name}")
@@ -135,9 +149,10 @@ def kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_told: bool
     if "appearance" not in kept:
         return shown
     appearance = appearance_from_dict(kept["appearance"], ())
-    is_same = type(appearance) is type(shown) and type(appearance.base) is type(shown.base) and appearance.is_portable
+    own, told = appearance.texture_options, shown.texture_options
+    is_same = appearance.is_portable and (own is None) == (told is None)
+    is_same &= appearance.has_degrees == shown.has_degrees and appearance.shapes_name == shown.shapes_name
     if is_same and is_told:
-        own, told = appearance.texture_options, shown.texture_options
         is_same = appearance.max_alpha == shown.max_alpha and all(
             getattr(own, field, None) == getattr(told, field, None) for field in OPTIONS.values()
         )

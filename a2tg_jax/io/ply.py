@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
+from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
@@ -55,7 +56,7 @@ def save_ply(
       path: the file; an older one is replaced once the new one is whole.
       gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show;
         they are as opaque as `Appearance.opacities` takes them to be (movable kernels and billboards have opacities of
-        their own).
+        their own). Kernels of other shapes become the nearest Gaussians.
       transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
         model back to the original world of its origin, if it has one.
@@ -72,11 +73,18 @@ def save_ply(
         temporary.write_bytes(encode_ply(gaussians, third))
 
 
-def plain_gaussians(gaussians: Gaussians | Model, transform: Similarity | None = None) -> Gaussians:
-    """Return the Gaussians of a model without what they show, in the original world. Arguments as in `save_ply`."""
+def plain_gaussians(
+    gaussians: Gaussians | Model, transform: Similarity | None = None, *, keeps_shapes: bool = False
+) -> Gaussians:
+    """Return the Gaussians of a model without what they show, in the original world.
+
+    Args:
+      gaussians, transform: as in `save_ply`.
+      keeps_shapes: the file keeps the shapes of kernels besides. If not, each kernel becomes the nearest Gaussian.
+    """
     if isinstance(gaussians, Model):
         model = gaussians.live
-        gaussians = _as_plain(model)
+        gaussians = _as_plain(model, keeps_shapes)
         transform = model.origin.transform if transform is None and model.origin is not None else transform
     check_gaussians(gaussians)
     return gaussians if transform is None else transform_gaussians(gaussians, transform.inverse())
@@ -104,10 +112,13 @@ def encode_ply(gaussians: Gaussians, third: np.ndarray | None) -> bytes:
     return f"{start}{properties}end_header\n".encode("ascii") + np.concatenate(columns, 1).astype("<f4").tobytes()
 
 
-def _as_plain(model: Model) -> Gaussians:
+def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
     """Return the Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
     shown = model.gaussians, model.params, model.layout
     gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
+    shapes = model.appearance.shapes(model.params)
+    if shapes is not None and not keeps_shapes:
+        gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
     if model.appearance.has_own_opacities:
         return gaussians
     opacities = jnp.clip(model.appearance.opacities(*shown), LEAST_OPACITY, LARGEST_OPACITY)

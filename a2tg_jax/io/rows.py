@@ -42,6 +42,8 @@ class Rows:
     """Sizes [N, 2] of their textures, (Tv, Tu); None without textures."""
     texels: np.ndarray | None
     """Texels [T, 4], one texture after the other, each row by row."""
+    shapes: np.ndarray | None = None
+    """Shapes [N] of their kernels; None if all are Gaussians."""
 
 
 def check_encodable(
@@ -50,7 +52,8 @@ def check_encodable(
     """Raise ValueError, saying what to do instead, unless a file can hold what splats show."""
     if not appearance.is_portable:
         raise ValueError(
-            f"model shows {type(appearance.base).__name__}: {file} holds Plain, Textured and Banded of these; {instead}"
+            f"model shows {type(appearance.base).__name__}: {file} holds Plain, Textured, and Shaped or Banded of "
+            f"these; {instead}"
         )
 
 
@@ -59,7 +62,7 @@ def rows_of(model: Model) -> Rows:
     field."""
     gaussians = model.gaussians
     fields = {field.name: np.asarray(getattr(gaussians, field.name)) for field in dataclasses.fields(gaussians)}
-    shown = model.appearance.arrays(model.params, model.layout)
+    shapes, shown = model.appearance.shapes(model.params), model.appearance.arrays(model.params, model.layout)
     for name, values in (*fields.items(), *shown.items()):
         if not np.isfinite(values).all():
             raise ValueError(f"model.{name} must be finite; some values are NaN or infinite")
@@ -71,7 +74,7 @@ def rows_of(model: Model) -> Rows:
         bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
     return Rows(
         fields["means"], fields["quats"], fields["log_scales"], fields["logit_opacities"], degrees, tuple(bands),
-        shown.get(prefix + "sizes"), shown.get(prefix + "texels"),
+        shown.get(prefix + "sizes"), shown.get(prefix + "texels"), None if shapes is None else np.asarray(shapes),
     )  # fmt: skip
 
 
@@ -87,6 +90,7 @@ def ordered(rows: Rows, order: np.ndarray) -> Rows:
         bands=tuple(band[_owned(rows.degrees, order, degree)] for degree, band in enumerate(rows.bands)),
         sizes=None if rows.sizes is None else rows.sizes[order],
         texels=None if rows.texels is None or rows.sizes is None else rows.texels[_texels(rows.sizes, order, axis)],
+        shapes=None if rows.shapes is None else rows.shapes[order],
     )
 
 
@@ -138,6 +142,8 @@ def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origi
     if rows.sizes is not None and rows.texels is not None:
         prefix = appearance.array_prefix
         arrays = {prefix + "sizes": rows.sizes, prefix + "texels": np.asarray(rows.texels, np.float32)}
+    if rows.shapes is not None and appearance.shapes_name is not None:
+        arrays[appearance.shapes_name] = np.asarray(rows.shapes, np.float32)
     if appearance.has_degrees:
         arrays |= {"degrees": rows.degrees, "base_degree": np.asarray(base_degree)}
         for degree, band in enumerate(rows.bands[base_degree + 1 :], base_degree + 1):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.appearance.shaped import log_exponents_of, shapes_of
 from a2tg_jax.io import quantise
 from a2tg_jax.io.quantise import Contraction, Ends
 from a2tg_jax.io.rows import Rows
@@ -16,6 +17,7 @@ from a2tg_jax.texture import MAX_SIDE
 
 BITS: Mapping[str, int] = {
     "log_scales": 8, "quats": 8, "opacities": 8, "sh_0": 8, "sh_1": 7, "sh_2": 6, "sh_3": 6, "colors": 8, "alphas": 8,
+    "shapes": 8,
 }  # fmt: skip
 """Bits of the numbers kept as a byte."""
 MEANS_BITS = 16
@@ -40,6 +42,8 @@ class Codes:
     """Band l > 0 is [3, 2l + 1, M]."""
     texels: np.ndarray | None
     """[4, T]."""
+    shapes: np.ndarray | None
+    """Logarithms [1, N] of the exponents of the kernels."""
     ends: Mapping[str, Any]
     """Ends of each group, for the header."""
 
@@ -51,6 +55,8 @@ class Codes:
         yield self.degrees[rows].astype(np.uint8).tobytes()
         if self.sizes is not None:
             yield self.sizes[:, rows].astype(np.uint8).tobytes()
+        if self.shapes is not None:
+            yield self.shapes[:, rows].astype(np.uint8).tobytes()
         for degree, band in enumerate(self.bands, 1):
             before = np.cumsum(np.concatenate([[0], self.degrees >= degree]))
             stop_row = min(stop, len(self.degrees))
@@ -93,8 +99,11 @@ def codes_of(rows: Rows) -> Codes:
             [coded("colors", signed_root(rows.texels[:, :3].T), is_color=True), coded("alphas", rows.texels[:, 3:].T)]
         )
     sizes = None if rows.sizes is None else rows.sizes.T
+    shapes = None if rows.shapes is None else coded("shapes", log_exponents_of(rows.shapes)[None])
     means_and_ends = {"means": axes, "ends": ends}
-    return Codes(np.array(means), np.concatenate(columns), rows.degrees, sizes, tuple(bands), texels, means_and_ends)
+    return Codes(
+        np.array(means), np.concatenate(columns), rows.degrees, sizes, tuple(bands), texels, shapes, means_and_ends
+    )
 
 
 def rows_of_body(header: Mapping[str, Any], body: bytes) -> Rows:
@@ -132,7 +141,13 @@ def rows_of_body(header: Mapping[str, Any], body: bytes) -> Rows:
         bands=tuple(bands),
         sizes=joined("sizes", 2).T if has_textures else None,
         texels=None if colors is None else np.concatenate([colors, values("alphas", texels[3:])]).T,
+        shapes=shapes_of(values("shapes", joined("shapes", 1)[0])) if has_shapes(header) else None,
     )
+
+
+def has_shapes(header: Mapping[str, Any]) -> bool:
+    """Return whether a file holds shapes of kernels."""
+    return "shapes" in header["ends"]
 
 
 def signed_root(x: np.ndarray) -> np.ndarray:
@@ -166,6 +181,8 @@ class Reader:
         sizes = None
         if self._header["num_texels"] is not None:
             sizes = found["sizes"] = self._take(2, num).astype(np.int64)
+        if has_shapes(self._header):
+            found["shapes"] = self._take(1, num).astype(np.int64)
         for degree in range(1, num_bands):
             count = int(np.count_nonzero(found["degrees"] >= degree))
             flat = self._take(3 * (2 * degree + 1), count).astype(np.int64)

@@ -29,11 +29,12 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.rows import Rows, model_of, ordered, rows_of
-from a2tg_jax.io.web_codes import codes_of, rows_of_body
+from a2tg_jax.io.web_codes import codes_of, has_shapes, rows_of_body
 from a2tg_jax.model import Model
 
 MAGIC = b"a2tgw\r\n\x1a"
-VERSION = 1
+VERSION, SHAPED_VERSION = 1, 2
+"""Versions of files without and with shapes of kernels, which readers of version 1 refuse."""
 HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header, bytes of the body as coded, checksum of the header."""
 LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
@@ -75,7 +76,7 @@ def encode_web_scene(
     """Return the bytes of a file.
 
     Args:
-      model: one that shows Plain, Textured, or Banded of these.
+      model: one that shows Plain, Textured, or Shaped or Banded of these.
       title: what the page is called.
       note: what the viewer says about the scene.
       near_plane: hits nearer than this do not show.
@@ -150,8 +151,9 @@ def _as_shown(model: Model) -> Model:
     textures, layout = model.textures
     model = model.with_textures(shown_textures(textures, layout, options), layout)
     seen = dataclasses.replace(options, rgb="signed", alpha="projected")
-    has_degrees = model.appearance.has_degrees
-    return dataclasses.replace(model, appearance=appearance_for(seen, has_textures=True, has_degrees=has_degrees))
+    shown = model.appearance
+    same = {"has_degrees": shown.has_degrees, "has_shapes": shown.shapes_name is not None}
+    return dataclasses.replace(model, appearance=appearance_for(seen, has_textures=True, **same))
 
 
 # The frame
@@ -162,7 +164,8 @@ def _framed(header: Mapping[str, Any], body: bytes, level: int) -> bytes:
     coded = zlib.compress(body, level)
     if len(body) > _room(len(coded)):
         coded = zlib.compress(body, 0)  # So alike are its numbers that the file would be taken for a bomb.
-    return HEAD.pack(MAGIC, VERSION, len(text), len(coded), zlib.crc32(text)) + text + coded
+    version = SHAPED_VERSION if has_shapes(header) else VERSION
+    return HEAD.pack(MAGIC, version, len(text), len(coded), zlib.crc32(text)) + text + coded
 
 
 def _room(num_coded: int) -> int:
@@ -174,8 +177,9 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
         raise ValueError("is not a web scene of a2tg-jax")
     _, version, num_text, num_coded, checksum = HEAD.unpack_from(data)
-    if version != VERSION:
-        raise ValueError(f"is a web scene of version {version}; this program reads version {VERSION}")
+    if version not in (VERSION, SHAPED_VERSION):
+        versions = f"{VERSION} and {SHAPED_VERSION}"
+        raise ValueError(f"is a web scene of version {version}; this program reads versions {versions}")
     if len(data) != HEAD.size + num_text + num_coded:
         raise ValueError(f"has {len(data)} bytes where {HEAD.size + num_text + num_coded} are announced")
     text = data[HEAD.size : HEAD.size + num_text]
@@ -227,10 +231,12 @@ def _appearance_of(header: Mapping[str, Any]) -> Appearance:
     max_alpha = header["max_alpha"]
     if not isinstance(max_alpha, float) or not 0 < max_alpha < 1:
         raise ValueError(f"max_alpha must lie in (0, 1); got {max_alpha!r}")
-    has_textures, has_degrees = header["num_texels"] is not None, header["banded"] is True
+    has_textures = header["num_texels"] is not None
     named = {"uv": header["uv"], "outside": header["outside"]} if has_textures else {}
     options = config_from_dict(TextureOptions, {**named, "max_alpha": max_alpha}, "options")
-    return appearance_for(options, has_textures=has_textures, has_degrees=has_degrees)
+    return appearance_for(
+        options, has_textures=has_textures, has_degrees=header["banded"] is True, has_shapes=has_shapes(header)
+    )
 
 
 def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from a2tg_jax.io.formats import beside_gaussians
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.results.viewing import Source
 
@@ -23,5 +24,6 @@ def export_ply(source: Source, out: Path) -> str:
     check_ply(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     save_ply(out, source.model)
-    left_out = "" if source.model.textures is None else ", without their textures, which PLY cannot hold"
+    lost = beside_gaussians(source.model)
+    left_out = f", without their {lost}, which PLY cannot hold" if lost else ""
     return f"file: {out}: {source.model.num:,} Gaussians{left_out}"

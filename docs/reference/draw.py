@@ -29,13 +29,20 @@ def draw(model, viewmat, K, width, height, background=(0, 0, 0), max_alpha=0.99,
             texel = looked_up(texture, u, v, uv)
             if outside == "identity":
                 texel = np.where((np.maximum(abs(u), abs(v)) > 3)[..., None], [0.0, 0.0, 0.0, 1.0], texel)
-        alpha = model["opacities"][i] * np.exp(-rho / 2)[..., None] * texel[..., 3:]
+        kernel = falloff(rho, model["exponents"][i] if "exponents" in model else 1.0)
+        alpha = model["opacities"][i] * kernel[..., None] * texel[..., 3:]
         alpha = np.where(alpha < LEAST_ALPHA, 0, np.minimum(alpha, max_alpha))
         is_live &= transmittance * (1 - alpha) >= LEAST_TRANSMITTANCE
         weight = np.where(is_live, alpha * transmittance, 0)
         image += weight * (colors[i] + texel[..., :3])
         transmittance = transmittance - weight
     return image + transmittance * np.asarray(background)
+
+
+def falloff(rho, exponent):
+    """Return a kernel at squared distances: that of a Gaussian if the exponent is 1."""
+    growth = lambda x: (x + 0.02) ** exponent - 0.02**exponent  # noqa: E731
+    return np.exp(-growth(rho) / growth(2.0))
 
 
 def rotations(quats):

@@ -9,7 +9,7 @@ import zlib
 import numpy as np
 import zstandard
 from PIL import Image
-from splats import dense, expanded, sigmoid, with_w
+from splats import dense, expanded, exponents, sigmoid, with_w
 
 
 def read_compact(path):
@@ -35,6 +35,9 @@ def read_compact(path):
         colors = parts.numbers("texel_colors", 3, count, choices["texels"], is_color=True)
         alphas = parts.numbers("texel_alphas", 1, count, choices["texels"])
         model["texels"] = np.concatenate([colors, alphas]).T
+    if "shapes" in choices:
+        values = parts.numbers("shapes", 1, num, choices["shapes"])[0]
+        model["exponents"] = exponents(np.tanh(values) if isinstance(choices["shapes"], str) else values)
     return model
 
 
@@ -42,8 +45,8 @@ def unframed(data):
     """Return header and body."""
     magic, version, num_coded, _, checksum = struct.unpack_from("<8sHIII", data)
     rest = data[22:]
-    if magic != b"a2tgz\r\n\x1a" or version != 1 or zlib.crc32(rest) != checksum:
-        raise ValueError("is no whole compact scene of version 1")
+    if magic != b"a2tgz\r\n\x1a" or version not in (1, 2) or zlib.crc32(rest) != checksum:
+        raise ValueError("is no whole compact scene of version 1 or 2")
     return json.loads(zstandard.ZstdDecompressor().decompress(rest[:num_coded])), rest[num_coded:]
 
 

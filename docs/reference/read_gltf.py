@@ -5,6 +5,7 @@ import json
 import struct
 
 import numpy as np
+from splats import exponents
 
 SPLATS, TEXTURES = "KHR_gaussian_splatting", "A2TG_splat_textures"
 COMPONENTS, SIDES = {5121: np.uint8, 5126: np.float32}, {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -40,6 +41,8 @@ def read_gltf(path):
         "degrees": numbers(extended["degrees"])[:, 0] if "degrees" in extended else np.full(len(sh), highest),
         "sh": sh,
     }
+    if "shapes" in extended:
+        model["exponents"] = exponents(numbers(extended["shapes"])[:, 0])
     if "sizes" in extended:
         model["sizes"] = numbers(extended["sizes"]).astype(int)
         texels = numbers(extended["texels"]) if "texels" in extended else np.zeros((0, 4))

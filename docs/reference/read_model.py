@@ -23,7 +23,7 @@ def read_model(path):
 
     means [N, 3]; quats [N, 4], wxyz; log_scales [N, 2]; opacities [N]; degrees [N]; sh [N, 16, 3], zero above the
     degree of a splat; with textures also sizes [N, 2], rows and columns, and texels [T, 4], one texture after the
-    other, each row by row. `header` is the file's own.
+    other, each row by row; where kernels differ in shape also exponents [N]. `header` is the file's own.
     """
     return READERS[Path(path).suffix](Path(path))
 
@@ -41,8 +41,10 @@ def read_npz(path):
     bands = [arrays["sh"][:, degree**2 : (degree + 1) ** 2] for degree in range(base + 1)]
     bands += [shown[f"band_{degree}"] for degree in range(base + 1, 4) if f"band_{degree}" in shown]
     for name, array in shown.items():
-        if (name := name.removeprefix("inner.")) in ("sizes", "texels"):  # "inner." where splats have degrees.
+        if (name := name.rpartition("inner.")[2]) in ("sizes", "texels"):  # "inner." where one class holds another.
             model[name] = array
+        if name == "shapes":
+            model["exponents"] = np.exp(np.tanh(array))
     return model | {"opacities": sigmoid(arrays["logit_opacities"]), "degrees": degrees, "sh": dense(bands, degrees)}
 
 

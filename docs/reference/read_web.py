@@ -5,7 +5,7 @@ import struct
 import zlib
 
 import numpy as np
-from splats import dense, expanded, with_w
+from splats import dense, expanded, exponents, with_w
 
 BITS = {"sh_1": 7, "sh_2": 6, "sh_3": 6}
 """Bits of the numbers that have no 8."""
@@ -38,6 +38,8 @@ def read_web(path):
         roots = values("colors", columns["texels"][:3], is_color=True)
         texels = np.concatenate([roots * np.abs(roots), values("alphas", columns["texels"][3:])])
         model |= {"sizes": columns["sizes"].T, "texels": texels.T}
+    if "shapes" in header["ends"]:
+        model["exponents"] = exponents(values("shapes", columns["shapes"][0]))
     return model
 
 
@@ -45,8 +47,8 @@ def unframed(data):
     """Return header and body."""
     magic, version, num_text, num_coded, checksum = struct.unpack_from("<8sHIII", data)
     text, coded = data[22 : 22 + num_text], data[22 + num_text : 22 + num_text + num_coded]
-    if magic != b"a2tgw\r\n\x1a" or version != 1 or zlib.crc32(text) != checksum:
-        raise ValueError("is no whole scene for browsers of version 1")
+    if magic != b"a2tgw\r\n\x1a" or version not in (1, 2) or zlib.crc32(text) != checksum:
+        raise ValueError("is no whole scene for browsers of version 1 or 2")
     return json.loads(text), zlib.decompress(coded)
 
 
@@ -65,6 +67,7 @@ def columns_of(header, body):
         means = take(6, num)
         chunk = {"means": means[:3] + 256 * means[3:], "numbers": take(9, num), "degrees": take(1, num)}
         chunk["sizes"] = take(2, num) if header["num_texels"] is not None else np.zeros((2, num), np.int64)
+        chunk["shapes"] = take(1, num) if "shapes" in header["ends"] else np.zeros((1, num), np.int64)
         for degree in range(1, header["num_bands"]):
             codes = take(3 * (2 * degree + 1), int(np.sum(chunk["degrees"] >= degree)))
             chunk[f"band_{degree}"] = codes.reshape(3, 2 * degree + 1, -1)

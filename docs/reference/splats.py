@@ -15,6 +15,11 @@ def sigmoid(x):
     return 1 / (1 + np.exp(-x))
 
 
+def exponents(logarithms):
+    """Return exponents of kernels; rounding may have moved their logarithms beyond 1."""
+    return np.exp(np.clip(logarithms, -1, 1))
+
+
 def with_w(xyz):
     """Return unit quaternions [n, 4] of x, y, z [3, n]."""
     return np.concatenate([np.sqrt(np.maximum(1 - np.sum(xyz**2, axis=0), 0))[None], xyz]).T

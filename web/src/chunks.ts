@@ -16,6 +16,8 @@ export interface Chunk {
   readonly degrees: Uint8Array;
   /** [2, n] texture sizes Tv, Tu; zeros without textures. */
   readonly sizes: Uint8Array;
+  /** [n] shapes of the kernels; zeros if all are Gaussians. */
+  readonly shapes: Uint8Array;
   /** Band l ≥ 1 at index l − 1: [3, 2l + 1, m] red − green, green, blue − green of the m rows of degree ≥ l. */
   readonly bands: readonly Uint8Array[];
   /** [4, t]: red − green, green, blue − green, alpha. */
@@ -95,13 +97,15 @@ export class ChunkReader {
     this.filled = 0;
   }
 
-  private parts(fixed: Uint8Array): Pick<Chunk, "means" | "numbers" | "degrees" | "sizes"> {
+  private parts(fixed: Uint8Array): Pick<Chunk, "means" | "numbers" | "degrees" | "sizes" | "shapes"> {
     const n = this.numRows;
+    const { numTexels, hasShapes } = this.header;
     return {
       means: fixed.subarray(0, 6 * n),
       numbers: fixed.subarray(6 * n, 15 * n),
       degrees: fixed.subarray(15 * n, 16 * n),
-      sizes: this.header.numTexels === null ? new Uint8Array(2 * n) : fixed.subarray(16 * n, 18 * n),
+      sizes: numTexels === null ? new Uint8Array(2 * n) : fixed.subarray(16 * n, 18 * n),
+      shapes: hasShapes ? fixed.subarray(fixed.length - n) : new Uint8Array(n),
     };
   }
 

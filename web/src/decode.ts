@@ -32,6 +32,8 @@ export interface Numbers {
   readonly sizes: Uint8Array;
   /** [T, 4] red, green, blue and alpha factor, one texture after the other. */
   readonly texels: Float64Array;
+  /** [N] exponents of the kernels; 1 is a Gaussian. */
+  readonly exponents: Float64Array;
 }
 
 /** Read a whole file. Throws a SceneError if it is damaged. */
@@ -57,6 +59,7 @@ class Decoder implements Numbers {
   readonly sh: Float64Array;
   readonly sizes: Uint8Array;
   readonly texels: Float64Array;
+  readonly exponents: Float64Array;
   private numTexels = 0;
 
   constructor(header: Header) {
@@ -70,6 +73,7 @@ class Decoder implements Numbers {
     this.sh = new Float64Array(3 * BASES * num);
     this.sizes = new Uint8Array(2 * num);
     this.texels = new Float64Array(4 * (header.numTexels ?? 0));
+    this.exponents = new Float64Array(num);
   }
 
   add(chunk: Chunk): void {
@@ -99,6 +103,7 @@ class Decoder implements Numbers {
     this.opacities[row] = this.value("opacities", code(5));
     this.sh.set(this.color("sh_0", code(6), code(7), code(8)), 3 * BASES * row);
     this.sizes.set([at(chunk.sizes, i), at(chunk.sizes, chunk.num + i)], 2 * row);
+    this.exponents[row] = Math.exp(Math.min(Math.max(this.value("shapes", at(chunk.shapes, i)), -1), 1));
   }
 
   /** Decode the coefficients of one degree, which come by colour and order, of the rows of that degree or more. */

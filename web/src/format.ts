@@ -6,7 +6,8 @@ import { isVector } from "./math";
 import type { Vec2, Vec3 } from "./math";
 
 export const MAGIC = [0x61, 0x32, 0x74, 0x67, 0x77, 0x0d, 0x0a, 0x1a];
-export const VERSION = 1;
+/** Versions of files without and with shapes of kernels. */
+export const VERSIONS = [1, 2];
 export const HEAD_BYTES = 22;
 const MOST_ROWS = 1 << 24;
 const LARGEST_HEADER = 1 << 24;
@@ -39,7 +40,8 @@ export interface Ends {
 }
 
 /** Quantized values, as the header names them. */
-export type Quantity = "log_scales" | "quats" | "opacities" | "sh_0" | "sh_1" | "sh_2" | "sh_3" | "colors" | "alphas";
+export type Quantity =
+  "log_scales" | "quats" | "opacities" | "sh_0" | "sh_1" | "sh_2" | "sh_3" | "colors" | "alphas" | "shapes";
 
 /** Quantization of one axis of the means: centre, spread, first and last step. */
 export type Axis = readonly [number, number, number, number];
@@ -53,6 +55,8 @@ export interface Header {
   readonly numBands: number;
   /** Total number of texels; null without textures. */
   readonly numTexels: number | null;
+  /** Whether kernels have shapes of their own. */
+  readonly hasShapes: boolean;
   readonly bytes: number;
   readonly nearPlane: number;
   readonly maxAlpha: number;
@@ -73,8 +77,9 @@ export function parseHead(bytes: Uint8Array): Head {
   }
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const version = view.getUint16(8, true);
-  if (version !== VERSION) {
-    throw new SceneError(`The scene file has version ${version}; this viewer reads version ${VERSION}.`);
+  if (!VERSIONS.includes(version)) {
+    const known = VERSIONS.join(" and ");
+    throw new SceneError(`The scene file has version ${version}; this viewer reads versions ${known}.`);
   }
   const head = {
     headerBytes: view.getUint32(10, true),
@@ -98,6 +103,7 @@ export function parseHeader(text: Uint8Array, head: Head): Header {
     baseDegree: raw.count("base_degree", 0, 3),
     numBands: raw.count("num_bands", 1, 4),
     numTexels: raw.isNull("num_texels") ? null : raw.count("num_texels", 0, MOST_ROWS),
+    hasShapes: raw.fields("ends").has("shapes"),
     bytes: raw.count("bytes", 0, FREE_ROOM + LARGEST_RATIO * head.bodyBytes),
     nearPlane: raw.between("near_plane", 0, 1e9),
     maxAlpha: raw.between("max_alpha", 0, 1),
@@ -115,8 +121,9 @@ export function parseHeader(text: Uint8Array, head: Head): Header {
   return header;
 }
 
-/** Return the bytes per row in the first part of a chunk: 6 of means, 9 of numbers, degree, texture sizes. */
-export const fixedColumns = (header: Header): number => (header.numTexels === null ? 16 : 18);
+/** Return the bytes per row in the first part of a chunk: 6 of means, 9 of numbers, degree, texture sizes, shape. */
+export const fixedColumns = ({ numTexels, hasShapes }: Header): number =>
+  16 + (numTexels === null ? 0 : 2) + Number(hasShapes);
 
 function meansOf(axes: readonly unknown[]): Header["means"] {
   const axis = (i: number): Axis => vector<Axis>(axes[i], 4, `means[${i}]`);
@@ -138,6 +145,7 @@ function endsOf(raw: Fields): Header["ends"] {
     sh_3: ends("sh_3", 6),
     colors: ends("colors", 8),
     alphas: ends("alphas", 8),
+    shapes: ends("shapes", 8),
   };
 }
 

@@ -1,8 +1,9 @@
 /**
  * Repacking of chunks for the shader. Each row takes 32 bytes, two texels of four 32-bit words:
  *
- *     x, y, z as floats | degree 0: red, green, blue; degree
- *     quaternion x, y, z; opacity | log-scale u, v; Tu, Tv | first texel of its texture | first word of its harmonics
+ *     x, y, z as floats | degree 0: red, green, blue; shape of the kernel
+ *     quaternion x, y, z; opacity | log-scale u, v; Tu + 32 Tv + 1024 degree | first texel of its texture | first word
+ *     of its harmonics
  *
  * Each coefficient above degree 0 takes one word (red, green, blue, unused), padded to groups of four. Each texel takes
  * four bytes.
@@ -44,7 +45,7 @@ export class Packer {
     const means = positions(chunk, this.header.means);
     const rows = new Uint32Array(ROW_WORDS * chunk.num);
     const floats = new Float32Array(rows.buffer);
-    const { num, numbers, degrees, sizes } = chunk;
+    const { num, numbers, degrees, sizes, shapes } = chunk;
     let texel = this.numTexels;
     let harmonic = this.numHarmonics;
     for (let i = 0; i < num; i++) {
@@ -52,9 +53,10 @@ export class Packer {
       const byte = (column: number): number => numbers[column * num + i]!;
       const green = byte(7);
       floats.set(means.subarray(3 * i, 3 * i + 3), place);
-      rows[place + 3] = word(byte(6) + green, green, byte(8) + green, degrees[i]!);
+      rows[place + 3] = word(byte(6) + green, green, byte(8) + green, shapes[i]!);
       rows[place + 4] = word(byte(2), byte(3), byte(4), byte(5));
-      rows[place + 5] = word(byte(0), byte(1), sizes[num + i]!, sizes[i]!);
+      const packed = sizes[num + i]! | (sizes[i]! << 5) | (degrees[i]! << 10);
+      rows[place + 5] = word(byte(0), byte(1), packed, packed >> 8);
       rows[place + 6] = texel;
       rows[place + 7] = harmonic;
       texel += sizes[i]! * sizes[num + i]!;

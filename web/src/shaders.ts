@@ -27,7 +27,13 @@ vec4 texelAt(uint index) {
 }
 `;
 
-export const SPLAT_VERTEX = `${HEADER}${TEXELS}
+/** Falloff of kernels with shapes: exp(-scale ((rho + OFFSET)^exponent - start)), as in a2tg_jax/appearance/shaped.py. */
+const KERNEL = `
+uniform bool isShaped;
+const float OFFSET = 0.02, LARGEST_LOG_EXPONENT = 1.0;
+`;
+
+export const SPLAT_VERTEX = `${HEADER}${TEXELS}${KERNEL}
 layout(location = 0) in uint row;
 
 uniform usampler2D rows, harmonics;
@@ -37,7 +43,7 @@ uniform vec2 size;
 uniform float nearPlane, peak;
 uniform vec3 boxAxes[3], boxLow, boxHigh;
 uniform float faintest, largest;
-uniform vec2 scaleEnds, quatEnds, opacityEnds, harmonicEnds[4];
+uniform vec2 scaleEnds, quatEnds, opacityEnds, shapeEnds, harmonicEnds[4];
 uniform int mode;
 uniform bool isClamped;
 
@@ -47,6 +53,7 @@ flat out vec3 mean;
 flat out vec4 shown;
 flat out uvec3 region;
 flat out vec3 own;
+flat out vec3 curve;
 
 const float SLACK = 1e-2;
 
@@ -59,6 +66,13 @@ vec4 bytesOf(uint word) {
 }
 
 vec4 values(uint word, vec2 ends) { return ends.x + bytesOf(word) * ends.y; }
+
+// Exponent, scale and start of the falloff of a kernel.
+vec3 curveOf(float logExponent) {
+  float exponent = exp(clamp(logExponent, -LARGEST_LOG_EXPONENT, LARGEST_LOG_EXPONENT));
+  float start = pow(OFFSET, exponent);
+  return vec3(exponent, 1.0 / (pow(2.0 + OFFSET, exponent) - start), start);
+}
 
 // Coefficient k, 1 to 15, from the words of one row.
 vec3 coefficient(uvec4 words[4], int k, vec2 ends) { return values(words[(k - 1) >> 2][(k - 1) & 3], ends).rgb; }
@@ -161,7 +175,7 @@ vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side, out bool 
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
-  axes = vec4(0); plane = vec3(0); mean = vec3(0); shown = vec4(0); region = uvec3(0); own = vec3(0);
+  axes = vec4(0); plane = vec3(0); mean = vec3(0); shown = vec4(0); region = uvec3(0); own = vec3(0); curve = vec3(0);
   uvec4 first = wordsAt(rows, 2u * row);
   vec3 position = uintBitsToFloat(first.xyz);
   float depth = dot(projection[2].xyz, position) + projection[2].w;
@@ -173,6 +187,10 @@ void main() {
   float cutoff = 2.0 * log(255.0 * opacity * peak);
   if (mode == ELLIPSES) cutoff = opacity < 0.02 ? 0.0 : 2.0;
   if (!(cutoff > 0.0)) return;
+  if (isShaped) {
+    curve = curveOf(values(first.w, shapeEnds).a);
+    cutoff = pow(cutoff / (2.0 * curve.y) + curve.z, 1.0 / curve.x) - OFFSET;
+  }
 
   vec2 scales = exp(values(second.y, scaleEnds).xy);
   if (opacity < faintest || max(scales.x, scales.y) > largest) return;
@@ -197,8 +215,8 @@ void main() {
   mean = vec3(middle, depth);
 
   vec4 base = values(first.w, harmonicEnds[0]);
-  vec3 color = colorOf(base.rgb, second.w, int(first.w >> 24), normalize(position - center));
-  uvec2 sides = uvec2(second.y >> 16, second.y >> 24) & 255u;
+  vec3 color = colorOf(base.rgb, second.w, int(second.y >> 26), normalize(position - center));
+  uvec2 sides = uvec2(second.y >> 16, second.y >> 21) & 31u;
   region = uvec3(second.z, sides);
   if (sides.x == 0u) region.yz = uvec2(0);
   if (mode == PLAIN) region.yz = uvec2(0);
@@ -228,13 +246,14 @@ void main() {
 }
 `;
 
-export const SPLAT_FRAGMENT = `${HEADER}${TEXELS}
+export const SPLAT_FRAGMENT = `${HEADER}${TEXELS}${KERNEL}
 flat in vec4 axes;
 flat in vec3 plane;
 flat in vec3 mean;
 flat in vec4 shown;
 flat in uvec3 region;
 flat in vec3 own;
+flat in vec3 curve;
 
 uniform float nearPlane, maxAlpha;
 uniform int mode;
@@ -270,7 +289,8 @@ void main() {
     fragment = vec4(mix(shown.rgb, vec3(0.02), 0.75 * edge), 1.0);
     return;
   }
-  float alpha = shown.a * exp(-0.5 * rho);
+  float exponent = isShaped ? curve.y * (pow(rho + OFFSET, curve.x) - curve.z) : 0.5 * rho;
+  float alpha = shown.a * exp(-exponent);
   vec3 color = shown.rgb;
   if (region.y > 0u) {
     vec4 texel = textureAt(uv);

@@ -3,7 +3,7 @@ import { expect, test } from "vitest";
 
 import { readNumbers } from "../src/decode";
 import { SceneError } from "../src/format";
-import { NUMBERS, SMALL } from "./small";
+import { NUMBERS, SHAPED, SMALL } from "./small";
 
 const DATA = new URL("../../tests/data/", import.meta.url);
 const KEPT = JSON.parse(readFileSync(new URL("numbers.json", DATA), "utf8")) as Record<
@@ -27,6 +27,14 @@ test.each(["means", "quats", "logScales", "opacities", "degrees", "sh", "sizes",
     near(found[name], wanted, 2e-6);
   },
 );
+
+test("kernels have the exponents of the Python reader, and are Gaussians without shapes", async () => {
+  const wanted = KEPT["shaped.a2tgw"]?.exponents ?? [];
+  const found = await readNumbers(SHAPED);
+  expect(found.exponents.length).toBe(wanted.length);
+  near(found.exponents, wanted, 2e-6);
+  expect(new Set((await readNumbers(SMALL)).exponents)).toEqual(new Set([1]));
+});
 
 test("a scene of several chunks is decoded in full", async () => {
   const found = await readNumbers(SMALL);

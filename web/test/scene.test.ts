@@ -8,7 +8,7 @@ import { HEAD_BYTES, SceneError, fixedColumns, parseHead, parseHeader } from "..
 import type { Header, Quantity } from "../src/format";
 import { HARMONIC_TEXELS, Packer, mostHarmonics } from "../src/packing";
 import { fromBytes, readScene } from "../src/source";
-import { NUMBERS, SMALL } from "./small";
+import { NUMBERS, SHAPED, SMALL } from "./small";
 
 const NUM = NUMBERS.degrees.length;
 
@@ -77,11 +77,13 @@ test("packed rows equal those of the Python reader", async () => {
         near(value("quats", byteOf(words, 4, k)), at(NUMBERS.quats, 4 * row + k + 1));
         if (row < 40) near(value("sh_0", byteOf(words, 3, k)), at(NUMBERS.sh, 48 * row + k));
       }
-      const degree = byteOf(words, 3, 3);
+      const sides = at(words, 5) >>> 16;
+      const degree = sides >> 10;
+      expect(byteOf(words, 3, 3)).toBe(at(chunk.shapes, i));
       expect(degree).toBe(NUMBERS.degrees[row]);
       near(value("opacities", byteOf(words, 4, 3)), at(NUMBERS.opacities, row));
       for (let k = 0; k < 2; k++) near(value("log_scales", byteOf(words, 5, k)), at(NUMBERS.log_scales, 2 * row + k));
-      const [width, height] = [byteOf(words, 5, 2), byteOf(words, 5, 3)];
+      const [width, height] = [sides & 31, (sides >> 5) & 31];
       expect([height, width]).toEqual(NUMBERS.sizes.slice(2 * row, 2 * row + 2));
       expect([words[6], words[7]]).toEqual([texel, harmonic]);
       for (let k = 1; row < 40 && k < (degree + 1) ** 2; k++) {
@@ -120,6 +122,18 @@ test.each([1, 7, 1000, 1e6])("bytes may arrive in pieces of %i", async (size) =>
   reader.end();
   expect(found).toEqual(chunks);
   expect(() => reader.push(new Uint8Array(1))).toThrow(SceneError);
+});
+
+test("shapes of kernels take a column more, and a byte of the packed rows", async () => {
+  const { header, chunks } = await read(SHAPED);
+  expect([header.hasShapes, fixedColumns(header)]).toEqual([true, 19]);
+  const packer = new Packer(header);
+  for (const chunk of chunks) {
+    const { rows } = packer.pack(chunk);
+    expect(new Set(chunk.shapes).size).toBe(chunk.num);
+    chunk.shapes.forEach((code, i) => expect(byteOf(rows, 8 * i + 3, 3)).toBe(code));
+  }
+  expect((await read(SMALL)).header.hasShapes).toBe(false);
 });
 
 test("truncated files are rejected", async () => {
