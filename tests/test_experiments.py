@@ -112,7 +112,7 @@ def test_equal_bytes_are_no_more_and_less_by_a_splat_at_most(mb, floats):
 def test_a_method_whose_gaussians_differ_in_size_fills_the_bytes_of_the_reference_as_its_budget():
     grid = read_grid("fixed_memory", "long", scenes=["fox"])
     finished = {grid.reference_job(grid.cells[0]).key: record(mb=0.7123)}
-    (run,) = (run for run in grid.runs(finished) if run.method.label == "Bytewise")
+    (run,) = (run for run in grid.runs(finished) if run.method.label == "Bytewise, Gaussian kernels")
     assert run.is_at_equal_bytes and run.job.system.memory_budget == 0.7123
     assert run.cell.budget is None, "it stays in the cell of the others"
 
