@@ -149,7 +149,7 @@ def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_caps_use_up_every_budget(name):
     """But for less than one Gaussian, of whatever degree; for A²TG textures make up the rest."""
-    floats = {"textured-gaussians": 64, "supergaussians": 27, "bbsplat": 4 * 256 - 1, "a2tg": 20}
+    floats = {"textured-gaussians": 64, "supergaussians": 27, "bytewise": 1, "bbsplat": 4 * 256 - 1, "a2tg": 20}
     rng = np.random.default_rng(0)
     for budget, sh_degree in itertools.product(np.exp(rng.uniform(-4, 6, 50)), range(4)):
         degree = "base_degree" if name == "bytewise" else "sh_degree"
