@@ -469,7 +469,7 @@ def test_the_schema_knows_what_is_written(saved):
         described = schema["properties"][name]
         assert described["default"] == getattr(TextureOptions(), field)
         assert name == "maxAlpha" or tuple(described["enum"]) == typing.get_args(hints[field])
-    written = set(extension_of(saved[0])) | {"texelRanges", "degrees", "baseDegree"}
+    written = set(extension_of(saved[0])) | {"texelRanges", "degrees", "baseDegree", "shapes"}
     assert written == set(schema["properties"])
     for name, wanted in schema["dependentRequired"].items():
         assert {name, *wanted} <= set(schema["properties"])

@@ -94,7 +94,7 @@ class Liveness:
                     break
                 if kind in (LOST, QUIT):
                     return self._end(text)
-        except (EOFError, OSError):
+        except (EOFError, OSError, TypeError):  # TypeError: Python's, of a connection that is closed during a read
             reason = "has ended"
         self._end(f"process {number} of {self._count} {reason}")
 
