@@ -8,9 +8,9 @@ import pytest
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.densify.view_dependence import AdaptDegrees
-from a2tg_jax.results.record import compared_system
+from a2tg_jax.results.record import RunFile, compared_system
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.training.registry import with_changes
+from a2tg_jax.training.registry import system_from_dict, system_to_dict, with_changes
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,17 @@ def test_beside_another_system_it_stays_what_it_is():
     beside = compared_system("bytewise", other, "quick")
     assert beside.initial_sh_degree == 0 and beside.sh_degree == 3
     assert compared_system("gaussians-2d-mcmc", Bytewise.preset("quick"), "quick").initial_sh_degree == 3
+
+
+def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():
+    """Records hold all options; options by hand lack most and get today's defaults."""
+    record = system_to_dict(Bytewise.preset("quick"))
+    del record["options"]["kernel"]
+    assert system_from_dict(record, "model.npz").kernel.rate == 0
+    file = RunFile(system="bytewise", preset="quick", options=record["options"])
+    assert file.chosen("run.toml").kernel.rate == 0
+    by_hand = dataclasses.replace(file, options={"prune": {"share": 0.2}})
+    assert by_hand.chosen("mine.toml").kernel.rate == Bytewise().kernel.rate > 0
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
 from a2tg_jax.training.options import BUDGET_OPTIONS
-from a2tg_jax.training.registry import differences, with_changes
+from a2tg_jax.training.registry import differences, with_changes, with_earlier_options
 
 SYNTHETIC = "synthetic"
 SYNTHETIC_SIZE = (208, 156)
@@ -179,7 +179,8 @@ class RunFile:
         Raises:
           ValueError: if there is no such system or preset, or an option is unknown or of another type.
         """
-        return with_changes(chosen_system(self.system, self.preset), self.options, f"{where}: options")
+        system = chosen_system(self.system, self.preset)
+        return with_changes(system, with_earlier_options(type(system), self.options), f"{where}: options")
 
 
 def label_of(name: str) -> str:

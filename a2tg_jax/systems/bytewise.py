@@ -106,6 +106,7 @@ class Bytewise(System):
 
     name: ClassVar[str] = "bytewise"
     version: ClassVar[int] = 2
+    earlier_options: ClassVar[Mapping[str, Any]] = {"kernel": {"rate": 0.0}}
     ranges: ClassVar[Ranges] = {**LOOKUP_RANGES, **PRUNE_RANGES}
     event_options: ClassVar[Mapping[str, str]] = {
         **MCMC_OPTIONS,

@@ -184,6 +184,8 @@ class System:
     """Name on the command line."""
     version: ClassVar[int] = 1
     """Version of the method. Raise it when the same options train another model."""
+    earlier_options: ClassVar[Mapping[str, Any]] = {}
+    """Values that options had before there were such options, as records of older versions mean them."""
     ranges: ClassVar[Ranges] = {}
     """Ranges of the system's own options."""
     event_options: ClassVar[Mapping[str, str]] = {}

@@ -100,7 +100,18 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
         raise ValueError(
             f"{where}: is of the system {shortened(name)!r}, which is not known here: import its module first"
         )
-    return config_from_dict(kind, options, f"{where}: options")
+    return config_from_dict(kind, with_earlier_options(kind, options), f"{where}: options")
+
+
+def with_earlier_options(kind: type[System], options: Any) -> Any:
+    """Return the options of a record with those that it lacks because an older version wrote it, at their values of
+    then. Options given by hand lack others, too, and are returned unchanged."""
+    if not isinstance(options, Mapping) or not kind.earlier_options:
+        return options
+    values = config_to_dict(kind())
+    groups = {name for name in vars(kind).get("__annotations__", {}) if isinstance(values.get(name), Mapping)}
+    is_record = groups - kind.earlier_options.keys() <= options.keys()
+    return {**kind.earlier_options, **options} if is_record else options
 
 
 def with_changes(system: System, changes: Mapping[str, Any], where: str) -> System:
