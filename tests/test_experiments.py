@@ -19,6 +19,7 @@ import numpy as np
 import polish
 import pytest
 import shrink
+import summary
 import upscale_gains
 from lab import pages, queue, spreadsheet, tables, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
@@ -620,6 +621,22 @@ def test_gains_have_the_verdict_that_seeds_allow():
     assert "+0.35 (above)" in text and "0.50 a pixel" in text and "differ by 0.10 dB" in text
     assert tables.verdict([0.05, -0.01], 0.1) == "undecided"
     assert tables.verdict([-0.3], 0.1) == "below"
+
+
+def test_the_best_plain_method_is_that_of_each_cell_which_has_all():
+    first, second = summary.PLAIN_METHODS
+    results = [result(first, 20.0), result(second, 21.0), result(first, 24.0, 1), result(second, 23.0, 1)]
+    results += [result(first, 30.0, 2), result(summary.BYTEWISE, 22.0), result(summary.BYTEWISE, 26.0, 1)]
+    best = summary.best_plain(results)
+    assert [(one.run.cell.seed, one["psnr"]) for one in best] == [(0, 21), (1, 24)]
+    assert {one.label for one in best} == {summary.BEST}
+    told = summary.bytes_table([dataclasses.replace(one, run=with_budget(one.run, 0.3)) for one in results])
+    assert "Bytewise less the best plain method: fox | +1.50" in told
+    assert "less MCMC of degree 0: mean** | +2.00" in told
+
+
+def with_budget(run: Run, megabytes: float) -> Run:
+    return dataclasses.replace(run, cell=dataclasses.replace(run.cell, budget=megabytes))
 
 
 def test_quality_is_averaged_over_seeds_and_what_is_missing_is_a_dash():

@@ -55,7 +55,8 @@ class KernelConfig:
     """Shapes of the kernels."""
 
     rate: float = 0.01
-    """Adam's learning rate of the shapes; 0: all kernels are Gaussians, as other programs draw them."""
+    """Adam's learning rate of the shapes; 0: all kernels are Gaussians, as other programs draw them, for which a
+    view_dependence.share of 0.23 is better."""
 
 
 @dataclasses.dataclass(frozen=True)
