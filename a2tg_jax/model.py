@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
+from a2tg_jax.appearance.layers import layers_in_words
 from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
@@ -227,12 +228,11 @@ class Model:
 
     def _facts(self) -> list[tuple[str, str]]:
         """Return what a reader asks about a model, by name (host)."""
-        kind, base = type(self.appearance).__name__, type(self.appearance.base).__name__
         degree = self.gaussians.sh_degree
         facts = [
             ("Gaussians", counted(self.num, "Gaussian")),
             ("view dependence", f"SH degrees {degree} to 3" if self.appearance.has_degrees else f"SH degree {degree}"),
-            ("appearance", kind if kind == base else f"{kind} around {base}"),
+            ("appearance", layers_in_words(self.appearance.layers)),
             ("memory", in_bytes(self.num_bytes)),
         ]
         return facts if self.origin is None else [*facts, ("origin", repr(self.origin))]

@@ -10,6 +10,7 @@ from test_oracle import FACING, FOCAL, hand_scene
 from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appearance, save_model
 from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Shaped, Textured, appearance_for
 from a2tg_jax.appearance.copies import share
+from a2tg_jax.appearance.layers import layer_without, layers_in_words
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.gaussians import logit
 from a2tg_jax.texture import allocate_textures
@@ -243,6 +244,17 @@ def test_a_wrapper_can_do_what_it_wraps_can(appearance):
     assert not appearance.has_degrees and Banded(appearance).has_degrees
     assert not Shaped(Banded(appearance)).is_portable and not Shaped(Shaped(appearance)).is_portable
     assert not Banded(Banded(appearance)).is_portable and Banded(Banded(appearance)).base is appearance
+
+
+def test_messages_name_the_innermost_layer_that_lacks_something():
+    def unportable(appearance: Appearance) -> str:
+        return layer_without(appearance, lambda layer: layer.is_portable)
+
+    assert unportable(Banded(Shaped(MovableKernels()))) == "MovableKernels"
+    assert unportable(Shaped(Banded())) == unportable(Banded(Shaped(Banded()))) == "Shaped and Banded around Plain"
+    assert unportable(OwnShapes()) == "OwnShapes around Plain"
+    assert layer_without(Banded(Textured()), lambda layer: True) == "Textured"
+    assert layers_in_words(Banded(Shaped(Textured())).layers) == "Banded and Shaped around Textured"
 
 
 def test_portable_appearances_come_from_their_options():

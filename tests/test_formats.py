@@ -30,7 +30,7 @@ from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by
+from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.io.gaussforge_files import SUFFIXES
 from a2tg_jax.results import first_stage, preflight, run_training
 from a2tg_jax.results.first_stage import GivenSplats
@@ -171,6 +171,9 @@ def test_what_a_format_does_not_keep():
     shaped = Model(some_gaussians(), params, layout, appearance=Shaped(Textured()))
     assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (--bake turns them into plain splats)"]
     assert lost_by(shaped, "a.glb") == lost_by(shaped, "a.a2tgz") == ["last digits"]
+    unseen = "textures and shapes of kernels (--bake turns them into plain splats)"
+    assert unseen_elsewhere(shaped, "a.glb") == unseen
+    assert unseen_elsewhere(shaped, "a.a2tgz") == unseen_elsewhere(Model(some_gaussians()), "a.glb") == ""
     kernels = Model(some_gaussians(), params._replace(inner=()), layout._replace(inner=()), appearance=Shaped())
     assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (--bake turns them into plain splats)"
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
@@ -204,6 +207,7 @@ def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
     save_model(tmp_path / "a.npz", model)
     main(["convert", str(tmp_path / "a.npz"), str(tmp_path / f"b{suffix}")])
     assert "not kept by this format: last digits\n" in (told := capsys.readouterr().out) and "(0." not in told
+    assert f"not shown by other programs: {TEXTURES}\n" in told
     main(["convert", str(tmp_path / f"b{suffix}"), str(tmp_path / "c.npz")])
     found = load_model(tmp_path / "c.npz")
     assert found.origin == model.origin and found.appearance == model.appearance

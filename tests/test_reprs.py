@@ -12,6 +12,7 @@ from PIL import Image
 from scenes_random import as_camera, as_gaussians, draw_scene
 from small_models import some_model
 
+from a2tg_jax.appearance import Appearance, Banded, Shaped, Textured
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics
 from a2tg_jax.model import Model
@@ -39,6 +40,11 @@ def small_model() -> Model:
     return Model(as_gaussians(draw_scene(1, num=5), "float32"))
 
 
+def shaped_model(appearance: Appearance) -> Model:
+    gaussians = small_model().gaussians
+    return Model(gaussians, *appearance.allocate(jax.random.key(0), gaussians), appearance=appearance)
+
+
 def some_history() -> History:
     return History.empty().with_point(1, 100, 0.5, 20.0, 5, 0.1, 2.0).with_point(2, 1200, 0.4, 21.25, 5, 0.1, 9.0)
 
@@ -62,6 +68,10 @@ LINES = {
         EVALUATION, lpips_network=None
     ),
     "Model(5 Gaussians, SH degree 3, Plain, 1.16 kB)": small_model,
+    "Model(5 Gaussians, SH degree 3, Shaped around Plain, 1.18 kB)": lambda: shaped_model(Shaped()),
+    "Model(5 Gaussians, SH degrees 3 to 3, Banded and Shaped around Textured, 1.26 kB)": lambda: shaped_model(
+        Banded(Shaped(Textured()))
+    ),
     "FitResult(A2tg, 2 stages, 5 Gaussians, 1.16 kB, 25 s)": fit_result,
     "StageResult('texture', 5 Gaussians, 1.16 kB, 12 s)": lambda: fit_result().stages[0],
     "History(2 rows to iteration 1,200 of stage 2, 21.25 dB)": some_history,

@@ -130,10 +130,11 @@ def test_what_cannot_shrink_is_refused():
     official = dataclasses.replace(model, appearance=Textured(options=TextureOptions.official()))
     with pytest.raises(ValueError, match="signed RGB"):
         shrink_textures(official, views)
-    params, layout = MovableKernels().allocate(None, model.gaussians)
-    movable = dataclasses.replace(model, params=params, layout=layout, appearance=MovableKernels())
-    with pytest.raises(ValueError, match="MovableKernels"):
-        shrink_textures(movable, views)
+    for appearance, name in ((MovableKernels(), "MovableKernels"), (Banded(Shaped()), "Plain")):
+        params, layout = appearance.allocate(None, model.gaussians)
+        other = dataclasses.replace(model, params=params, layout=layout, appearance=appearance)
+        with pytest.raises(ValueError, match=f"^{name} has no textures that can shrink"):
+            shrink_textures(other, views)
     with pytest.raises(ValueError, match="at least one view"):
         shrink_textures(model, [])
     with pytest.raises(ValueError, match="max_loss"):

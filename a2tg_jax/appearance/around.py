@@ -32,6 +32,10 @@ class AppearanceAround(Appearance):
         return self.inner.base
 
     @property
+    def layers(self) -> tuple[Appearance, ...]:
+        return (self, *self.inner.layers)
+
+    @property
     def is_linear(self) -> bool:
         return self.inner.is_linear
 

@@ -60,8 +60,13 @@ class Appearance(MovableRows, StoredArrays):
 
     @property
     def base(self) -> "Appearance":
-        """The appearance that a wrapper wraps, innermost; any other appearance is its own base."""
+        """What shows without wrappers that change colours alone: `Banded` has the base of what it wraps."""
         return self
+
+    @property
+    def layers(self) -> tuple["Appearance", ...]:
+        """The appearance, and what it wraps, from the outermost to the innermost."""
+        return (self,)
 
     @property
     def is_linear(self) -> bool:

@@ -84,7 +84,7 @@ def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
 def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
     """Return the shapes of logarithms of exponents in a file (host).
 
-    Rounding may move a logarithm beyond ±1; it counts as ±1.
+    Logarithms that rounding has moved beyond ±1 are cut to ±1.
 
     Raises:
       ValueError: if one is NaN or farther out than rounding moves it.

@@ -18,6 +18,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import GivenColors
+from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.jit import Jitted
@@ -174,7 +175,7 @@ def _check(model: Model, views: Sequence[View]) -> None:
     if not views:
         raise ValueError("views must hold at least one view; got none")
     if not model.appearance.is_linear:
-        kind = type(model.appearance.base).__name__
+        kind = layer_without(model.appearance, lambda layer: layer.is_linear)
         raise ValueError(
             f"a picture is not linear in what {kind} shows: Plain, Textured with signed RGB, or Shaped or Banded "
             "around one of these can be polished"

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.jit import Jitted
@@ -63,7 +65,11 @@ def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.
 
 def can_shrink(model: Model) -> bool:
     """Return whether the model has textures that can shrink: signed RGB and projected alpha."""
-    options = model.appearance.texture_options if model.appearance.is_portable else None
+    return _has_such_textures(model.appearance)
+
+
+def _has_such_textures(appearance: Appearance) -> bool:
+    options = appearance.texture_options if appearance.is_portable else None
     return options is not None and options.rgb == "signed" and options.alpha == "projected"
 
 
@@ -74,8 +80,8 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if not can_shrink(model):
         raise ValueError(
-            f"{type(model.appearance.base).__name__} has no textures that can shrink: Textured with signed RGB and "
-            "projected alpha, or Shaped or Banded around it, has"
+            f"{layer_without(model.appearance, _has_such_textures)} has no textures that can shrink: Textured with "
+            "signed RGB and projected alpha, or Shaped or Banded around it, has"
         )
 
 

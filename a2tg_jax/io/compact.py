@@ -110,7 +110,7 @@ def save_compact(path: str | os.PathLike[str], model: Model, *, choices: Compact
 
     Args:
       path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
-      model: one that shows Plain, Textured, or Shaped or Banded of these.
+      model: one that shows Plain, Textured, Shaped of these, or Banded of any of these.
       choices: how finely its numbers are kept.
 
     Raises:

@@ -47,6 +47,8 @@ class FileFormat:
     """Highest degree of spherical harmonics."""
     is_exact: bool = True
     """Whether numbers come back unrounded."""
+    has_extension: bool = False
+    """Whether other programs read the file, too, but only its plain splats."""
     import_library: Callable[[Path], object] | None = None
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
@@ -71,7 +73,15 @@ def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
     )
 
 
-_GLTF = FileFormat("glTF", _later("gltf", "load_gltf"), _later("gltf", "save_gltf"), True, True, is_exact=False)
+_GLTF = FileFormat(
+    "glTF",
+    _later("gltf", "load_gltf"),
+    _later("gltf", "save_gltf"),
+    keeps_appearance=True,
+    keeps_origin=True,
+    is_exact=False,
+    has_extension=True,
+)
 _USD = FileFormat(
     "OpenUSD",
     _later("usd", "load_usd"),
@@ -184,6 +194,12 @@ def _lost_appearance(model: Model) -> list[str]:
         return [f"{bakeable} {BAKES}"]
     kind = type(model.appearance.base).__name__
     return [] if kind == "Plain" else [f"what {kind} shows beside Gaussians"]
+
+
+def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
+    """Return in words what a file of some suffix keeps of a model and other programs do not show; "" if nothing."""
+    bakeable = beside_gaussians(model) if format_of(path).has_extension else ""
+    return f"{bakeable} {BAKES}" if bakeable else ""
 
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:

@@ -72,7 +72,7 @@ def save_gltf(
     Args:
       path: the file. *.gltf has its numbers in a *.bin beside it, any other name is one *.glb. Older ones are replaced
         once the new ones are whole.
-      model: any model without textures, or one that shows Plain, Textured, or Shaped or Banded of these.
+      model: any model without textures, or one that shows Plain, Textured, Shaped of these, or Banded of any of these.
       textures: write textures, degrees and shapes of kernels, too, as the extension A2TG_splat_textures. False writes
         plain splats of any model, as `save_ply` does.
       texels: what keeps them, "float32" exactly or "uint8" in a quarter of the bytes.

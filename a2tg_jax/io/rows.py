@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
@@ -52,8 +53,8 @@ def check_encodable(
     """Raise ValueError, saying what to do instead, unless a file can hold what splats show."""
     if not appearance.is_portable:
         raise ValueError(
-            f"model shows {type(appearance.base).__name__}: {file} holds Plain, Textured, and Shaped or Banded of "
-            f"these; {instead}"
+            f"model shows {layer_without(appearance, lambda layer: layer.is_portable)}: {file} holds Plain, Textured, "
+            f"Shaped of these, and Banded of any of these; {instead}"
         )
 
 

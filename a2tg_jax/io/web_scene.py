@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
+from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.capture import central_camera
@@ -66,7 +67,7 @@ def is_viewable(appearance: Appearance) -> bool:
 def check_viewable(appearance: Appearance) -> None:
     """Raise ValueError, naming what the splats show, unless a browser can show it."""
     if not is_viewable(appearance):
-        kind = type(appearance.base).__name__
+        kind = layer_without(appearance, is_viewable)
         raise ValueError(f"the viewer cannot show {kind}: it shows Gaussians with or without textures")
 
 
@@ -76,7 +77,7 @@ def encode_web_scene(
     """Return the bytes of a file.
 
     Args:
-      model: one that shows Plain, Textured, or Shaped or Banded of these.
+      model: one that shows Plain, Textured, Shaped of these, or Banded of any of these.
       title: what the page is called.
       note: what the viewer says about the scene.
       near_plane: hits nearer than this do not show.

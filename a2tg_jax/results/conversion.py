@@ -11,7 +11,16 @@ from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
 from a2tg_jax.finish.distilling import likeness, pictures
-from a2tg_jax.io.formats import file_bytes, files_of, files_written, format_of, lost_by, save_splats, writer_of
+from a2tg_jax.io.formats import (
+    file_bytes,
+    files_of,
+    files_written,
+    format_of,
+    lost_by,
+    save_splats,
+    unseen_elsewhere,
+    writer_of,
+)
 from a2tg_jax.model import Model
 from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.viewing import open_source
@@ -41,6 +50,8 @@ class Converted:
             lines.insert(0, self.baked)
         if self.lost:
             lines.append(f"not kept by this format: {', '.join(self.lost)}")
+        if unseen := unseen_elsewhere(self.model, self.out):
+            lines.append(f"not shown by other programs: {unseen}")
         if self.model.origin is not None and not format_of(self.out).keeps_origin:
             lines.append("world: the original one, in its units and axes")
         return "\n".join(lines)

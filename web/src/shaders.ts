@@ -189,7 +189,7 @@ void main() {
   if (!(cutoff > 0.0)) return;
   if (isShaped) {
     curve = curveOf(values(first.w, shapeEnds).a);
-    cutoff = pow(cutoff / (2.0 * curve.y) + curve.z, 1.0 / curve.x) - OFFSET;
+    cutoff = max(pow(cutoff / (2.0 * curve.y) + curve.z, 1.0 / curve.x) - OFFSET, 0.0);
   }
 
   vec2 scales = exp(values(second.y, scaleEnds).xy);
