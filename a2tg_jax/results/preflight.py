@@ -12,7 +12,8 @@ from a2tg_jax.data import Scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.formats import format_of
 from a2tg_jax.measure.metrics import load_lpips
-from a2tg_jax.results.first_stage import GivenSplats
+from a2tg_jax.model import Model
+from a2tg_jax.results.first_stage import GivenSplats, are_shapes_taken
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, RunFolder, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
 from a2tg_jax.results.output import check_output
@@ -86,10 +87,23 @@ def check_init(given: GivenSplats, out: Path, system: System) -> None:
             f"init: {file} holds {splats.num:,} Gaussians, {in_bytes(needed)} at degree {degree}, which is more than "
             f"the memory_budget of {in_bytes(budget)}: raise it, or leave it out"
         )
-    lost = [] if type(splats.appearance.base).__name__ == "Plain" else ["what its splats show beside Gaussians"]
-    lost += [f"its spherical harmonics above degree {degree}"] if splats.sh.shape[1] > NUM_BASES[degree] else []
+    lost = _left_out(splats, system)
     if lost:
         warnings.warn(f"--init {file} leaves out {' and '.join(lost)}", stacklevel=2)
+
+
+def _left_out(splats: Model, system: System) -> list[str]:
+    """Return, in words, what a first stage cannot take of splats."""
+    base, degree, lost = splats.appearance.base, system.initial_sh_degree, []
+    if base.shapes_name is not None:
+        if not are_shapes_taken(splats, system.stages()[0].appearance):
+            lost.append("the shapes of its kernels (the nearest Gaussians take their place)")
+        base = getattr(base, "inner", base).base
+    if type(base).__name__ != "Plain":
+        lost.append("what its splats show beside " + ("kernels" if splats.appearance.shapes_name else "Gaussians"))
+    if splats.sh.shape[1] > NUM_BASES[degree]:
+        lost.append(f"its spherical harmonics above degree {degree}")
+    return lost
 
 
 def warn_of_small_budget(system: System) -> None:

@@ -146,8 +146,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     gaussians = _with_rows(model.gaussians, room)
     params, layout = model.params, model.layout
     if model.appearance != stage.appearance or room > num:
-        key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS)
-        params, layout = stage.appearance.allocate(key, gaussians)
+        params, layout = new_parameters(stage.appearance, gaussians, system)
         params = _with_known_shapes(stage.appearance, params, model)
     if model.appearance == stage.appearance and room > num:
         leaves = zip(jax.tree.leaves(params), jax.tree.leaves(model.params), strict=False)
@@ -157,6 +156,11 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
             )
         params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
     return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+
+
+def new_parameters(appearance: Appearance, gaussians: Gaussians, system: System) -> tuple[Any, Any]:
+    """Return the parameters and layout that an appearance of a system's stage begins with."""
+    return appearance.allocate(jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS), gaussians)
 
 
 def _with_known_shapes(appearance: Appearance, params: Any, model: Model) -> Any:
