@@ -16,6 +16,8 @@ from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.preflight import check_init
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.systems.bytewise import KernelConfig
+from a2tg_jax.training.cost import forecast_stages
+from a2tg_jax.training.start import padded
 
 NUM = 40
 SHAPES = np.linspace(-1, 1, NUM).astype(np.float32)
@@ -73,3 +75,26 @@ def test_a_first_stage_without_shapes_is_told(tmp_path, recwarn):
     save_model(tmp_path / "b.npz", shaped(Textured()))
     with pytest.warns(UserWarning, match="leaves out what its splats show beside kernels$"):
         check_init(GivenSplats(tmp_path / "b.npz"), tmp_path / "run", Bytewise())
+
+
+def test_bytes_of_shapes_count_in_a_budget(tmp_path, scene):
+    """56 bytes a Gaussian: 13 floats, and one of its shape."""
+    save_ply(tmp_path / "a.ply", GAUSSIANS)
+    check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", Bytewise(memory_budget="2.24kB"))
+    with pytest.raises(ValueError, match=r"40 Gaussians, 2\.24 kB at degree 0, .* of 2\.20 kB"):
+        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", Bytewise(memory_budget="2.2kB"))
+    assert Bytewise(memory_budget="5.5kB").small_budget == "memory_budget has room for 98 Gaussians of 56 bytes"
+    given, _ = forecast_stages(scene, Bytewise(), NUM)
+    assert given.model_bytes == 40 * 56
+
+
+def test_a_stage_without_shapes_takes_the_nearest_gaussians():
+    stage = OF_GAUSSIANS.stages()[1]
+    with pytest.warns(UserWarning, match="^stage 'details' has no shapes of kernels: it takes the Gaussians nearest"):
+        found = padded(shaped(), stage, OF_GAUSSIANS)
+    nearest = nearest_gaussians(GAUSSIANS, SHAPES)
+    jax.tree.map(np.testing.assert_array_equal, found.live.gaussians, nearest)
+    assert not np.allclose(nearest.log_scales, GAUSSIANS.log_scales)
+    same = padded(shaped(), Bytewise().stages()[1], Bytewise())
+    jax.tree.map(np.testing.assert_array_equal, same.live.gaussians, GAUSSIANS)
+    np.testing.assert_array_equal(same.appearance.shapes(same.live.params), SHAPES)

@@ -79,12 +79,12 @@ def write_first_stage(run: RunFolder, planned: PlannedStage, given: GivenSplats,
       scene: the scene of the run.
     """
     splats, appearance, system = given.taken().live, planned.stage.appearance, planned.system
-    takes_shapes = are_shapes_taken(splats, appearance)
-    gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=takes_shapes), scene.transform)
+    shapes = splats.appearance.shapes(splats.params) if are_shapes_taken(splats, appearance) else None
+    gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), scene.transform)
     gaussians = _of_degree(gaussians, system.initial_sh_degree)
     params, layout = new_parameters(appearance, gaussians, system)
-    if takes_shapes:
-        params = appearance.with_shapes(params, splats.appearance.shapes(splats.params))
+    if shapes is not None:
+        params = appearance.with_shapes(params, shapes)
     origin = origin_of_scene(scene, BACKGROUNDS[system.background])
     model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
     save_model(run.own(run.model(planned.name)), model, {"init": str(given.file)})

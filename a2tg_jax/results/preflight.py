@@ -5,7 +5,6 @@ import shutil
 import warnings
 from pathlib import Path
 
-from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
@@ -81,7 +80,7 @@ def check_init(given: GivenSplats, out: Path, system: System) -> None:
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
     splats, degree = given.splats, system.initial_sh_degree
-    needed, budget = splats.num * bytes_per_gaussian(degree), system.budget_bytes
+    needed, budget = splats.num * system.initial_bytes, system.budget_bytes
     if budget is not None and needed > budget:
         raise ValueError(
             f"init: {file} holds {splats.num:,} Gaussians, {in_bytes(needed)} at degree {degree}, which is more than "
@@ -128,7 +127,7 @@ def check_apart(out: Path, source: Path) -> None:
 def check_room(record: RunRecord, scene: Scene, out: Path, num_given: int | None = None) -> None:
     """Raise ValueError unless the disk has room for what will surely be written.
 
-    Models and checkpoints of the Gaussians that there will be, without what they show besides.
+    Models and checkpoints of the Gaussians that there will be, with what the first stage begins to show of them.
     """
     plan = record.plan
     nums = {name: num_given if plan.begins_like_main(name) else None for name in plan.names}
@@ -150,7 +149,7 @@ def gaussian_bytes(planned: PlannedStage, scene: Scene, num_given: int | None = 
     num = num_rows(first, initial_number(scene, system)) if num_given is None else num_given
     if system.budget_bytes is not None:
         return system.budget_bytes
-    return int(num * bytes_per_gaussian(system.initial_sh_degree))
+    return int(num * system.initial_bytes)
 
 
 def _existing(path: Path) -> Path:
