@@ -11,6 +11,7 @@ from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appeara
 from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Shaped, Textured, appearance_for
 from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.layers import layer_without, layers_in_words
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.gaussians import logit
 from a2tg_jax.texture import allocate_textures
@@ -242,7 +243,6 @@ def test_a_wrapper_can_do_what_it_wraps_can(appearance):
         assert found == CAPABILITIES[appearance]
         assert shown.base is appearance and shown.max_alpha == appearance.max_alpha
     assert not appearance.has_degrees and Banded(appearance).has_degrees
-    assert not Shaped(Banded(appearance)).is_portable and not Shaped(Shaped(appearance)).is_portable
     assert not Banded(Banded(appearance)).is_portable and Banded(Banded(appearance)).base is appearance
 
 
@@ -265,3 +265,19 @@ def test_portable_appearances_come_from_their_options():
     shaped = appearance_for(options, has_textures=True, has_degrees=True, has_shapes=True)
     assert shaped == Banded(Shaped(Textured(options=options)))
     assert appearance_for(options, has_textures=False, has_shapes=True) == Shaped(Plain(options.max_alpha))
+
+
+class OwnFalloff(Plain):
+    """Kernels that are no Gaussians."""
+
+    def rule(self, params, layout):
+        return Shaped().rule(ShapedParams(jnp.zeros(1), ()), ShapedLayout(()))
+
+
+def test_shapes_replace_gaussian_falloffs_only():
+    words = r"Shaped .* goes around Plain, Textured .* not around {}; .*Banded\(Shaped\(Textured\(\)\)\)$"
+    for inner in (Billboards(), Shaped(), Banded(Textured()), Banded(Shaped())):
+        with pytest.raises(ValueError, match=words.format(type(inner).__name__)):
+            Shaped(inner)
+    with pytest.raises(ValueError, match=words.format("OwnFalloff")):
+        Shaped(OwnFalloff()).rule(ShapedParams(jnp.zeros(1), ()), ShapedLayout(()))

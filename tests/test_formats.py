@@ -308,8 +308,8 @@ def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     save_model(tmp_path / "a.npz", textured())
     with pytest.warns(UserWarning, match="leaves out what its splats show beside Gaussians"):
         check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg(sh_degree=3))
-    save_ply(tmp_path / "a.ply", init_from_points(np.eye(3), np.eye(3), sh_degree=2))
+    save_ply(tmp_path / "a.ply", init_from_points(np.eye(4, 3), np.eye(4, 3), sh_degree=2))
     with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):
         check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=1))
-    with pytest.raises(ValueError, match="3 Gaussians, 444 bytes at degree 2, which is more than the memory_budget"):
-        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0004))
+    with pytest.raises(ValueError, match="4 Gaussians, 592 bytes at degree 2, which is more than the memory_budget"):
+        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0005))

@@ -166,6 +166,13 @@ class RuleAround(AppearanceRule):
         return self.inner.cutoff(opacities)
 
 
+def has_gaussian_falloff(rule: AppearanceRule) -> bool:
+    """Return whether a rule keeps the Gaussian falloff, and so does each rule inside."""
+    if isinstance(rule, RuleAround) and type(rule).falloff is RuleAround.falloff:
+        return has_gaussian_falloff(rule.inner)
+    return type(rule).falloff is AppearanceRule.falloff
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GivenColors(RuleAround):

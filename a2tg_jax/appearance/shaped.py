@@ -20,8 +20,9 @@ from jax import Array
 
 from a2tg_jax.appearance.around import AppearanceAround
 from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.billboards import Billboards
 from a2tg_jax.appearance.plain import Plain
-from a2tg_jax.appearance.rule import Factor, Residual, RuleAround
+from a2tg_jax.appearance.rule import Factor, Residual, RuleAround, has_gaussian_falloff
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 
@@ -37,6 +38,12 @@ MOST_ROUNDED = 1.5
 """Largest tanh of a shape in a file: half the coarsest step beyond the range."""
 LARGEST_RHO = 1e6
 """Squared distance beyond which the falloff is 0 in any case; its powers stay finite up to there."""
+
+
+REFUSAL = (
+    "Shaped replaces a Gaussian falloff and goes around Plain, Textured or another appearance that has one, not "
+    "around {}; Banded goes around it, as in Banded(Shaped(Textured()))"
+)
 
 
 class ShapedParams(NamedTuple):
@@ -144,14 +151,19 @@ class Shaped(AppearanceAround):
 
     inner: Appearance = dataclasses.field(default_factory=Plain)
 
+    def __post_init__(self) -> None:
+        """Refuse an inner appearance with degrees, with shapes of its own, or of billboards."""
+        inner = self.inner
+        if inner.has_degrees or inner.shapes_name is not None or isinstance(inner, Billboards):
+            raise ValueError(REFUSAL.format(type(inner).__name__))
+
     @property
     def base(self) -> Appearance:
         return self
 
     @property
     def is_portable(self) -> bool:
-        has_more = self.inner.has_degrees or self.inner.shapes_name is not None
-        return type(self) is Shaped and self.inner.is_portable and not has_more
+        return type(self) is Shaped and self.inner.is_portable
 
     @property
     def shapes_name(self) -> str:  # type: ignore[override]
@@ -163,7 +175,10 @@ class Shaped(AppearanceAround):
         return ShapedParams(jnp.zeros(gaussians.num, gaussians.means.dtype), params), ShapedLayout(layout)
 
     def rule(self, params: ShapedParams, layout: ShapedLayout) -> ShapedRule:
-        return ShapedRule(self.inner.rule(params.inner, layout.inner), params.shapes)
+        inner = self.inner.rule(params.inner, layout.inner)
+        if not has_gaussian_falloff(inner):
+            raise ValueError(REFUSAL.format(type(self.inner).__name__))
+        return ShapedRule(inner, params.shapes)
 
     def rates(self, rate: Any, params: ShapedParams) -> ShapedParams:
         """Return the rates of `ShapedRates`."""

@@ -20,6 +20,8 @@ from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
 INITIAL_OPACITY = 0.1
+NO_ROW_LOG_SCALE = -10.0
+"""Log-scales and opacity logit of spare rows."""
 COLOR_SLACK = 1e-3
 """Rounding by which colours may leave [0, 1]."""
 SH_C0 = 0.28209479177387814
@@ -184,4 +186,15 @@ def init_from_points(
         log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
         logit_opacities=as_float(np.full(count, np.log(opacity / (1 - opacity)))),
         sh=as_float(sh),
+    )
+
+
+def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:
+    """Return rows that do not exist yet."""
+    return Gaussians(
+        means=jnp.zeros((num, 3), dtype),
+        quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),
+        log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE, dtype),
+        logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE, dtype),
+        sh=jnp.zeros((num, num_coefficients, 3), dtype),
     )

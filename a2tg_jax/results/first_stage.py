@@ -6,6 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.transform import transform_gaussians
@@ -21,6 +22,7 @@ from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import History
 from a2tg_jax.training.fitting import BACKGROUNDS
+from a2tg_jax.training.start import new_parameters
 
 
 class GivenSplats:
@@ -76,12 +78,22 @@ def write_first_stage(run: RunFolder, planned: PlannedStage, given: GivenSplats,
       given: the splats, which are released.
       scene: the scene of the run.
     """
-    gaussians = transform_gaussians(plain_gaussians(given.taken()), scene.transform)
-    gaussians = _of_degree(gaussians, planned.system.initial_sh_degree)
-    origin = origin_of_scene(scene, BACKGROUNDS[planned.system.background])
-    model = Model(gaussians, appearance=planned.stage.appearance, origin=origin)
+    splats, appearance, system = given.taken().live, planned.stage.appearance, planned.system
+    shapes = splats.appearance.shapes(splats.params) if are_shapes_taken(splats, appearance) else None
+    gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), scene.transform)
+    gaussians = _of_degree(gaussians, system.initial_sh_degree)
+    params, layout = new_parameters(appearance, gaussians, system)
+    if shapes is not None:
+        params = appearance.with_shapes(params, shapes)
+    origin = origin_of_scene(scene, BACKGROUNDS[system.background])
+    model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
     save_model(run.own(run.model(planned.name)), model, {"init": str(given.file)})
     write_history(run.own(run.history(planned.name)), History.empty())
+
+
+def are_shapes_taken(splats: Model, appearance: Appearance) -> bool:
+    """Return whether splats have shapes of kernels that a stage with this appearance takes over."""
+    return splats.appearance.shapes_name is not None and appearance.shapes_name is not None
 
 
 def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:

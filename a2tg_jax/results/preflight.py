@@ -5,14 +5,14 @@ import shutil
 import warnings
 from pathlib import Path
 
-from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.formats import format_of
 from a2tg_jax.measure.metrics import load_lpips
-from a2tg_jax.results.first_stage import GivenSplats
+from a2tg_jax.model import Model
+from a2tg_jax.results.first_stage import GivenSplats, are_shapes_taken
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, RunFolder, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
 from a2tg_jax.results.output import check_output
@@ -80,16 +80,29 @@ def check_init(given: GivenSplats, out: Path, system: System) -> None:
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
     splats, degree = given.splats, system.initial_sh_degree
-    needed, budget = splats.num * bytes_per_gaussian(degree), system.budget_bytes
+    needed, budget = splats.num * system.initial_bytes, system.budget_bytes
     if budget is not None and needed > budget:
         raise ValueError(
             f"init: {file} holds {splats.num:,} Gaussians, {in_bytes(needed)} at degree {degree}, which is more than "
             f"the memory_budget of {in_bytes(budget)}: raise it, or leave it out"
         )
-    lost = [] if type(splats.appearance.base).__name__ == "Plain" else ["what its splats show beside Gaussians"]
-    lost += [f"its spherical harmonics above degree {degree}"] if splats.sh.shape[1] > NUM_BASES[degree] else []
+    lost = _left_out(splats, system)
     if lost:
         warnings.warn(f"--init {file} leaves out {' and '.join(lost)}", stacklevel=2)
+
+
+def _left_out(splats: Model, system: System) -> list[str]:
+    """Return, in words, what a first stage cannot take of splats."""
+    base, degree, lost = splats.appearance.base, system.initial_sh_degree, []
+    if base.shapes_name is not None:
+        if not are_shapes_taken(splats, system.stages()[0].appearance):
+            lost.append("the shapes of its kernels (the nearest Gaussians take their place)")
+        base = getattr(base, "inner", base).base
+    if type(base).__name__ != "Plain":
+        lost.append("what its splats show beside " + ("kernels" if splats.appearance.shapes_name else "Gaussians"))
+    if splats.sh.shape[1] > NUM_BASES[degree]:
+        lost.append(f"its spherical harmonics above degree {degree}")
+    return lost
 
 
 def warn_of_small_budget(system: System) -> None:
@@ -114,7 +127,7 @@ def check_apart(out: Path, source: Path) -> None:
 def check_room(record: RunRecord, scene: Scene, out: Path, num_given: int | None = None) -> None:
     """Raise ValueError unless the disk has room for what will surely be written.
 
-    Models and checkpoints of the Gaussians that there will be, without what they show besides.
+    Models and checkpoints of the Gaussians that there will be, with what the first stage begins to show of them.
     """
     plan = record.plan
     nums = {name: num_given if plan.begins_like_main(name) else None for name in plan.names}
@@ -136,7 +149,7 @@ def gaussian_bytes(planned: PlannedStage, scene: Scene, num_given: int | None = 
     num = num_rows(first, initial_number(scene, system)) if num_given is None else num_given
     if system.budget_bytes is not None:
         return system.budget_bytes
-    return int(num * bytes_per_gaussian(system.initial_sh_degree))
+    return int(num * system.initial_bytes)
 
 
 def _existing(path: Path) -> Path:

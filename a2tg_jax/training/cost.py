@@ -9,11 +9,8 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import jax
-
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent
 from a2tg_jax.host.cores import num_threads
@@ -21,7 +18,7 @@ from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.training.start import initial_number, no_rows, num_rows
+from a2tg_jax.training.start import initial_number, num_rows
 
 MB = 10**6
 PROCESS = 300 * MB
@@ -113,7 +110,7 @@ def forecast_stages(scene: Scene, system: System, num_given: int | None = None) 
     for stage in stages:
         num = num_rows(stage, num)
         if stage.appearance != shown:
-            floats, shown = floats_shown(stage, system), stage.appearance
+            floats, shown = stage.floats_shown(system.initial_sh_degree), stage.appearance
         own = floats_per_gaussian(system.initial_sh_degree) + floats
         model_bytes = BYTES_PER_FLOAT * own * num
         for event in stage.events:
@@ -131,15 +128,8 @@ def forecast_stages(scene: Scene, system: System, num_given: int | None = None) 
 
 def _given_stage(system: System, num: int) -> StageForecast:
     """Return the forecast of a first stage in whose place a file gives its Gaussians."""
-    model_bytes = BYTES_PER_FLOAT * floats_per_gaussian(system.initial_sh_degree) * num
+    model_bytes = system.initial_bytes * num
     return StageForecast(Bytes(), model_bytes, num, num_programs=0, seconds=0, gathered_bytes=0)
-
-
-def floats_shown(stage: Stage, system: System) -> float:
-    """Return the floats that a Gaussian shows beside its own when a stage begins."""
-    few = no_rows(64, NUM_BASES[system.initial_sh_degree])
-    _, layout = stage.appearance.allocate(jax.random.key(0), few)
-    return stage.appearance.num_floats(layout, few.num) / few.num
 
 
 def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_bytes: float) -> Bytes:

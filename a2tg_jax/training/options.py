@@ -201,6 +201,11 @@ class System:
         return self.sh_degree
 
     @property
+    def initial_bytes(self) -> float:
+        """Bytes of a Gaussian that training starts from, with what the first stage shows of it."""
+        return bytes_per_gaussian(self.initial_sh_degree, self.stages()[0].floats_shown(self.initial_sh_degree))
+
+    @property
     def budget_bytes(self) -> int | None:
         """Memory budget in bytes; None without one."""
         megabytes = megabytes_of(self.memory_budget)
@@ -209,8 +214,7 @@ class System:
     @property
     def small_budget(self) -> str:
         """Number of Gaussians that fit into the memory budget, in words, if it is below `FEW_GAUSSIANS`; else empty."""
-        size = bytes_per_gaussian(self.initial_sh_degree)
-        if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * size:
+        if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * (size := self.initial_bytes):
             return ""
         return f"memory_budget has room for {int(self.budget_bytes // size)} Gaussians of {size:,.0f} bytes"
 

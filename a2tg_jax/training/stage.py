@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.core.gaussians import no_rows
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
@@ -68,6 +70,12 @@ class Stage:
     def has_depths(self) -> bool:
         """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
         return any(getattr(term, "has_depths", False) for term in self.losses)
+
+    def floats_shown(self, sh_degree: int) -> float:
+        """Return the floats that a Gaussian of a degree shows beside its own when the stage begins (host)."""
+        few = no_rows(64, NUM_BASES[sh_degree])
+        _, layout = self.appearance.allocate(jax.random.key(0), few)
+        return self.appearance.num_floats(layout, few.num) / few.num
 
     def is_ahead(self, event: Event) -> bool:
         """Return whether an event happens at all (host)."""

@@ -1,6 +1,7 @@
 """Start of training: Gaussians at a scene's points, and spare rows for those that events add."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points
+from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
@@ -20,8 +22,6 @@ from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
 
-NO_ROW_LOG_SCALE = -10.0
-"""Log-scales and opacity logit of spare rows."""
 KEY_OF_PARAMETERS = 0x7E8E1
 LEAST_OPACITY = INITIAL_OPACITY
 """Lower bound of the reduced opacities: the initial opacity of 3DGS."""
@@ -136,18 +136,18 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     """Return the model with the appearance of a stage and with spare rows for its events.
 
     If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew, but for the
-    shapes of kernels. The number of devices divides that of the rows.
+    shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices divides
+    that of the rows.
 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
     """
     num = model.gaussians.num
     room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
-    gaussians = _with_rows(model.gaussians, room)
+    gaussians = _with_rows(_shown_by(stage, model), room)
     params, layout = model.params, model.layout
     if model.appearance != stage.appearance or room > num:
-        key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS)
-        params, layout = stage.appearance.allocate(key, gaussians)
+        params, layout = new_parameters(stage.appearance, gaussians, system)
         params = _with_known_shapes(stage.appearance, params, model)
     if model.appearance == stage.appearance and room > num:
         leaves = zip(jax.tree.leaves(params), jax.tree.leaves(model.params), strict=False)
@@ -157,6 +157,23 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
             )
         params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
     return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+
+
+def _shown_by(stage: Stage, model: Model) -> Gaussians:
+    """Return the Gaussians of a model, the nearest ones to its kernels if the stage has no shapes of them."""
+    shapes = model.appearance.shapes(model.params)
+    if shapes is None or stage.appearance.shapes_name is not None:
+        return model.gaussians
+    warnings.warn(
+        f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to those of the model",
+        stacklevel=2,
+    )
+    return nearest_gaussians(model.gaussians, np.asarray(shapes))
+
+
+def new_parameters(appearance: Appearance, gaussians: Gaussians, system: System) -> tuple[Any, Any]:
+    """Return the parameters and layout that an appearance of a system's stage begins with."""
+    return appearance.allocate(jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS), gaussians)
 
 
 def _with_known_shapes(appearance: Appearance, params: Any, model: Model) -> Any:
@@ -181,14 +198,3 @@ def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
 def _followed_by(gaussians: Gaussians, others: Gaussians) -> Gaussians:
     joined: Gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, others)
     return joined
-
-
-def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:
-    """Return rows that do not exist yet."""
-    return Gaussians(
-        means=jnp.zeros((num, 3), dtype),
-        quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),
-        log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE, dtype),
-        logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE, dtype),
-        sh=jnp.zeros((num, num_coefficients, 3), dtype),
-    )

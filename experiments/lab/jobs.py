@@ -16,7 +16,7 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.gaussians import floats_per_gaussian
+from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
 from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.memory import tidy_memory
@@ -25,7 +25,6 @@ from a2tg_jax.results.plan import fingerprint, is_same_so_far
 from a2tg_jax.results.record import SceneSource
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
-from a2tg_jax.training.start import no_rows
 from lab.versions import is_from_before
 
 MOST_TRAIN_VIEWS = 16

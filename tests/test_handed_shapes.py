@@ -1,0 +1,100 @@
+"""Shapes of kernels handed from a file to a first stage, and from one stage to the next."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_values import some_gaussians
+
+from a2tg_jax import A2tg, Bytewise, Model, load_model, save_model, save_ply, synthetic_scene, transform_gaussians
+from a2tg_jax.appearance import Appearance, Plain, Shaped, Textured
+from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
+from a2tg_jax.results.first_stage import GivenSplats, write_first_stage
+from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.preflight import check_init
+from a2tg_jax.results.record import RunRecord, SceneSource
+from a2tg_jax.systems.bytewise import KernelConfig
+from a2tg_jax.training.cost import forecast_stages
+from a2tg_jax.training.start import padded
+
+NUM = 40
+SHAPES = np.linspace(-1, 1, NUM).astype(np.float32)
+GAUSSIANS = dataclasses.replace(some_gaussians(NUM), sh=some_gaussians(NUM).sh[:, :1])
+OF_GAUSSIANS = Bytewise(kernel=KernelConfig(0.0))
+
+
+def shaped(inner: Appearance = Plain()) -> Model:  # noqa: B008 - frozen
+    """A model whose kernels differ."""
+    appearance = Shaped(inner)
+    params, layout = appearance.allocate(jax.random.key(0), GAUSSIANS)
+    return Model(GAUSSIANS, appearance.with_shapes(params, jnp.asarray(SHAPES)), layout, appearance=appearance)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic_scene(width=32, height=24, num_views=4, num_points=50)
+
+
+def first_model(file, scene, system, tmp_path) -> Model:
+    """The model that the splats of a file give in place of the first stage."""
+    planned = RunRecord(SceneSource("synthetic"), system.name, system).plan.stages[0]
+    run = create_run(tmp_path / "run")
+    write_first_stage(run, planned, GivenSplats(file), scene)
+    found = load_model(run.model(planned.name))
+    assert found.appearance == planned.stage.appearance
+    return found
+
+
+def test_plain_splats_begin_as_gaussians_where_kernels_have_shapes(tmp_path, scene):
+    save_ply(tmp_path / "a.ply", transform_gaussians(GAUSSIANS, scene.transform.inverse()))
+    found = first_model(tmp_path / "a.ply", scene, Bytewise(), tmp_path)
+    np.testing.assert_allclose(found.gaussians.means, GAUSSIANS.means, atol=1e-5)
+    np.testing.assert_array_equal(found.params.shapes, np.zeros(NUM))
+
+
+@pytest.mark.parametrize(("system", "has_shapes"), [(Bytewise(), True), (OF_GAUSSIANS, False)])
+def test_shapes_of_a_file_are_kept_or_its_nearest_gaussians_taken(tmp_path, scene, system, has_shapes):
+    save_model(tmp_path / "a.npz", shaped())
+    found = first_model(tmp_path / "a.npz", scene, system, tmp_path)
+    wanted = GAUSSIANS if has_shapes else nearest_gaussians(GAUSSIANS, SHAPES)
+    np.testing.assert_allclose(found.gaussians.logit_opacities, wanted.logit_opacities, rtol=1e-5)
+    grown = np.log(scene.transform.scale)
+    np.testing.assert_allclose(found.gaussians.log_scales, wanted.log_scales + grown, atol=1e-5)
+    if has_shapes:
+        np.testing.assert_array_equal(found.params.shapes, SHAPES)
+
+
+def test_a_first_stage_without_shapes_is_told(tmp_path, recwarn):
+    save_model(tmp_path / "a.npz", shaped())
+    check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", Bytewise())
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"leaves out the shapes of its kernels \(the nearest Gaussians .* place\)$"):
+        check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg())
+    save_model(tmp_path / "b.npz", shaped(Textured()))
+    with pytest.warns(UserWarning, match="leaves out what its splats show beside kernels$"):
+        check_init(GivenSplats(tmp_path / "b.npz"), tmp_path / "run", Bytewise())
+
+
+def test_bytes_of_shapes_count_in_a_budget(tmp_path, scene):
+    """56 bytes a Gaussian: 13 floats, and one of its shape."""
+    save_ply(tmp_path / "a.ply", GAUSSIANS)
+    check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", Bytewise(memory_budget="2.24kB"))
+    with pytest.raises(ValueError, match=r"40 Gaussians, 2\.24 kB at degree 0, .* of 2\.20 kB"):
+        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", Bytewise(memory_budget="2.2kB"))
+    assert Bytewise(memory_budget="5.5kB").small_budget == "memory_budget has room for 98 Gaussians of 56 bytes"
+    given, _ = forecast_stages(scene, Bytewise(), NUM)
+    assert given.model_bytes == 40 * 56
+
+
+def test_a_stage_without_shapes_takes_the_nearest_gaussians():
+    stage = OF_GAUSSIANS.stages()[1]
+    with pytest.warns(UserWarning, match="^stage 'details' has no shapes of kernels: it takes the Gaussians nearest"):
+        found = padded(shaped(), stage, OF_GAUSSIANS)
+    nearest = nearest_gaussians(GAUSSIANS, SHAPES)
+    jax.tree.map(np.testing.assert_array_equal, found.live.gaussians, nearest)
+    assert not np.allclose(nearest.log_scales, GAUSSIANS.log_scales)
+    same = padded(shaped(), Bytewise().stages()[1], Bytewise())
+    jax.tree.map(np.testing.assert_array_equal, same.live.gaussians, GAUSSIANS)
+    np.testing.assert_array_equal(same.appearance.shapes(same.live.params), SHAPES)
