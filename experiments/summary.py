@@ -22,7 +22,7 @@ OTHERS = {
     f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
 }
 """Differences of means: what they are called, and the two methods."""
-LEFT_OUT = "\n\nRuns from before are left out.\n"
+LEFT_OUT = "\nRuns from before are left out. A number of scenes in brackets stands where not all were run.\n"
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -42,11 +42,11 @@ def bytes_table(results: Sequence[tables.Result]) -> str:
     results = [*results, *best_plain(results)]
     budgets = sorted({result.run.cell.budget or 0.0 for result in results})
     found = [at_budget(results, budget) for budget in budgets]
-    rows = []
-    for scene in sorted({result.run.cell.scene.label for result in results}):
+    scenes, rows = sorted({result.run.cell.scene.label for result in results}), []
+    for scene in scenes:
         rows.append([f"{BYTEWISE} less {BEST}: {scene}", *(_on(own, scene) for own in found)])
     for told, (label, other) in OTHERS.items():
-        means = [told_gain(own, label, other).partition(" (")[0] for own in found]
+        means = [told_gain(own, label, other).removesuffix(f" ({len(scenes)})") for own in found]
         rows.append([f"**{told}: mean**", *means])
     return tables.markdown(["", *(f"{budget:g} MB: dB · LPIPS" for budget in budgets)], rows)
 
@@ -78,7 +78,6 @@ def textures_table(budgets: Sequence[tables.Result], claim: Sequence[tables.Resu
         _row("`a2tg` of `quick` less MCMC, bytes of `a2tg`", claim, TEXTURED, PLAIN + equal),
         _row("`a2tg` of `quick` less MCMC, given budgets", budgets, TEXTURED, PLAIN),
         _row("`a2tg` of the paper less MCMC, bytes of `a2tg`", claim, "A²TG", PLAIN + equal),
-        _row("`bytewise`, Gaussian kernels, less the same untextured", budgets, GAUSSIAN, "Bytewise, untextured"),
         _row("`a2tg` of `quick` less textures of one size, its bytes", claim, TEXTURED, "Textured Gaussians*" + equal),
     ]
     return tables.markdown(["compared", "cells", "dB", "p", "LPIPS", "p"], rows)
