@@ -15,7 +15,7 @@ from small_values import some_gaussians, some_world
 from test_compact import MODELS, every_model, plain, shaped, textured
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Billboards, Shaped, TextureOptions
+from a2tg_jax.appearance import MovableKernels, Shaped, TextureOptions
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
@@ -116,10 +116,10 @@ def test_programs_that_know_no_textures_see_plain_splats(tmp_path):
 
 def test_what_the_extension_cannot_hold_is_refused_or_left_out(tmp_path):
     gaussians = some_gaussians()
-    appearance = Shaped(Billboards())
+    appearance = Shaped(MovableKernels())
     params, layout = appearance.allocate(jax.random.key(0), gaussians)
     model = Model(gaussians, params, layout, appearance=appearance)
-    with pytest.raises(ValueError, match=r"shows Billboards: a glTF file holds Plain, .*textures=False here"):
+    with pytest.raises(ValueError, match=r"shows MovableKernels: a glTF file holds Plain, .*textures=False here"):
         save_gltf(tmp_path / "m.glb", model)
     save_gltf(tmp_path / "m.glb", model, textures=False)
     a2tg.save_ply(tmp_path / "m.ply", model)
