@@ -60,7 +60,7 @@ class Appearance(MovableRows, StoredArrays):
 
     @property
     def base(self) -> "Appearance":
-        """What shows without wrappers that change colours alone: `Banded` has the base of what it wraps."""
+        """The appearance inside wrappers that change nothing but colours. `Banded` has the base of what it wraps."""
         return self
 
     @property
