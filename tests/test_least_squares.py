@@ -10,7 +10,7 @@ import pytest
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Banded, Billboards, Plain, Shaped, Textured
+from a2tg_jax.appearance import Banded, Plain, Shaped, Textured, TextureOptions
 from a2tg_jax.data import View
 from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
 from a2tg_jax.renderer import plan_render
@@ -93,7 +93,7 @@ def test_what_is_not_linear_is_refused():
     model, _, camera = banded(1)
     with pytest.raises(ValueError, match="views must hold at least one view"):
         polish(model, [])
-    shown = Banded(Shaped(Billboards(3)))
+    shown = Banded(Shaped(Textured(options=TextureOptions(rgb="unit"))))
     other = a2tg.Model(model.gaussians, *shown.allocate(None, model.gaussians), appearance=shown)
-    with pytest.raises(ValueError, match="not linear in what Billboards shows"):
+    with pytest.raises(ValueError, match="not linear in what Textured shows"):
         polish(other, some_views(model, camera))
