@@ -6,6 +6,7 @@ the settings, which `plan_render` fills in.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -274,36 +275,96 @@ def render_traced(
         )  # fmt: skip
         images = {name: box_mean(getattr(output, name), factor) for name in IMAGES}
         return output._replace(**images), num_pairs
+    options: dict[str, Any] = {
+        "has_geometry": has_geometry, "sh_degree": sh_degree, "num_live": num_live, "statistic": statistic,
+    }  # fmt: skip
+    if settings.exchange is None:
+        return _rendered(_alone, gaussians, camera, rule, background, settings, probe=probe, **options)
+    gaussians, camera, background, probe = jax.tree.map(lambda x: x[None], (gaussians, camera, background, probe))
+    views = render_together(gaussians, camera, rule, background, settings, probe=probe, **options)
+    only: tuple[RenderOutput, Array] = jax.tree.map(lambda x: x[0], views)
+    return only
+
+
+def render_together(
+    gaussians: Gaussians,
+    cameras: Camera,
+    rule: AppearanceRule,
+    backgrounds: Array,
+    settings: RenderSettings,
+    *,
+    has_geometry: bool = True,
+    sh_degree: Any = None,
+    num_live: Any = None,
+    probe: Array | None = None,
+    statistic: Statistic | None = "position",
+) -> tuple[RenderOutput, Array]:
+    """Return what `render_traced` does for each of G views, drawn at once by the devices of an exchange.
+
+    Args:
+      gaussians, cameras, backgrounds, probe: as for `render_traced`, [G, ...]: each view has its own copy of the
+        Gaussians, so that gradients are of each view.
+      rule: shared by the views.
+      settings: with a capacity and an exchange, whose number of devices G divides; without supersampling.
+      has_geometry, sh_degree, num_live, statistic: as for `render_traced`.
+    """
+    return _rendered(
+        jax.vmap, gaussians, cameras, rule, backgrounds, settings,
+        has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
+    )  # fmt: skip
+
+
+def _alone(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of one view unchanged, where `jax.vmap` makes it one of several."""
+    return function
+
+
+def _rendered(
+    each: Callable[..., Callable[..., Any]], gaussians: Gaussians, camera: Camera, rule: AppearanceRule,
+    background: Array, settings: RenderSettings, *, has_geometry: bool, sh_degree: Any, num_live: Any,
+    probe: Array | None, statistic: Statistic | None,
+) -> tuple[RenderOutput, Array]:  # fmt: skip
+    """Return the output of one view, or of several if `each` is `jax.vmap`; other arguments as of `render_traced`."""
     compositor = choose(settings.compositor, settings.tile_size)
     if camera.rays is not None:
         compositor = _for_rays(settings, compositor)
     compositing = _compositing_settings(
         camera, settings, compositor, has_geometry, None if probe is None else statistic, rule.num_colors
     )
-    if gaussians.num == 0:
-        return _empty_view(compositing, background), jnp.zeros((), jnp.float32)
+    *views, num, _ = gaussians.means.shape
+    if num == 0:
+        return each(functools.partial(_empty_view, compositing))(background), jnp.zeros(views, jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
-    splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
-    if reason := refusal(compositing, rule, splats):
+
+    def projected(gaussians: Gaussians, camera: Camera) -> tuple[Splats, Array, Array]:
+        splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
+        return splats, cutoff, jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
+
+    splats, cutoff, jacobian = each(projected)(gaussians, camera)
+    of_one = splats if each is _alone else jax.tree.map(lambda x: x[0], splats)
+    if reason := refusal(compositing, rule, of_one):
         settings = dataclasses.replace(settings, compositor=instead_of(settings.compositor, type(rule), reason))
-        return render_traced(
-            gaussians, camera, rule, background, settings,
+        return _rendered(
+            each, gaussians, camera, rule, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
-    jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
-    probe = jnp.zeros((gaussians.num, 4), splats.M.dtype) if probe is None else probe
+    probe = jnp.zeros((*views, num, 4), splats.M.dtype) if probe is None else probe
     pixels = _pixels_of(camera, settings.tile_size)
     shown = _composited(compositing, settings, splats, rule, cutoff, jacobian, probe, pixels)
-    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
-    channels, transmittance = shown.channels + taint, shown.transmittance + taint
-    return _output(compositing, channels, transmittance, background, shown.overflow), shown.num_pairs
+
+    def shaded(shown: Composited, cutoff: Array, background: Array) -> RenderOutput:
+        taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
+        channels, transmittance = shown.channels + taint, shown.transmittance + taint
+        return _output(compositing, channels, transmittance, background, shown.overflow)
+
+    return each(shaded)(shown, cutoff, background), shown.num_pairs
 
 
 def _composited(
     compositing: CompositingSettings, settings: RenderSettings, splats: Splats, rule: AppearanceRule, cutoff: Array,
     jacobian: Array, probe: Array, pixels: TilePixels | None,
 ) -> Composited:  # fmt: skip
-    """Return the image without background, of one device or of several."""
+    """Return the image without background, of one device; or those of several views, of several devices."""
     capacity = settings.capacity or 0
     if settings.exchange is not None:
         return composite_in_bands(compositing, settings.exchange, capacity, splats, rule, cutoff, jacobian, probe)

@@ -1,6 +1,6 @@
 """Renders and trains on one, two and four devices of a CPU and compares; run by `test_devices` in a process of its own.
 
-python tests/on_devices.py rendering|overflowing|training|textures FOLDER
+python tests/on_devices.py rendering|overflowing|batches|training|textures FOLDER
 """
 
 import dataclasses
@@ -18,8 +18,10 @@ from a2tg_jax.rasterize.exchange import exchange_among, spread
 from a2tg_jax.render import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session
+from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.start import padded
+from a2tg_jax.training.step import attempt
 
 ROWS = 96
 """Number of Gaussians that are rendered: divisible by 4."""
@@ -105,6 +107,23 @@ def fit(own, count, **options):
     return a2tg.fit(
         scene(), own, progress=False, session=Session(devices=jax.devices()[:count] if count > 1 else None), **options
     )
+
+
+def batches(folder):
+    """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
+    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True)
+    for index, size in ((1, 4), (0, 6)):
+        own = dataclasses.replace(own, batch_size=size)
+        found = []
+        for devices in (None, jax.devices()):
+            run = StageRun(scene(), own, index, plain(), session=Session(devices=devices))
+            arguments = run.arguments(1)
+            if devices is not None:
+                assert arguments[0].render.exchange.num_at_once(size) == (2 if size == 6 else size)
+            tried = jax.jit(attempt, static_argnums=0)(*arguments)
+            views = tried.views._replace(num_pairs=0, grads=tried.grads)
+            found.append((views, tried.state.model))
+        close(*found)
 
 
 def training(folder):

@@ -105,7 +105,7 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     monkeypatch.setattr(step, "_all_finite", lambda tree: checked.append(tree) or jnp.asarray(True))
     system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
     run = StageRun(scene, system, 0, initial_model(scene, system))
-    settings, stage, _, _, *others = run._arguments(1)
+    settings, stage, _, _, *others = run.arguments(1)
     settings = dataclasses.replace(settings, due=(True,))
     stage, state = dataclasses.replace(stage, events=(Nothing(),)), dataclasses.replace(run.state, events=(None,))
     jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(), state, *others), state)

@@ -1,8 +1,9 @@
 """Compositing on several devices: splats travel to the devices that own the pixels they reach.
 
-N rows of splats are sharded over D devices, N/D each. The image is cut into D bands of whole rows of tiles, one for
-each device. By one `all_to_all` every device sends to every other one the splats that reach its band, a fixed number
-of rows; JAX transposes it, which brings the gradients back. A splat that reaches two bands travels twice.
+N rows of splats are sharded over D devices, N/D each. G views are drawn at once, where G divides D. Each image is cut
+into D/G bands of whole rows of tiles, so that each device has one band. By one `all_to_all` every device sends to every
+other one the splats that reach its band, a fixed number of rows; JAX transposes it, which brings the gradients back. A
+splat that reaches two bands travels twice.
 
 The received rows keep the order of the model, so that a band is composited as it is on one device.
 """
@@ -41,12 +42,18 @@ class Exchange:
     mesh: Mesh
     """Devices along the one axis `AXIS`."""
     rows_per_pair: float = 1.0
-    """Rows that one device can send to another, as a share of the capacity for pairs (`plan_exchange`)."""
+    """Rows that one device can send to another, as a share of the capacity for pairs."""
+    views_at_once: int = 1
+    """Largest number of views that are drawn at once; a divisor of D."""
 
     @property
     def num(self) -> int:
         """Number D of devices."""
         return self.mesh.size
+
+    def num_at_once(self, num_views: int) -> int:
+        """Return how many of some views are drawn at once: a divisor of their number, and of D."""
+        return math.gcd(num_views, self.views_at_once)
 
     @property
     def is_of_processes(self) -> bool:
@@ -102,17 +109,19 @@ def exchange_among(devices: Any) -> Exchange:
 
 @dataclasses.dataclass(frozen=True)
 class Bands:
-    """Bands of an image; all static."""
+    """Bands of each view; all static."""
 
     whole: TileGrid
+    """Grid of a view."""
     own: TileGrid
     """Grid of one band."""
     num: int
+    """Number of bands of a view."""
 
     @staticmethod
     def of(grid: TileGrid, num: int) -> "Bands":
-        rows = -(-grid.rows // num)
-        return Bands(grid, TileGrid(grid.width, rows * grid.tile_size, grid.tile_size), num)
+        height = -(-grid.rows // num) * grid.tile_size
+        return Bands(grid, grid if num == 1 else grid._replace(height=height), num)
 
     def reached(self, M: Array, cutoff: Array, near_plane: float) -> Array:
         """Return [D, n] whether each splat's box reaches each band."""
@@ -127,50 +136,55 @@ def composite_in_bands(
     settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, rule: AppearanceRule,
     cutoff: Array, jacobian: Array, probe: Array,
 ) -> Composited:  # fmt: skip
-    """Composite as `compositor.composite` does, each device a band of the image.
+    """Composite G views as `compositor.composite` does one, each device a band of a view.
 
     The number of pairs is the capacity that has room for the fullest band and for all that is sent to it.
 
     Args:
-      settings, splats, rule, cutoff, jacobian, probe: as for `composite`.
-      exchange: the devices.
-      capacity: number of pairs of the whole image.
+      settings, rule: as for `composite`.
+      exchange: the D devices; G divides D.
+      capacity: number of pairs of a whole image.
+      splats, cutoff, jacobian, probe: as for `composite`, [G, ...].
     """
-    devices = exchange.num
-    own = splats, rule.regions, probe
-    (splats, regions, probe), cutoff = jax.tree.map(exchange.filled_up, own), exchange.filled_up(cutoff, -1.0)
-    num_rows = cutoff.shape[0]
-    share = min(1.0, ROOM_OF_A_BAND / devices)
+    num_views = cutoff.shape[0]
+    num_bands = exchange.num // num_views
+    splats, probe = jax.tree.map(jax.vmap(exchange.filled_up), (splats, probe))
+    cutoff = jax.vmap(functools.partial(exchange.filled_up, value=-1.0))(cutoff)
+    regions = jax.tree.map(exchange.filled_up, rule.regions)
+    share = min(1.0, ROOM_OF_A_BAND / num_bands)
     room = _Room(
         pairs=math.ceil(capacity * share), pairs_share=share,
-        rows=min(num_rows // devices, max(1, math.ceil(capacity * exchange.rows_per_pair))),
+        rows=min(cutoff.shape[1] // exchange.num, max(1, math.ceil(capacity * exchange.rows_per_pair))),
         rows_share=exchange.rows_per_pair,
     )  # fmt: skip
-    on_device = functools.partial(_composite_band, settings, Bands.of(settings.grid, devices), room, rule)
-    rows, everywhere = P(AXIS), P()
+    on_device = functools.partial(_composite_band, settings, Bands.of(settings.grid, num_bands), room, rule)
+    rows, of_views, everywhere = P(AXIS), P(None, AXIS), P()
     channels, transmittance, num_pairs, overflow = jax.shard_map(
         on_device,
         mesh=exchange.mesh,
-        in_specs=(rows, rows, rows, rows, everywhere, everywhere),
+        in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere),
         out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
     )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian)
-    height = settings.grid.height
-    return Composited(channels[:, :height], transmittance[:height], num_pairs, overflow)
+    height, width = settings.grid.height, settings.grid.width
+    channels = channels.reshape(channels.shape[0], num_views, -1, width)[:, :, :height]
+    transmittance = transmittance.reshape(num_views, -1, width)[:, :height]
+    num_pairs, overflow = (jnp.broadcast_to(x, (num_views,)) for x in (num_pairs, overflow))
+    return Composited(jnp.moveaxis(channels, 1, 0), transmittance, num_pairs, overflow)
 
 
 def rows_to_send(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid) -> Array:
-    """Return the largest number of rows that a device sends to another one for a view.
+    """Return the largest number of rows that a device sends to another one for a view, drawn beside others or alone.
 
     Args:
       exchange: the D devices.
       M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
       grid: tiles of the image.
     """
-    num = exchange.num
     M, cutoff = exchange.filled_up(M), exchange.filled_up(cutoff, -1.0)
-    reached = Bands.of(grid, num).reached(M, cutoff, near_plane)
-    return jnp.max(jnp.sum(reached.reshape(num, num, -1), axis=2, dtype=jnp.int32))
+    bands = Bands.of(grid, exchange.num // exchange.views_at_once)
+    reached = bands.reached(M, cutoff, near_plane)
+    return jnp.max(jnp.sum(reached.reshape(bands.num, exchange.num, -1), axis=2, dtype=jnp.int32))
 
 
 class _Room(NamedTuple):
@@ -190,21 +204,24 @@ def _composite_band(
     settings: CompositingSettings, bands: Bands, room: _Room, rule: AppearanceRule, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return channels [D, h, W] and transmittance [h, W] of this device's band, the capacity needed, the overflow."""
-    reached = bands.reached(jax.lax.stop_gradient(splats.M), cutoff, settings.near_plane)
-    num_sent = jnp.max(jnp.sum(reached, axis=1, dtype=jnp.int32))
-    nothing = cutoff.shape[0]
-    chosen = jax.vmap(lambda mask: jnp.nonzero(mask, size=room.rows, fill_value=nothing)[0])(reached)
-    send = functools.partial(_send, chosen.astype(jnp.int32))
+    """Return channels [C, h, W] and transmittance [h, W] of this device's band, the capacity needed, the overflow."""
+    reach = functools.partial(bands.reached, near_plane=settings.near_plane)
+    reached = jax.vmap(reach)(jax.lax.stop_gradient(splats.M), cutoff)
+    num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
+    chosen, chosen_of_views = _chosen_rows(reached, room.rows)
+    send = functools.partial(_send, chosen_of_views)
 
+    splats, cutoff, probe = jax.tree.map(lambda x: x.reshape(cutoff.size, *x.shape[2:]), (splats, cutoff, probe))
     packed = send(jnp.concatenate([pack_splats(splats, True), probe], axis=1))
     splats = unpack_splats(packed[:, : -probe.shape[1]], splats, True)
     probe = packed[:, -probe.shape[1] :]
     cutoff = send(cutoff, fill=-1.0)
-    regions = None if regions is None else TextureRegion(*(send(field) for field in regions))
+    regions = None if regions is None else TextureRegion(*(_send(chosen, field) for field in regions))
 
-    top = jax.lax.axis_index(AXIS) * bands.own.height
-    M, jacobian = _shifted(splats.M, top), _shifted(jacobian[None], top)[0]
+    index = jax.lax.axis_index(AXIS)
+    view, band = index // bands.num, index % bands.num
+    top = band * bands.own.height
+    M, jacobian = _shifted(splats.M, top), _shifted(jacobian[view][None], top)[0]
     splats = splats._replace(M=M)
     list_tiles = native.tile_lists if settings.compositor == "native" else tile_lists
     lists = list_tiles(jax.lax.stop_gradient(M), cutoff, settings.near_plane, bands.own, room.pairs)
@@ -214,6 +231,21 @@ def _composite_band(
     needed = jnp.maximum(lists.num_pairs / room.pairs_share, num_sent / room.rows_share)
     overflow = jax.lax.pmax((lists.overflow | ~is_sent).astype(jnp.int32), AXIS) > 0
     return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
+
+
+def _chosen_rows(reached: Array, most: int) -> tuple[Array, Array]:
+    """Return the rows that reach each of D bands, up to a number C of them, [D, C]: in [n] rows, and in [G·n] rows.
+
+    Args:
+      reached: [G, D/G, n] whether each row reaches each band of its view.
+      most: C; places that are left hold n, and G·n.
+    """
+    num_views, _, num = reached.shape
+    choose = jax.vmap(jax.vmap(lambda mask: jnp.nonzero(mask, size=most, fill_value=num)[0].astype(jnp.int32)))
+    chosen = choose(reached)
+    starts = jnp.arange(num_views, dtype=jnp.int32)[:, None, None] * num
+    of_views = jnp.where(chosen < num, chosen + starts, num_views * num)
+    return chosen.reshape(-1, most), of_views.reshape(-1, most)
 
 
 def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:

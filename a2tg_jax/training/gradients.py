@@ -1,4 +1,4 @@
-"""Gradients of one view's loss, and the statistic that shows where a model lacks detail."""
+"""Gradients of the losses of views, and the statistic that shows where a model lacks detail."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,7 +16,14 @@ from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.model import Model, Parameters
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.render import RenderOutput, RenderSettings, check_background, render_traced, with_capacity
+from a2tg_jax.render import (
+    RenderOutput,
+    RenderSettings,
+    check_background,
+    render_together,
+    render_traced,
+    with_capacity,
+)
 from a2tg_jax.training.corrections import Correction, corrected_camera
 
 
@@ -125,6 +132,8 @@ class View(NamedTuple):
     corrections: tuple[Correction, ...] = ()
     rows: tuple[Array, ...] = ()
     """The view's row of each correction."""
+    target: Any = None
+    """Arrays that the loss compares the render with."""
 
     @property
     def corrected(self) -> "View":
@@ -132,8 +141,12 @@ class View(NamedTuple):
         return self._replace(camera=corrected_camera(self.corrections, self.rows, self.camera))
 
 
+VIEWS = View(camera=0, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
+"""Axes of several views in one, of which the corrections are shared, for `jax.vmap`."""
+
+
 class Differentiated(NamedTuple):
-    """Result of `differentiate`."""
+    """Result of `differentiate`, or of `differentiate_together`, of G views [G, ...]."""
 
     value: Array
     """The loss, a scalar."""
@@ -144,7 +157,7 @@ class Differentiated(NamedTuple):
     gaussians: Gaussians
     """Gradient in the Gaussians."""
     params: Any
-    """Gradient in what they show."""
+    """Gradient in what they show; of several views their sum."""
     rows: tuple[Array, ...]
     """Gradient in the view's row of each correction."""
     probe: Any
@@ -191,3 +204,44 @@ def differentiate(
     with_gradients = jax.value_and_grad(of_parameters, argnums=(0, 1, 2, 3), has_aux=True)
     (value, (told, num_pairs)), gradients = with_gradients(model.gaussians, model.params, view.rows, probe)
     return Differentiated(value, told, num_pairs, *gradients)
+
+
+def differentiate_together(
+    loss: Callable[[Model, View, RenderOutput], tuple[Array, Any]],
+    model: Model,
+    views: View,
+    settings: RenderSettings,
+    *,
+    has_geometry: bool,
+    sh_degree: Any,
+    statistic: Statistic | None,
+    has_probe: bool,
+) -> Differentiated:
+    """Do what `differentiate` does for G views at once, on the devices of `settings.exchange`.
+
+    Args:
+      loss, model, settings, has_geometry, sh_degree, statistic, has_probe: as for `differentiate`.
+      views: with a leading axis G, but for the corrections.
+    """
+    num_views = views.background.shape[0]
+
+    def of_parameters(
+        gaussians: Gaussians, params: Any, rows: tuple[Array, ...], probe: Array | None
+    ) -> tuple[Array, tuple[Any, ...]]:
+        seen = jax.vmap(lambda view: view.corrected, in_axes=(VIEWS,), out_axes=VIEWS)(views._replace(rows=rows))
+        outputs, num_pairs = render_together(
+            gaussians, seen.camera, dataclasses.replace(model, params=params).rule, views.background, settings,
+            has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
+        )  # fmt: skip
+
+        def of_view(gaussians: Gaussians, view: View, output: RenderOutput) -> tuple[Array, Any]:
+            return loss(dataclasses.replace(model, gaussians=gaussians, params=params), view, output)
+
+        values, told = jax.vmap(of_view, in_axes=(0, VIEWS, 0))(gaussians, seen, outputs)
+        return jnp.sum(values), (values, told, num_pairs)
+
+    copies: Gaussians = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_views, *x.shape)), model.gaussians)
+    probe = jnp.zeros((num_views, model.gaussians.num, 4), copies.means.dtype) if has_probe else None
+    with_gradients = jax.value_and_grad(of_parameters, argnums=(0, 1, 2, 3), has_aux=True)
+    (_, (values, told, num_pairs)), gradients = with_gradients(copies, model.params, views.rows, probe)
+    return Differentiated(values, told, num_pairs, *gradients)

@@ -6,6 +6,7 @@ after it stay idle (`step.TrainState.status`); the loop mends the cause and laun
 
 import dataclasses
 import functools
+import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -275,7 +276,7 @@ class StageRun:
             self._mend(first + len(taken), infos[len(taken)])
         return taken
 
-    def _arguments(self, iteration: int) -> tuple[Any, ...]:
+    def arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
         due = self._due(iteration) if are_events_decided_by_host() else None
@@ -288,7 +289,7 @@ class StageRun:
         return tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
 
     def _launch(self, iteration: int) -> StepInfo:
-        arguments, step = self._arguments(iteration), jitted_step()
+        arguments, step = self.arguments(iteration), jitted_step()
         num_compiled = step.num_compiled()
         info: StepInfo
         self.state, info = step(*arguments)
@@ -324,7 +325,7 @@ class StageRun:
         names = [self.views[index].name for index in self.order.indices(iteration)]
         what = "loss or gradient is not finite" if info.status == NOT_FINITE else "the loss has exploded"
         return DivergedError(
-            f"{what} {where}, view {', '.join(names)}: {what_diverged(self._arguments(iteration), names)}: lower the "
+            f"{what} {where}, view {', '.join(names)}: {what_diverged(self.arguments(iteration), names)}: lower the "
             "learning rates, or look for a damaged camera or image; the state before it is unharmed",
             self.checkpoint,
         )
@@ -399,6 +400,7 @@ class StageRun:
 
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
         """Return the exchange with room for the rows that travel in some views once all rows exist."""
+        exchange = dataclasses.replace(exchange, views_at_once=math.gcd(self.system.batch_size, exchange.num))
         model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
         most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)

@@ -6,7 +6,7 @@ values, and its status makes all further steps idle, so that the host may look a
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -33,7 +33,7 @@ from a2tg_jax.training.corrections import (
     rows_of,
     updated,
 )
-from a2tg_jax.training.gradients import View, differentiate
+from a2tg_jax.training.gradients import Differentiated, View, differentiate, differentiate_together
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 
@@ -202,7 +202,8 @@ class BatchGradients(NamedTuple):
     num_pairs: Array
     is_overflow: Array
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
-    """Gradients in the Gaussians, the appearance parameters, and the view's row of each correction."""
+    """Gradients in the Gaussians, the appearance parameters, and the view's row of each correction. Those of
+    parameters are of rounds of views, whose mean each is."""
     statistic: Array | None
     """[V, N, 4]."""
 
@@ -217,38 +218,55 @@ def _gradients(
     iteration: Array,
     own: tuple[Array, ...],
 ) -> BatchGradients:
-    """Return loss and gradients of every view, one after the other."""
+    """Return loss and gradients of every view: one after the other, or as many at once as the devices share."""
     height, width = batch.images.shape[1:3]
     model, highest = state.model, settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    has_geometry = any(term.has_geometry for term in stage.losses)
+    options: dict[str, Any] = {
+        "has_geometry": any(term.has_geometry for term in stage.losses), "sh_degree": degree,
+        "statistic": stage.statistic, "has_probe": is_gathering,
+    }  # fmt: skip
 
-    def one_view(view: tuple[Any, ...]) -> BatchGradients:
-        viewmat, K, image, alpha, mask, depth, background, rows = view
-        photograph = _black_outside(mask, _over(image, alpha, background))
+    def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
+        image, alpha, mask, depth = seen.target
+        photograph = _black_outside(mask, _over(image, alpha, seen.background))
+        target = Target(seen.camera, photograph, seen.background, mask, depth, clock.progress(iteration - 1))
+        color = corrected_color(seen.corrections, seen.rows, output.color)
+        output = output._replace(color=_black_outside(mask, color))
+        terms = [term(shown, target, output) for term in stage.losses]
+        value = functools.reduce(jnp.add, [*terms, *penalties(seen.corrections, seen.rows)])
+        error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
+        return value, (error, output.overflow)
 
-        def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
-            target = Target(seen.camera, photograph, background, mask, depth, clock.progress(iteration - 1))
-            color = corrected_color(seen.corrections, seen.rows, output.color)
-            output = output._replace(color=_black_outside(mask, color))
-            terms = [term(shown, target, output) for term in stage.losses]
-            value = functools.reduce(jnp.add, [*terms, *penalties(seen.corrections, seen.rows)])
-            error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
-            return value, (error, output.overflow)
-
-        shot = View(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows)
-        found = differentiate(
-            loss, model, shot, settings.render,
-            has_geometry=has_geometry, sh_degree=degree, statistic=stage.statistic, has_probe=is_gathering,
-        )  # fmt: skip
+    def gradients_by(differentiate: Callable[..., Differentiated], arrays: tuple[Any, ...]) -> BatchGradients:
+        viewmat, K, background, rows, pictures = arrays
+        view = View(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
+        found = differentiate(loss, model, view, settings.render, **options)
         error, overflow = found.told
         grads = found.gaussians, found.params, found.rows
         return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
 
     pictures = batch.images, batch.alphas, batch.masks, batch.depths
-    gradients: BatchGradients = jax.lax.map(one_view, (batch.viewmats, batch.Ks, *pictures, backgrounds, own))
-    return gradients
+    arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
+    num, exchange = backgrounds.shape[0], settings.render.exchange
+    num_at_once = 1 if exchange is None else exchange.num_at_once(num)
+    gradients: BatchGradients
+    if num_at_once == 1:
+        gradients = jax.lax.map(functools.partial(gradients_by, differentiate), arrays)
+        return gradients
+    rounds = jax.tree.map(lambda x: x.reshape(num // num_at_once, num_at_once, *x.shape[1:]), arrays)
+    gradients = jax.lax.map(functools.partial(gradients_by, differentiate_together), rounds)
+    return _of_views(gradients, num_at_once)
+
+
+def _of_views(rounds: BatchGradients, num_at_once: int) -> BatchGradients:
+    """Return the gradients of rounds of views [V/G, G, ...] as those of views [V, ...]; of parameters, mean ones."""
+    gaussians, sums, rows = rounds.grads
+    rounds = rounds._replace(grads=(gaussians, None, rows))
+    views: BatchGradients = jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), rounds)
+    means = jax.tree.map(lambda x: x / num_at_once, sums)
+    return views._replace(grads=(views.grads[0], means, views.grads[2]))
 
 
 def _over(image: Array, alpha: Array | None, background: Array) -> Array:
