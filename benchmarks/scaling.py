@@ -2,9 +2,10 @@
 
     python -m benchmarks.scaling --out benchmarks/results/scaling.json
 
-The random scene of the other benchmarks at 1600×1060 pixels, spread over 1 to 64 devices. A device sends a fixed number
-of rows to each other one, the largest that any pair needs; the least that must travel are the rows that reach a band
-which another device owns. Gradients come back in the same rows.
+The random scene of the other benchmarks at 1600×1060 pixels, spread over 1 to 64 devices, which draw one view together,
+or as many views at once as there are devices. A device sends a fixed number of rows to each other one, the largest that
+any pair needs; the least that must travel are the rows that reach a band which another device owns. Gradients come back
+in the same rows.
 
     python -m benchmarks.scaling --train 2000000 --memory-gb 12 --out benchmarks/results/scaling_training.json
 
@@ -51,21 +52,22 @@ def row_bytes() -> tuple[int, int]:
     return BYTES_PER_FLOAT * (splat + CUTOFF), BYTES_PER_FLOAT * splat
 
 
-def counted(num: int, devices: int) -> dict[str, float]:
-    """Return the counts of one rendering of `num` Gaussians."""
+def counted(num: int, devices: int, views: int) -> dict[str, float]:
+    """Return the counts of one rendering of `num` Gaussians, beside those of `views` − 1 others that are alike."""
     num = num // devices * devices
     gaussians, camera = random_scene(num, WIDTH, HEIGHT)
     M, _ = homographies(gaussians, camera)
     rule = rule_of(gaussians, None, None, RenderSettings())
-    bands = Bands.of(TileGrid(WIDTH, HEIGHT, 8), devices)
+    bands = Bands.of(TileGrid(WIDTH, HEIGHT, 8), devices // views)
     reached = np.asarray(jax.jit(bands.reached)(M, rule.cutoff(rule.opacities(gaussians)), jnp.float32(NEAR_PLANE)))
-    per_pair = reached.reshape(devices, devices, -1).sum(axis=2)
+    per_pair = reached.reshape(bands.num, devices, -1).sum(axis=2)
     least = per_pair.sum() - np.trace(per_pair)
     forward, back = row_bytes()
-    sent = per_pair.max() * devices * (devices - 1)
+    sent = per_pair.max() * bands.num * (devices - 1)
     return {
         "gaussians": num,
         "devices": devices,
+        "views_at_once": views,
         "state_bytes_per_device": BYTES_PER_FLOAT * STATES * floats_per_gaussian(3) * num / devices,
         "rows_received": float(per_pair.sum(axis=1).max()),
         "least_bytes": float(least * (forward + back)),
@@ -91,7 +93,13 @@ def main() -> None:
         if trained["peak_gb"] > args.memory_gb:
             sys.exit(f"the training took {trained['peak_gb']:.1f} GB, more than {args.memory_gb:g} GB")
         return
-    found = [counted(num, devices) for num in NUMS if num <= args.largest for devices in DEVICES]
+    found = [
+        counted(num, devices, views)
+        for num in NUMS
+        if num <= args.largest
+        for devices in DEVICES
+        for views in sorted({1, devices})
+    ]
     args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(table(found))
 
@@ -116,13 +124,14 @@ def training(num: int, steps: int) -> dict[str, float]:
 
 
 def table(found: Sequence[Mapping[str, float]]) -> str:
-    """Return a row for each case."""
+    """Return a row for each case; bytes are of one view."""
     rows = []
     for row in found:
         names = "state_bytes_per_device", "sent_bytes", "least_bytes"
         state, sent, least = (f"{row[name] / 1e6:,.0f} MB" for name in names)
-        rows.append([f"{row['gaussians']:,}", f"{row['devices']}", state, f"{row['rows_received']:,.0f}", sent, least])
-    header = ["Gaussians", "devices", "state on a device", "rows received", "sent by all", "least"]
+        counts = (f"{row[name]:,.0f}" for name in ("gaussians", "devices", "views_at_once"))
+        rows.append([*counts, state, f"{row['rows_received']:,.0f}", sent, least])
+    header = ["Gaussians", "devices", "views at once", "state on a device", "rows received", "sent by all", "least"]
     return markdown(header, rows)
 
 
