@@ -50,6 +50,15 @@ def free_port():
         return found.getsockname()[1]
 
 
+def ipv6_loopback():
+    """The loopback as trainings name it: by IPv6 where the machine has it."""
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6):
+            return "[::1]"
+    except OSError:
+        return "127.0.0.1"
+
+
 def pair(arguments, count=2):
     """Processes that run this script with some arguments and the place of each."""
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", str(count), "--process-id"]
@@ -59,7 +68,7 @@ def pair(arguments, count=2):
 def trainings(out, flags, *own):
     """Processes of the command line that train together, each with some flags of its own."""
     words = ["-m", "a2tg_jax.cli", "train", "synthetic", "--out", str(out), *flags]
-    place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", str(len(own)), "--process-id"]
+    place = ["--coordinator", f"{ipv6_loopback()}:{free_port()}", "--num-processes", str(len(own)), "--process-id"]
     return [started([*words, *place, str(number), *each]) for number, each in enumerate(own)]
 
 

@@ -239,7 +239,10 @@ def test_a_lack_of_memory_is_no_lost_connection():
     [
         ("--num-processes 2", "--num-processes wants --coordinator HOST:PORT"),
         ("--coordinator h:1 --process-id 0", "--coordinator HOST:PORT also wants --num-processes"),
-        ("--coordinator h --num-processes 2 --process-id 0", "--coordinator must be HOST:PORT or auto; got 'h'"),
+        (
+            "--coordinator h --num-processes 2 --process-id 0",
+            "must be HOST:PORT, [IPv6]:PORT or auto; got 'h'",
+        ),
         ("--coordinator h:1 --num-processes 2 --process-id 2", "--process-id must be from 0 to 1"),
         ("--coordinator auto --view", "--view shows the training of one process"),
         ("--coordinator auto --heartbeat-timeout-seconds 0", "--heartbeat-timeout-seconds must be positive and finite"),
@@ -248,7 +251,7 @@ def test_a_lack_of_memory_is_no_lost_connection():
         ("--heartbeat-timeout-seconds 9", "--heartbeat-timeout-seconds wants --coordinator HOST:PORT"),
         ("--coordinator auto --num-processes -3", "--num-processes must be at least 1; got -3"),
         ("--coordinator auto --process-id -1", "--process-id must be at least 0; got -1"),
-        ("--coordinator [::1]:7700 --num-processes 2 --process-id 0", "host name or an IPv4 address, not IPv6"),
+        ("--coordinator ::1:7700 --num-processes 2 --process-id 0", "[IPv6]:PORT or auto; got '::1:7700'"),
     ],
 )
 def test_wrong_places_are_told(tmp_path, capsys, flags, told):

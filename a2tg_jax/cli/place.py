@@ -41,11 +41,9 @@ def place_of(
 
 
 def _check_address(coordinator: str) -> None:
-    """Raise ValueError unless the text is HOST:PORT."""
-    if not re.fullmatch(r".+:\d+", coordinator):
-        raise ValueError(f"--coordinator must be HOST:PORT or auto; got {coordinator!r}")
-    if ":" in coordinator.rpartition(":")[0]:
-        raise ValueError(f"--coordinator wants a host name or an IPv4 address, not IPv6; got {coordinator!r}")
+    """Raise ValueError unless the text is HOST:PORT, with IPv6 addresses in brackets."""
+    if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+(%\w+)?\]|[^:\[\]]+):\d+", coordinator):
+        raise ValueError(f"--coordinator must be HOST:PORT, [IPv6]:PORT or auto; got {coordinator!r}")
 
 
 def _check_number(num_processes: int | None, process_id: int | None) -> None:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from multiprocessing import AuthenticationError
-from multiprocessing.connection import Client, Connection, answer_challenge, deliver_challenge
+from multiprocessing.connection import Connection, answer_challenge, deliver_challenge
 
 BEATS = 5
 """Number of signs of life within the time after which a silent process is lost."""
@@ -138,12 +138,17 @@ def _admit(guest: socket.socket, key: bytes, arrived: "queue.SimpleQueue[tuple[i
 
 def connect(host: str, port: int, key: bytes, number: int) -> dict[int, Connection]:
     """Return the connection of process `number` to the first."""
-    connection: Connection = Client((host, port), authkey=key)
+    connection = Connection(socket.create_connection((host, port)).detach())
+    answer_challenge(connection, key)
+    deliver_challenge(connection, key)
     connection.send_bytes(number.to_bytes(4, "big"))
     return {0: connection}
 
 
 def listen() -> tuple[socket.socket, int, bytes]:
-    """Return a listener on a free port, that port, and a key for those who may connect."""
-    listener = socket.create_server(("", 0), backlog=64)
+    """Return a listener on a free port, that port, and a key for those who may connect: by IPv4, and IPv6 if it is
+    there."""
+    has_both = socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if has_both else socket.AF_INET
+    listener = socket.create_server(("", 0), family=family, backlog=64, dualstack_ipv6=has_both)
     return listener, int(listener.getsockname()[1]), os.urandom(32)

@@ -33,7 +33,8 @@ class Place(NamedTuple):
     """Place of this process among all; arguments of `jax.distributed.initialize`."""
 
     coordinator: str
-    """HOST:PORT of the first process, or "auto": JAX detects Slurm, Open MPI, Kubernetes."""
+    """HOST:PORT of the first process, or "auto": JAX detects Slurm, Open MPI, Kubernetes. IPv6 addresses are in
+    brackets."""
     num_processes: int | None
     process_id: int | None
     seconds: float

@@ -241,8 +241,11 @@ def _chosen_rows(reached: Array, most: int) -> tuple[Array, Array]:
       most: C; places that are left hold n, and G·n.
     """
     num_views, _, num = reached.shape
-    choose = jax.vmap(jax.vmap(lambda mask: jnp.nonzero(mask, size=most, fill_value=num)[0].astype(jnp.int32)))
-    chosen = choose(reached)
+
+    def of_band(mask: Array) -> Array:
+        return jnp.nonzero(mask, size=most, fill_value=num)[0].astype(jnp.int32)
+
+    chosen: Array = jax.vmap(jax.vmap(of_band))(reached)
     starts = jnp.arange(num_views, dtype=jnp.int32)[:, None, None] * num
     of_views = jnp.where(chosen < num, chosen + starts, num_views * num)
     return chosen.reshape(-1, most), of_views.reshape(-1, most)
