@@ -104,8 +104,8 @@ if TYPE_CHECKING:
     from a2tg_jax.model import Model as Model
     from a2tg_jax.model import Parameters as Parameters
     from a2tg_jax.model import concatenate as concatenate
-    from a2tg_jax.render import RenderOutput as RenderOutput
-    from a2tg_jax.render import RenderSettings as RenderSettings
+    from a2tg_jax.rasterize.render_types import RenderOutput as RenderOutput
+    from a2tg_jax.rasterize.render_types import RenderSettings as RenderSettings
     from a2tg_jax.render import render_appearance as render_appearance
     from a2tg_jax.render import render_image as render_image
     from a2tg_jax.renderer import Renderer as Renderer
@@ -213,7 +213,8 @@ _NAMES = {
     "a2tg_jax.mesh.texturing": ("texture_mesh",),
     "a2tg_jax.mesh.triangles": ("Mesh",),
     "a2tg_jax.model": ("Model", "Parameters", "concatenate"),
-    "a2tg_jax.render": ("RenderOutput", "RenderSettings", "render_appearance", "render_image"),
+    "a2tg_jax.rasterize.render_types": ("RenderOutput", "RenderSettings"),
+    "a2tg_jax.render": ("render_appearance", "render_image"),
     "a2tg_jax.renderer": ("Renderer", "plan_render"),
     "a2tg_jax.systems.a2tg": ("A2tg", "TextureConfig"),
     "a2tg_jax.systems.bbsplat": ("BBSplat",),

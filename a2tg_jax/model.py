@@ -20,7 +20,8 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
-from a2tg_jax.render import RenderOutput, RenderSettings, render_appearance, with_features
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
+from a2tg_jax.render import render_appearance, with_features
 from a2tg_jax.texture import AtlasLayout, Textures
 
 

@@ -15,17 +15,10 @@ from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.model import Model
-from a2tg_jax.render import (
-    HEAD_ROOM,
-    RenderOutput,
-    RenderSettings,
-    appearance_of,
-    capacity_for,
-    check_background,
-    pairs_of_view,
-    render_traced,
-    rule_of,
-)
+from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import appearance_of, check_background, rule_of
 from a2tg_jax.texture import AtlasLayout, Textures
 
 FIRST_ROOM = 1.5

@@ -22,12 +22,13 @@ import numpy as np
 import a2tg_jax
 from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.core.gaussians import floats_per_gaussian
+from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.traced import Functions, KernelSpec
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats, project_gaussians
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
-from a2tg_jax.render import capacity_for, pairs_of_view, rule_of
+from a2tg_jax.render import rule_of
 from benchmarks.workload import random_scene, random_textures
 
 BYTES_PER_SECOND, FLOPS_PER_SECOND = 4.8e12, 67e12

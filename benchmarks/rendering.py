@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax
-from a2tg_jax.render import render_traced, rule_of
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import rule_of
 from benchmarks.arrays import random_image
 from benchmarks.timing import timed
 from benchmarks.workload import random_scene, random_textures

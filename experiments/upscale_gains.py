@@ -28,7 +28,7 @@ from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.data import view_image
 from a2tg_jax.events import Change, Due, HostEvent, event
 from a2tg_jax.model import Model
-from a2tg_jax.render import render_traced
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.systems.bytewise import DetailTextureConfig
 from a2tg_jax.systems.stage1 import later_stage

@@ -15,7 +15,7 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.rasterize.exchange import exchange_among, spread
-from a2tg_jax.render import render_traced
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import StageRun

@@ -15,7 +15,7 @@ import a2tg_jax as a2tg
 from a2tg_jax import Model, RenderSettings, Textured, view_gradients
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.events import Seen
-from a2tg_jax.render import render_traced
+from a2tg_jax.rasterize.views import render_traced
 
 
 @pytest.mark.usefixtures("x64")

@@ -15,7 +15,7 @@ from a2tg_jax import load_compact, load_ply, save_compact, save_ply
 from a2tg_jax.io.model_file import FORMAT as MODEL
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.model import Model
-from a2tg_jax.render import render_traced
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 
 

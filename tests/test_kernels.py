@@ -19,7 +19,8 @@ from a2tg_jax.core.geometry import homographies
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.native import threads
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
-from a2tg_jax.render import render_traced, rule_of
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import rule_of
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
 
 

@@ -9,7 +9,8 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_image
-from a2tg_jax.render import render_traced, rule_of
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import rule_of
 
 COMPOSITORS = ("native", "xla", "cuda")
 SCENE = draw_scene(4, num=16, width=19, height=13)

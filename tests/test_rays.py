@@ -18,7 +18,7 @@ from a2tg_jax.appearance import PlainRule
 from a2tg_jax.core.cameras import Camera, looking, resize_camera
 from a2tg_jax.data.scene import kinds_of
 from a2tg_jax.model import Model
-from a2tg_jax.render import pairs_of_view
+from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.systems.stage1 import PruneConfig
 from a2tg_jax.training.batches import check_lenses
 from a2tg_jax.training.loop import StageRun

@@ -21,7 +21,7 @@ from a2tg_jax import Camera, RenderSettings, Textures, render_appearance
 from a2tg_jax.appearance import AppearanceRule, Billboards, MovableKernelParams, MovableKernels, PlainRule, Shaped
 from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.render import render_traced
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import plan_layout
 
 SIDE = 4

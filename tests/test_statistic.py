@@ -10,7 +10,8 @@ import pytest
 from oracle import DEFAULT_RULES, OFFICIAL, Scene
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_settings, as_textures, draw_scene
 
-from a2tg_jax.render import RenderSettings, render_traced, rule_of
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import RenderSettings, rule_of
 
 
 def statistic(scene: Scene, cotangent: np.ndarray, settings: RenderSettings, which: str) -> np.ndarray:

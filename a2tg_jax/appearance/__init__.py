@@ -25,6 +25,7 @@ from a2tg_jax.appearance.rule import RuleAround as RuleAround
 from a2tg_jax.appearance.rule import StaticRule as StaticRule
 from a2tg_jax.appearance.rule import gaussian_cutoff as gaussian_cutoff
 from a2tg_jax.appearance.rule_check import Arguments as Arguments
+from a2tg_jax.appearance.rule_check import check_rule as check_rule
 from a2tg_jax.appearance.rule_check import check_shading as check_shading
 from a2tg_jax.appearance.rule_check import elementwise_rule as elementwise_rule
 from a2tg_jax.appearance.rule_check import takes_arrays as takes_arrays

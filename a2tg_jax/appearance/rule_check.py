@@ -14,12 +14,23 @@ import jax.extend.core
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.rule import Factor, Residual, RuleAround, StaticRule
+from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, RuleAround, StaticRule
 from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.core.checks import described
+from a2tg_jax.core.checks import check_kind, described
 
 ODD_SHAPE = (5, 7)
 """Shape of arrays that fits no matrix in a rule by chance."""
+
+
+def check_rule(rule: AppearanceRule) -> None:
+    """Raise ValueError unless a value is a rule, and it and the rules in it are pytrees."""
+    check_kind("rule", rule, AppearanceRule)
+    for leaf in jax.tree.leaves(rule):
+        if isinstance(leaf, AppearanceRule):
+            raise ValueError(
+                f"{type(leaf).__name__} is not a pytree: decorate it with @jax.tree_util.register_dataclass, above "
+                "@dataclasses.dataclass(frozen=True)"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,9 @@ from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import choice
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import Wanted
-from a2tg_jax.render import RenderSettings, render_image
+from a2tg_jax.render import render_image
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
 MOST_DIFFERENCE = 1e-3

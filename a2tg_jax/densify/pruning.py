@@ -23,7 +23,8 @@ from a2tg_jax.data import View, counted_pixels, views_by_kind
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, Times, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 
 

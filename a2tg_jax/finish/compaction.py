@@ -18,7 +18,7 @@ from a2tg_jax.data import View, view_image
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
 from a2tg_jax.io.quantise import Precision
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 
 Loss = Callable[[Model], float]

@@ -26,7 +26,8 @@ from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.data import View, counted_pixels, view_image, views_by_kind
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import Textures
 

@@ -26,7 +26,8 @@ from a2tg_jax.core.jit import Jitted
 from a2tg_jax.data import View
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
 

@@ -22,7 +22,8 @@ from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import View, view_image
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, render_traced
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 

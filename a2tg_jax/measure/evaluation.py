@@ -18,7 +18,8 @@ from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.measure.alignment import color_fit
 from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, appearance_of
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.render import appearance_of
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.texture import AtlasLayout, Textures
 from a2tg_jax.training.corrections import exposed

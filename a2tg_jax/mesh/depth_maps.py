@@ -11,7 +11,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.render import RenderOutput
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import back_project
 
 LEAST_FACING = 0.1

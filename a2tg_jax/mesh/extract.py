@@ -19,7 +19,7 @@ from a2tg_jax.mesh.marching import surface_of
 from a2tg_jax.mesh.space import RADII, Space, common_sphere
 from a2tg_jax.mesh.triangles import Mesh, largest_clusters
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 
 RESOLUTION = 512

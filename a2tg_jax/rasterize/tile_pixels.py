@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.core.cameras import Camera
+
 PRIOR = 1e-6
 """Weight of the unit matrix, per pixel, where a tile's pixels do not tell its frame: a single row or column of them."""
 
@@ -43,6 +45,11 @@ class TilePixels(NamedTuple):
     """[T, 4] left, top, right and bottom edge of the tile's rays; an empty box without any."""
     magnifications: Array
     """[T] bound of the length in the image plane of one pixel of the image."""
+
+
+def pixels_of(camera: Camera, tile_size: int) -> TilePixels | None:
+    """Return the pixels of all tiles of a camera with rays; None for a pinhole camera."""
+    return None if camera.rays is None else tile_pixels(camera.rays, tile_size)
 
 
 def tile_pixels(rays: Array, tile_size: int) -> TilePixels:

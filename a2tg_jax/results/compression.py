@@ -23,7 +23,7 @@ from a2tg_jax.io.compact import GROUPS, encode_model
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.rows import check_encodable
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.record import read_record

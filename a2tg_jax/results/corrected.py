@@ -17,7 +17,7 @@ from a2tg_jax.data import Scene, View
 from a2tg_jax.measure.alignment import align_poses
 from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.results.folder import RunFolder, write_json
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.training.corrections import learned

@@ -15,7 +15,7 @@ from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderOutput, RenderSettings
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.images import checkered, colored_by_level, to_uint8
 from a2tg_jax.texture import texture_arrays

@@ -13,7 +13,7 @@ from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.corrected import measure_corrected, write_corrections
 from a2tg_jax.results.folder import RunFolder, resuming_command, write_json

@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder

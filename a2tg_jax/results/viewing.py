@@ -21,7 +21,7 @@ from a2tg_jax.io.formats import FORMATS, file_bytes, load_splats
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.record import read_record

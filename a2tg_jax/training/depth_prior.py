@@ -9,7 +9,7 @@ from jax import Array
 from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderOutput
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.terms import Target
 
 DepthKind = Literal["inverse", "depth"]

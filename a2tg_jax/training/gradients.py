@@ -15,15 +15,11 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.model import Model, Parameters
+from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.render import (
-    RenderOutput,
-    RenderSettings,
-    check_background,
-    render_together,
-    render_traced,
-    with_capacity,
-)
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
+from a2tg_jax.rasterize.views import render_together, render_traced
+from a2tg_jax.render import check_background
 from a2tg_jax.training.corrections import Correction, corrected_camera
 
 

@@ -22,9 +22,10 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.rasterize.exchange import Exchange, spread
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, of_first, readable
-from a2tg_jax.render import RenderSettings, capacity_for, pairs_of_view, rows_of_view
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batches import BatchOrder, PhotoStore, check_lenses
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
 from a2tg_jax.training.corrections import check_corrections

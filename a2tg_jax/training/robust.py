@@ -11,7 +11,7 @@ from jax import Array
 
 from a2tg_jax.events import event
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderOutput
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import photometric_loss
 from a2tg_jax.training.terms import Target
 

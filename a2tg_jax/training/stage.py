@@ -15,7 +15,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.render import RenderOutput
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.terms import Target

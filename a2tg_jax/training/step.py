@@ -22,7 +22,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import spread
-from a2tg_jax.render import RenderOutput, RenderSettings
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (
     CorrectionState,

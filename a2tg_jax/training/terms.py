@@ -12,7 +12,7 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
-from a2tg_jax.render import RenderOutput
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 
 

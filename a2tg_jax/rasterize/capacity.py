@@ -1,0 +1,122 @@
+"""Room that a view needs: pairs of splat and tile, and rows that travel between devices, counted on the host."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import AppearanceRule, check_rule
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_kind
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.core.jit import Jitted
+from a2tg_jax.rasterize.exchange import rows_to_send
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.supersampling import finer
+from a2tg_jax.rasterize.tile_pixels import pixels_of
+from a2tg_jax.rasterize.tiles import TileGrid, count_pairs
+
+HEAD_ROOM = 1.25
+
+
+def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
+    """Return a capacity with head room for a number of pairs, rounded up so that few shapes occur."""
+    return max(1024, -(-int(pairs * head_room) // 1024) * 1024)
+
+
+def with_capacity(
+    settings: RenderSettings, gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any = None
+) -> RenderSettings:
+    """Return the settings; if they lack a capacity, with one for this view, which an eager call can find.
+
+    Raises:
+      ValueError: under jit or vmap without a capacity.
+    """
+    check_kind("settings", settings, RenderSettings)
+    check_rule(rule)
+    if settings.capacity is not None:
+        return settings
+    gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
+        raise ValueError(
+            "settings.capacity is needed under jit and vmap, where shapes are fixed: "
+            "settings = plan_render(model, cameras) outside, then pass settings=settings"
+        )
+    pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
+    return dataclasses.replace(settings, capacity=capacity_for(pairs))
+
+
+def _primal_value(x: Any) -> Any:
+    """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
+    while isinstance(x, jax.core.Tracer):
+        try:
+            return np.asarray(jax.lax.stop_gradient(x))
+        except jax.errors.TracerArrayConversionError:
+            inner = getattr(x, "primal", None)
+            if inner is None:
+                return x
+            x = inner
+    return x
+
+
+def pairs_of_view(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
+    check_rule(rule)
+    camera = finer(camera, settings.supersample)
+    try:
+        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
+
+
+def rows_of_view(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the rows that a device of `settings.exchange` must be able to send to another one in a view (host)."""
+    camera = finer(camera, settings.supersample)
+    return int(_jitted_rows()(gaussians, camera, rule, settings, num_live))
+
+
+@functools.cache
+def _jitted_count() -> Jitted[..., Array]:
+    return Jitted(_count_pairs, static_argnums=(3, 4))
+
+
+def _count_pairs(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
+) -> Array:
+    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    pixels = pixels_of(camera, tile_size)
+    bounds = screen_bounds(M, cutoff, near_plane)
+    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size), pixels)
+
+
+@functools.cache
+def _jitted_rows() -> Jitted[..., Array]:
+    return Jitted(_count_rows, static_argnums=(3,))
+
+
+def _count_rows(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any
+) -> Array:
+    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    assert settings.exchange is not None
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    return rows_to_send(settings.exchange, M, cutoff, settings.near_plane, grid)
+
+
+def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:
+    """Return homographies [N, 3, 3] and squared distances [N] of visibility, not positive for rows that do not
+    exist."""
+    M, _ = homographies(gaussians, camera)
+    cutoff = rule.cutoff(rule.opacities(gaussians))
+    if num_live is not None:
+        cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
+    return M, cutoff

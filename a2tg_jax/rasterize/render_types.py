@@ -1,0 +1,93 @@
+"""Options of a rendering and its images: what `render_image` takes and returns."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import TextureOptions
+from a2tg_jax.core.display import as_bytes, enlarged, png, short_tuple_repr
+from a2tg_jax.core.pixel_sizes import NEAR_PLANE
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.rasterize.exchange import Exchange
+from a2tg_jax.rasterize.splats import Wanted
+
+IMAGES = ("color", "alpha", "depth", "normal", "distortion")
+"""Fields of `RenderOutput` that are images."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderSettings:
+    """Static options of a rendering; hashable, so that jit can close over them or take them as static."""
+
+    tile_size: int = 8
+    """Side of a tile in pixels; it does not change the image."""
+    near_plane: float = NEAR_PLANE
+    """Least depth of visible splats and hits, in units of the world; positive. If you scale the world, scale near_plane
+    by the same factor (`transform`)."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics used, 0 to 3."""
+    texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
+    """Texture options for Gaussians and textures given apart (`render_image`, `plan_render`, `evaluate`).
+
+    A `Model` and a rule have their own options; this field is then not used."""
+    capacity: int | None = None
+    """Largest number of (splat, tile) pairs, at least 1, as `plan_render` finds it. None: an eager call finds it, jit
+    raises. If it is too small, the image is only the background and `overflow` is True; an eager call then warns."""
+    compositor: Wanted = "auto"
+    """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
+    and XLA with a warning if the others do not support the appearance rule. These are differentiated once, in reverse
+    mode; "autodiff", slower and by XLA, in any mode and to any order."""
+    tile_batch: int | None = None
+    """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
+    supersample: int = 1
+    """Factor k by which views are drawn larger; each pixel is the mean over k × k. It lets a model be seen much smaller
+    than it was trained without aliasing, at k² times the cost."""
+    exchange: Exchange | None = None
+    """Devices that render each image together (`exchange_among`); None: one."""
+
+    def __post_init__(self) -> None:
+        if not self.near_plane > 0:
+            raise ValueError(f"near_plane must be positive; got {self.near_plane}")
+        if type(self.supersample) is not int or self.supersample < 1:
+            raise ValueError(f"supersample must be an int, at least 1; got {self.supersample!r}")
+        if isinstance(self.capacity, np.integer):
+            object.__setattr__(self, "capacity", int(self.capacity))
+        if self.capacity is not None and (type(self.capacity) is not int or self.capacity < 1):
+            raise ValueError(f"capacity must be an int, at least 1, or None; got {self.capacity!r}")
+
+    def transform(self, similarity: Similarity) -> "RenderSettings":
+        """Return settings that show a model in the world of `similarity` as these show it in its own."""
+        return dataclasses.replace(self, near_plane=self.near_plane * similarity.scale)
+
+    @staticmethod
+    def official() -> "RenderSettings":
+        """Return settings with the texture conventions of the authors' program."""
+        return RenderSettings(texture=TextureOptions.official())
+
+
+class RenderOutput(NamedTuple):
+    """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background."""
+
+    color: Array
+    """[H, W, 3], background included, not clipped; or [H, W, D] features."""
+    alpha: Array
+    """[H, W] in [0, 1], 1 − the final transmittance."""
+    depth: Array
+    """[H, W] Σ z·α·T."""
+    normal: Array
+    """[H, W, 3] Σ n·α·T, in the world, facing the camera."""
+    overflow: Array
+    """Whether the capacity was too small; the image is then only the background and must not be used. Eager calls
+    warn of it (`CapacityWarning`), jitted ones cannot."""
+    distortion: Array
+    """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
+
+    def __repr__(self) -> str:
+        return short_tuple_repr(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the colour as a PNG file for notebooks; None for several views, or under a transformation."""
+        pixels = as_bytes(self.color)
+        return None if pixels is None else png(enlarged(pixels))
