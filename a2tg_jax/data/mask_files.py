@@ -14,7 +14,7 @@ from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, Shot, View
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular
 
 FOLDER = "masks"
 """Folder of masks, beside the folder of images."""
@@ -90,7 +90,7 @@ def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) 
     """
     lacking = [shot.name for shot in shots if shot.mask is None]
     if len(lacking) == len(shots):
-        if folder is not None and folder.is_dir():
+        if folder is not None and is_folder(folder):
             message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
             warnings.warn(message, stacklevel=3)
         return
