@@ -132,7 +132,7 @@ def _load_remote(path: Path, options: dict[str, Any]) -> Scene:
     """Load a scene from object storage."""
     is_json = path.suffix.lower() == ".json"
     reach(path.parent if is_json else path)
-    if is_json and is_regular(path):
+    if is_json:
         return load_transforms(path, **options)
     if (load := _loader(path)) is not None:
         return load(**options)
