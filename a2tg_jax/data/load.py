@@ -51,7 +51,8 @@ def load_scene(
     a pose are ignored. Masks, black at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
 
     Args:
-      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
+      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
+        or UPath of universal_pathlib, of a COLMAP, transforms.json or Blender scene.
       downscale: k >= 1; images are read from `images_k` if it exists, and downscaled from the full ones otherwise.
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
         panorama count as one. Has no effect if the scene names its own test views.
@@ -67,6 +68,7 @@ def load_scene(
 
     Raises:
       FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
+      OSError: if a store does not answer.
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
     """
     if alpha not in get_args(AlphaMeaning):
