@@ -4,6 +4,7 @@ import collections
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -64,6 +65,7 @@ class Store:
 @pytest.fixture
 def store(monkeypatch):
     monkeypatch.setattr(remote_files, "PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(photo_store, "SHARE_OF_DISK", 0.0)
     made = Store(monkeypatch)
     yield made
     made.seconds = 0.0
@@ -140,17 +142,21 @@ def fox(distorted, store):
     store.put(distorted)
 
 
-def test_batches_are_of_the_same_bits_and_nothing_goes_to_disk(tmp_path, monkeypatch, fox):
+@pytest.mark.parametrize("share", [0.0, 1e-12, 0.5])
+def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, monkeypatch, fox, share):
+    """What is undistorted goes to disk up to a share of it, and is fetched and undistorted again beyond."""
+    monkeypatch.setattr(photo_store, "SHARE_OF_DISK", share)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(photo_store.shutil, "disk_usage", lambda folder: SimpleNamespace(free=3 * 38 * 30 * 3 * 10**12))
     scenes = load(), load(room=None)
     order = BatchOrder(scenes[0].train, 2, 0)
+    assert sum(view.picture.is_remote for view in views_of(scenes[0])) == {0.0: 6, 1e-12: 3, 0.5: 0}[share]
     stores = [PhotoStore(scene.train, order, 4, room=0) for scene in scenes]
     for iteration in range(1, 5):
         (one, _), (other, _) = (each.batch(iteration) for each in stores)
         jax.tree.map(np.testing.assert_array_equal, one, other)
     for each in stores:
         each.close()
-    assert not (tmp_path / "cache").exists()
 
 
 def test_photographs_are_fetched_ahead_of_the_step(monkeypatch, fox, store):

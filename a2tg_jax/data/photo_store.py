@@ -1,6 +1,7 @@
 """Storage of photographs: in memory while there is room, otherwise read on demand from a disk or a store."""
 
 import dataclasses
+import shutil
 import tempfile
 import threading
 import weakref
@@ -21,6 +22,9 @@ Processing = Callable[[np.ndarray], np.ndarray]
 """Function from the pixels in an image file to undistorted or resized ones."""
 SHARE_OF_MEMORY = 0.25
 """Share of the process's memory for photographs; those beyond it stay on disk."""
+
+SHARE_OF_DISK = 0.5
+"""Share of the free disk for undistorted or resized photographs of object storage."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,8 +68,9 @@ class Shelf:
     """Store of the pictures of one scene; safe to use from several threads.
 
     Beyond the memory limit, pixels of an unchanged image file are dropped: decoding it again takes less time than a
-    training step of that size. Processinged or resized pixels go to an unnamed file in `cache_folder()`, which
-    disappears with the process, however that ends; those of remote files are dropped, too, and made again.
+    training step of that size. Undistorted or resized pixels go to an unnamed file in `cache_folder()`, which
+    disappears with the process, however that ends. Those of remote files take a share of the disk; the others are
+    made again.
     """
 
     def __init__(self, room: int | None = None):
@@ -76,6 +81,7 @@ class Shelf:
         self._lock = threading.Lock()
         self._file: BinaryIO | None = None
         self._end = 0
+        self._disk: int | None = None
 
     def keep(self, pixels: np.ndarray, source: Path | None = None, view: Processing | None = None) -> Picture:
         """Return a picture of these pixels.
@@ -93,9 +99,22 @@ class Shelf:
             if self._room >= 0:
                 return Picture.of(pixels)
             self._room += pixels.nbytes
-        if source is not None and (view is None or is_remote(source)):
+        if source is not None and (view is None or self._is_made_again(source, pixels.nbytes)):
             return _decoded_again(source, pixels, view)
         return self._put(pixels)
+
+    def _is_made_again(self, source: Path, num_bytes: int) -> bool:
+        """Return whether undistorted or resized pixels are dropped: those of a remote file, if its share of the disk
+        is taken."""
+        if not is_remote(source):
+            return False
+        with self._lock:
+            if self._disk is None:
+                folder = cache_folder()
+                folder.mkdir(parents=True, exist_ok=True)
+                self._disk = int(SHARE_OF_DISK * shutil.disk_usage(folder).free)
+            self._disk -= num_bytes
+            return self._disk < 0
 
     def _put(self, pixels: np.ndarray) -> Picture:
         """Write pixels to the unnamed file."""
