@@ -1,6 +1,7 @@
 """Storage of photographs: in memory while there is room, otherwise read on demand from a disk or a store."""
 
 import dataclasses
+import os
 import shutil
 import tempfile
 import threading
@@ -110,9 +111,7 @@ class Shelf:
             return False
         with self._lock:
             if self._disk is None:
-                folder = cache_folder()
-                folder.mkdir(parents=True, exist_ok=True)
-                self._disk = int(SHARE_OF_DISK * shutil.disk_usage(folder).free)
+                self._disk = int(SHARE_OF_DISK * _free_disk())
             self._disk -= num_bytes
             return self._disk < 0
 
@@ -142,6 +141,16 @@ class Shelf:
             return again
 
         return Picture(shape, read)
+
+
+def _free_disk() -> int:
+    """Return the free bytes for pictures; 0 if no file can be made there."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return shutil.disk_usage(folder).free if os.access(folder, os.W_OK) else 0
+    except OSError:
+        return 0
 
 
 def _decoded_again(source: Path, pixels: np.ndarray, view: Processing | None) -> Picture:
