@@ -19,7 +19,6 @@ from a2tg_jax import load_scene
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data import photo_store
 from a2tg_jax.host import remote_files
-from a2tg_jax.results import run_evaluation
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import read_record, scene_place
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -220,7 +219,6 @@ def test_a_photograph_that_changes_or_goes_is_named(fox, store):
 def test_a_run_that_loses_its_store_is_resumed(tmp_path, monkeypatch, capsys, fox, store):
     """The newest checkpoint stays. run.toml has the URL, which `--resume` and `a2tg info` take from there."""
     monkeypatch.setattr(cli, "configure_cpu", lambda: None)
-    monkeypatch.setattr(run_evaluation, "write_figures", lambda *arguments: ())
     monkeypatch.setattr(photo_store, "SHARE_OF_MEMORY", 0.0)
     batch = PhotoStore.batch
 
