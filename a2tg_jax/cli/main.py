@@ -25,6 +25,7 @@ from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.host import signals
+from a2tg_jax.host.remote_files import is_url
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.results.compression import compress, compression_text
@@ -209,7 +210,17 @@ def _parse(name: str, arguments: list[str]) -> Command:
     if kind is Train:
         options["default"] = defaults = train_defaults(arguments)
         options["hint"] = lambda flag: other_systems_text(flag, defaults.system)
-    return parse(kind, f"a2tg {name}", arguments, **options)
+    command: Command = parse(kind, f"a2tg {name}", arguments, **options)
+    _check_urls(arguments, command)
+    return command
+
+
+def _check_urls(arguments: Sequence[str], command: Command) -> None:
+    """Raise ValueError for a URL that is not the scene to train; as a path it would name a folder of this machine."""
+    values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments]
+    for url in filter(is_url, values):
+        if url != getattr(command, "scene", None):
+            raise ValueError(f"{url}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
 def _show_warning(

@@ -36,6 +36,7 @@ from a2tg_jax.results.record import (
     changed_numbers,
     read_record,
     read_run_file,
+    scene_place,
     write_record,
 )
 from a2tg_jax.results.summary import RunResult, summary_text
@@ -102,7 +103,8 @@ class Train:
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """Scene folder with photographs and cameras, or "synthetic"; not needed with --config or --resume."""
+    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or "synthetic"; not needed with
+    --config or --resume."""
     out: Path
     """Run folder for models, checkpoints, metrics, pictures and report.html."""
     config: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -228,7 +230,7 @@ class Train:
     @property
     def record(self) -> RunRecord:
         """Record of the run that the flags ask for."""
-        path = self.scene if self.scene == SYNTHETIC else str(Path(self.scene).resolve())
+        path = self.scene if self.scene == SYNTHETIC else scene_place(self.scene)
         compare = (*self.compare, BASELINE) if self.baseline else self.compare
         source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.lens, self.validation)
         init = None if self.init is None else str(self.init.resolve())

@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,15 +18,16 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.colmap_text import check_text
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.depth_files import depth_map, find_depths
-from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads
+from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat, scene_name
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular, open_regular
+from a2tg_jax.host.remote_files import is_remote
 
-MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
+MODEL_FOLDERS = ("sparse/0", "sparse", "", "0")
 """Folders of the model below a scene folder, in order of preference."""
 EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
 """A points3D file with no points in it."""
@@ -39,7 +41,7 @@ logger = logging.getLogger(__name__)
 
 def find_model(path: Path) -> Path | None:
     """Return the folder of the sparse model of a scene folder, or None."""
-    folders = [path / folder for folder in MODEL_FOLDERS]
+    folders = [path / folder if folder else path for folder in MODEL_FOLDERS]
     return next((folder for folder in folders if _model_suffix(folder) is not None), None)
 
 
@@ -80,7 +82,7 @@ def load_colmap(
         shot = _shot(image, lenses[image.camera_id], images_folder, downscale, shelf)
         return dataclasses.replace(shot, panorama=panorama_of(image, reach))
 
-    shots = map_in_threads(shoot, registered)
+    shots = map_in_threads(shoot, registered, num_readers(path))
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
     train, test = every_kth(shots, test_every)
     cloud = _read_cloud(model, reconstruction)
@@ -139,7 +141,7 @@ def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Sh
             raise ValueError(f"{file}: its camera model {error}") from None
         raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
     mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
-    kept = shelf.keep(pixels, file if pixels is photograph else None)
+    kept = shelf.keep(pixels, file, None if pixels is photograph else lens.viewing(still_to_downscale))
     depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)
     return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth)
 
@@ -180,15 +182,31 @@ def _model_suffix(folder: Path) -> str | None:
 def _read_model(model: Path) -> Any:
     """Return the pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
     suffix = _model_suffix(model) or ".bin"
-    for file in (model / f"{kind}{suffix}" for kind in RECORDS):
-        if is_regular(file):
-            (check_binary if suffix == ".bin" else check_text)(file)
-    try:
-        with _with_points_file(model, suffix) as folder:
-            return pycolmap().Reconstruction(str(folder))
-    except Exception as error:  # whatever pycolmap makes of C++'s
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{model}: cannot be read as a COLMAP model ({reason}); export it again") from None
+    check = check_binary if suffix == ".bin" else check_text
+    with _on_disk(model, suffix) as on_disk:
+        for name in (f"{kind}{suffix}" for kind in RECORDS):
+            if is_regular(on_disk / name):
+                check(model / name, on_disk / name)
+        try:
+            with _with_points_file(on_disk, suffix) as folder:
+                return pycolmap().Reconstruction(str(folder))
+        except Exception as error:  # whatever pycolmap makes of C++'s
+            reason = " ".join(str(error).split())
+            raise ValueError(f"{model}: cannot be read as a COLMAP model ({reason}); export it again") from None
+
+
+@contextmanager
+def _on_disk(model: Path, suffix: str) -> Iterator[Path]:
+    """Return the model's folder, or a temporary copy of a remote one."""
+    if not is_remote(model):
+        yield model
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for file in (model / f"{kind}{suffix}" for kind in RECORDS):
+            if is_regular(file):
+                with open_regular(file) as source, open(Path(folder) / file.name, "wb") as target:
+                    shutil.copyfileobj(source, target)
+        yield Path(folder)
 
 
 @contextmanager
@@ -209,14 +227,14 @@ def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
     """Return the folder `images` of the model's scene; it need not exist if `images_k` does."""
     model = model.resolve()
     for base in (path.resolve(), model, *model.parents[:2]):
-        if (base / "images").is_dir() or (downscale > 1 and (base / f"images_{downscale}").is_dir()):
+        if is_folder(base / "images") or (downscale > 1 and is_folder(base / f"images_{downscale}")):
             return base / "images"
     raise FileNotFoundError(f"{path}: has no folder 'images'; put the model's photographs there")
 
 
 def _log_unregistered(images_folder: Path, num_registered: int) -> None:
-    """Log the number of files that are not registered images."""
-    if images_folder.is_dir():
+    """Log the number of files in a folder of this machine that are not registered images."""
+    if not is_remote(images_folder) and images_folder.is_dir():
         others = sum(file.is_file() for file in images_folder.rglob("*")) - num_registered
         if others > 0:
             logger.info("%s: %d files have no pose in the model and are not used", images_folder, others)

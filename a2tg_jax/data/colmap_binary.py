@@ -57,17 +57,21 @@ class _Cursor:
         return ValueError(f"{self.path}: is cut off or damaged: {place} {what}; export the model again")
 
 
-def check_binary(path: Path) -> None:
+def check_binary(path: Path, copy: Path | None = None) -> None:
     """Refuse a binary file of a kind in `RECORDS` unless it ends where its counts say.
+
+    Args:
+      path: the file, which messages name.
+      copy: a copy of it that is read in its place.
 
     Raises:
       ValueError: naming the file and the error.
     """
-    with open_regular(path) as file:
-        if os.fstat(file.fileno()).st_size == 0:  # Nothing can be mapped.
+    with open_regular(copy or path) as opened:
+        if os.fstat(opened.fileno()).st_size == 0:  # Nothing can be mapped.
             _check_records(_Cursor(path, b""))
         else:
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 _check_records(_Cursor(path, data))
 
 

@@ -21,8 +21,8 @@ ANNOUNCED = re.compile(rb"# Number of \w+: (\d{1,18})\b")
 """COLMAP's comment on the number of lines, or of pairs of lines for images."""
 
 
-def check_text(path: Path) -> None:
-    """Refuse a text file of a kind in `LINES` unless all its lines are valid.
+def check_text(path: Path, copy: Path | None = None) -> None:
+    """Refuse a text file of a kind in `LINES` unless all its lines are valid. Arguments as `check_binary`.
 
     Warn if the count in a comment is another: the file may be truncated, but other programs copy comments.
 
@@ -30,8 +30,8 @@ def check_text(path: Path) -> None:
       ValueError: naming the file and the line.
     """
     announced, found = None, 0
-    with open_regular(path) as file:
-        lines = enumerate(_lines(file, path), 1)
+    with open_regular(copy or path) as opened:
+        lines = enumerate(_lines(opened, path), 1)
         for number, line in lines:
             words = line.split()
             if match := ANNOUNCED.match(line):

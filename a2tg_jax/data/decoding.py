@@ -17,6 +17,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.remote_files import Unreachable
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
@@ -113,6 +114,8 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8) -> Iterator[Image.
     """Open an image within the block; every decoding error becomes one ValueError."""
     try:
         opened = open_regular(path, MOST_BYTES)
+    except Unreachable:
+        raise
     except OSError as error:
         raise _unreadable(path, error) from error
     with opened as file:

@@ -15,6 +15,7 @@ from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.host.npz import read_npy
 from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.remote_files import Unreachable
 from a2tg_jax.host.text import shortened
 
 FOLDER = "depths"
@@ -68,8 +69,10 @@ def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
       ValueError: naming the file, if it is damaged or something else.
     """
     try:
-        values = read_npy(file) if Path(file).suffix == ".npy" else _read_png(file)
+        values = read_npy(file) if str(file).endswith(".npy") else _read_png(file)
         values = values.reshape([side for side in values.shape if side != 1]) if values.ndim > 2 else values
+    except Unreachable:
+        raise
     except Exception as error:  # what a damaged file raises goes from SyntaxError to struct.error
         reason = shortened(str(error) or type(error).__name__)
         raise ValueError(f"{file}: cannot be read as a depth map ({reason}); replace or remove it") from error

@@ -9,7 +9,8 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular
+from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
@@ -18,6 +19,8 @@ LONGEST_NAME = 1000
 """Largest number of letters in an image's path below its folder."""
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
+MOST_READERS = 8
+"""Largest number of threads that read photographs."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -37,7 +40,7 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
     """
     check_inside(folder, name)
     smaller = folder.with_name(f"{folder.name}_{downscale}")
-    if downscale > 1 and smaller.is_dir():
+    if downscale > 1 and is_folder(smaller):
         folder, downscale = smaller, 1
     for candidate in (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name)):
         if is_regular(candidate):
@@ -111,7 +114,21 @@ def scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int])
     return scaled
 
 
-def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return [function(item) for item in items], in several threads; decoding and resizing release Python's lock."""
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+def num_readers(place: Path | None = None) -> int:
+    """Return the number of threads that read photographs of a place; None: of this machine. Those that wait for a
+    store take no core."""
+    return MOST_READERS if place is not None and is_remote(place) else min(MOST_READERS, os.cpu_count() or 1)
+
+
+def map_in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], num_threads: int | None = None
+) -> list[Result]:
+    """Return [function(item) for item in items], in several threads; decoding and resizing release Python's lock.
+
+    Args:
+      function: called in any of the threads.
+      items: its arguments.
+      num_threads: number of threads; None: `num_readers` of this machine.
+    """
+    with ThreadPoolExecutor(max_workers=num_threads or num_readers()) as pool:
         return list(pool.map(function, items))

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import threading
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal
 
@@ -103,6 +104,10 @@ class Lens:
             image_size = undistorted_size
         new_size = downscaled_size(*image_size, downscale)
         return resize_pixels(pixels, *new_size), scaled_intrinsics(K, size, new_size)
+
+    def viewing(self, downscale: int) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the function from the pixels of a photograph to those of its view."""
+        return lambda pixels: self.view_pixels(pixels, downscale)[0]
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays of pictures of a size, as `Camera.rays` has them; None of a pinhole."""

@@ -19,11 +19,17 @@ from a2tg_jax.data.scene import Scene, check_test_every, warn_of_lenses
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.remote_files import is_remote, located, reach
 from a2tg_jax.host.text import as_argument
 
 NO_SCENE_FILE = (
     "is neither a transforms.json nor an XML file of Metashape's cameras (File > Export > Export Cameras); "
     "give one of these, or the scene's folder"
+)
+
+NO_REMOTE_SCENE = (
+    "has none of the scenes that are read from a URL: sparse/0, transforms.json or transforms_train.json; copy others "
+    "to a folder, or mount the bucket (mountpoint-s3, gcsfuse, rclone mount)"
 )
 
 
@@ -45,7 +51,8 @@ def load_scene(
     a pose are ignored. Masks, black at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
 
     Args:
-      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
+      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
+        or UPath of universal_pathlib, of a COLMAP, transforms.json or Blender scene.
       downscale: k >= 1; images are read from `images_k` if it exists, and downscaled from the full ones otherwise.
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
         panorama count as one. Has no effect if the scene names its own test views.
@@ -61,6 +68,7 @@ def load_scene(
 
     Raises:
       FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
+      OSError: if a store does not answer.
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
     """
     if alpha not in get_args(AlphaMeaning):
@@ -68,7 +76,7 @@ def load_scene(
     if lens not in get_args(LensUse):
         raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
     try:
-        scene = _load(Path(path), downscale, test_every, room, lens)
+        scene = _load(located(path), downscale, test_every, room, lens)
     finally:
         forget_rays()
     warn_of_lenses(scene)
@@ -87,20 +95,19 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None, lens: L
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
     check_test_every(test_every)
-    if not path.exists():
+    is_here = not is_remote(path)
+    if is_here and not path.exists():
         raise FileNotFoundError(f"{path}: no such scene folder")
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
     options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room, "lens": lens}
+    if not is_here:
+        return _load_remote(path, options)
     check_no_video(path)
     if is_regular(path):
         return _load_file(path, options)
-    if find_model(path) is not None:
-        return load_colmap(path, **options)
-    if is_regular(path / NERFSTUDIO_FILE):
-        return load_transforms(path / NERFSTUDIO_FILE, **options)
-    if is_regular(path / BLENDER_FILES[0]):
-        return load_blender(path, **options)
+    if (load := _loader(path)) is not None:
+        return load(**options)
     make = _frames(path)
     if make is not None:
         return load_frames(make(), **options)
@@ -112,6 +119,26 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None, lens: L
         f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
         f"for plain photographs, run `a2tg sfm {as_argument(path)} SCENE` first"
     )
+
+
+def _loader(path: Path) -> Callable[..., Scene] | None:
+    """Return what loads a folder with a COLMAP model or a transforms file, or None."""
+    if find_model(path) is not None:
+        return functools.partial(load_colmap, path)
+    if is_regular(path / NERFSTUDIO_FILE):
+        return functools.partial(load_transforms, path / NERFSTUDIO_FILE)
+    return functools.partial(load_blender, path) if is_regular(path / BLENDER_FILES[0]) else None
+
+
+def _load_remote(path: Path, options: dict[str, Any]) -> Scene:
+    """Load a scene from object storage."""
+    is_json = path.suffix.lower() == ".json"
+    reach(path.parent if is_json else path)
+    if is_json:
+        return load_transforms(path, **options)
+    if (load := _loader(path)) is not None:
+        return load(**options)
+    raise FileNotFoundError(f"{path}: {NO_REMOTE_SCENE}")
 
 
 def _load_file(path: Path, options: dict[str, Any]) -> Scene:

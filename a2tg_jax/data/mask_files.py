@@ -12,9 +12,8 @@ from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.images import resize_pixels
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, Shot, View
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular
 
 FOLDER = "masks"
 """Folder of masks, beside the folder of images."""
@@ -90,7 +89,7 @@ def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) 
     """
     lacking = [shot.name for shot in shots if shot.mask is None]
     if len(lacking) == len(shots):
-        if folder is not None and folder.is_dir():
+        if folder is not None and is_folder(folder):
             message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
             warnings.warn(message, stacklevel=3)
         return
@@ -116,7 +115,7 @@ def alpha_as_mask(scene: Scene, source: str) -> Scene:
         is_opaque = picture.read()[..., 3] == 255
         mask = Mask.of(is_opaque if view.mask is None else is_opaque & view.mask.read())
         _check_left(mask, view.name, source)
-        opaque = Picture((height, width, 3), lambda: picture.read()[..., :3], picture.is_held)
+        opaque = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: picture.read()[..., :3])
         return dataclasses.replace(view, picture=opaque, mask=mask)
 
     return dataclasses.replace(scene, train=tuple(map(masked, scene.train)), test=tuple(map(masked, scene.test)))

@@ -1,6 +1,8 @@
-"""Storage of photographs: in memory while there is room, otherwise on disk and read on demand."""
+"""Storage of photographs: in memory while there is room, otherwise read on demand from a disk or a store."""
 
 import dataclasses
+import os
+import shutil
 import tempfile
 import threading
 import weakref
@@ -14,10 +16,16 @@ from numpy.typing import DTypeLike
 
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.startup import cache_folder
 
+Processing = Callable[[np.ndarray], np.ndarray]
+"""Function from the pixels in an image file to undistorted or resized ones."""
 SHARE_OF_MEMORY = 0.25
 """Share of the process's memory for photographs; those beyond it stay on disk."""
+
+SHARE_OF_DISK = 0.5
+"""Share of the free disk for undistorted or resized photographs of object storage."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,6 +39,8 @@ class Picture:
     is_held: bool = False
     """Whether they are in memory."""
     dtype: DTypeLike = np.uint8
+    is_remote: bool = False
+    """Whether reading waits for object storage."""
 
     @staticmethod
     def of(pixels: "np.ndarray | Picture") -> "Picture":
@@ -38,7 +48,11 @@ class Picture:
         return pixels if isinstance(pixels, Picture) else Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 
     def __repr__(self) -> str:
-        return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {'in memory' if self.is_held else 'on disk'})"
+        return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {self._place})"
+
+    @property
+    def _place(self) -> str:
+        return "in memory" if self.is_held else "in object storage" if self.is_remote else "on disk"
 
     @property
     def size(self) -> tuple[int, int]:
@@ -56,7 +70,8 @@ class Shelf:
 
     Beyond the memory limit, pixels of an unchanged image file are dropped: decoding it again takes less time than a
     training step of that size. Undistorted or resized pixels go to an unnamed file in `cache_folder()`, which
-    disappears with the process, however that ends.
+    disappears with the process, however that ends. Those of remote files take a share of the disk; the others are
+    made again.
     """
 
     def __init__(self, room: int | None = None):
@@ -67,13 +82,15 @@ class Shelf:
         self._lock = threading.Lock()
         self._file: BinaryIO | None = None
         self._end = 0
+        self._disk: int | None = None
 
-    def keep(self, pixels: np.ndarray, source: Path | None = None) -> Picture:
+    def keep(self, pixels: np.ndarray, source: Path | None = None, view: Processing | None = None) -> Picture:
         """Return a picture of these pixels.
 
         Args:
           pixels: of any shape, uint8.
-          source: image file with exactly these pixels; None if they were undistorted or resized.
+          source: image file that they come from; None: no file has them.
+          view: function that made them of those in the file; None: they are exactly these.
 
         Raises:
           OSError: with a remedy, if there is no room on disk.
@@ -83,7 +100,20 @@ class Shelf:
             if self._room >= 0:
                 return Picture.of(pixels)
             self._room += pixels.nbytes
-        return self._put(pixels) if source is None else _decoded_again(source, pixels)
+        if source is not None and (view is None or self._is_made_again(source, pixels.nbytes)):
+            return _decoded_again(source, pixels, view)
+        return self._put(pixels)
+
+    def _is_made_again(self, source: Path, num_bytes: int) -> bool:
+        """Return whether undistorted or resized pixels are dropped: those of a remote file, if its share of the disk
+        is taken."""
+        if not is_remote(source):
+            return False
+        with self._lock:
+            if self._disk is None:
+                self._disk = int(SHARE_OF_DISK * _free_disk())
+            self._disk -= num_bytes
+            return self._disk < 0
 
     def _put(self, pixels: np.ndarray) -> Picture:
         """Write pixels to the unnamed file."""
@@ -113,14 +143,25 @@ class Shelf:
         return Picture(shape, read)
 
 
-def _decoded_again(source: Path, pixels: np.ndarray) -> Picture:
-    """Return the picture in an image file, which must not change."""
+def _free_disk() -> int:
+    """Return the free bytes for pictures; 0 if no file can be made there."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return shutil.disk_usage(folder).free if os.access(folder, os.W_OK) else 0
+    except OSError:
+        return 0
+
+
+def _decoded_again(source: Path, pixels: np.ndarray, view: Processing | None) -> Picture:
+    """Return the picture in an image file, which must not change, or what a function makes of it."""
     checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
 
     def read() -> np.ndarray:
-        again = np.ascontiguousarray(read_pixels(source))
+        stored = read_pixels(source)
+        again = np.ascontiguousarray(stored if view is None else view(stored))
         if zlib.crc32(again.data) != checksum:
             raise ValueError(f"{source}: has changed since the scene was loaded; restore it or start again")
         return again
 
-    return Picture(pixels.shape, read)
+    return Picture(pixels.shape, read, is_remote=is_remote(source))

@@ -21,6 +21,7 @@ from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
+from a2tg_jax.host.remote_files import is_remote
 
 NUM_RANDOM_POINTS = 10_000
 MANY_LENSES = 8
@@ -291,7 +292,7 @@ def assemble_scene(
 
 def scene_name(folder: Path) -> str:
     """Return the end of a folder's path, from the last name that tells more than "scene" or "colmap" does."""
-    parts = folder.resolve().parts
+    parts = ("", *str(folder).split("/")[2:]) if is_remote(folder) else folder.resolve().parts
     told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
     return "/".join(parts[told[-1] if told else -1 :])
 

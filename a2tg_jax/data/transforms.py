@@ -15,7 +15,7 @@ from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.depth_files import depth_map, find_depths
-from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads
+from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
 from a2tg_jax.data.photo_store import Shelf
@@ -73,7 +73,7 @@ def load_transforms(
         train = [shot for shot in shots if shot.name in train_names - test_names]
     else:
         train, test = every_kth(shots, test_every)
-    cloud = read_ply_points(file.parent / meta["ply_file_path"]) if meta.get("ply_file_path") else None
+    cloud = read_ply_points(_beside(file, meta["ply_file_path"])) if meta.get("ply_file_path") else None
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
@@ -147,7 +147,7 @@ def read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf, u
     def shoot(frame: dict[str, Any]) -> Shot:
         return _shot(file, {**meta, **frame}, downscale, shelf, use)
 
-    shots = map_in_threads(shoot, meta["frames"])
+    shots = map_in_threads(shoot, meta["frames"], num_readers(file))
     check_masks(shots, str(file))
     return shots
 
@@ -156,7 +156,7 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: 
     """Return one frame; `frame` also holds the file's global values, which the frame's own override."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-    path = file.parent / frame["file_path"]
+    path = _beside(file, frame["file_path"])
     name = Path(frame["file_path"]).as_posix()
     # Only a folder of images below the scene has siblings of the form images_k.
     image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
@@ -170,15 +170,20 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: 
     except ValueError as error:
         raise ValueError(f"{file}: {name}: its camera model {error}") from None
     mask = load_mask(_find_mask(file, frame, image_folder / image_name, downscale), lens, photograph, pixels)
-    kept = shelf.keep(pixels, image_file if pixels is photograph else None)
+    kept = shelf.keep(pixels, image_file, None if pixels is photograph else lens.viewing(still_to_downscale))
     depth = depth_map(_find_depths(file, frame, image_folder / image_name), lens, photograph, pixels)
     return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask, rays, depth)
+
+
+def _beside(file: Path, name: str) -> Path:
+    """Return the path of a file that a scene names from the folder of its own file."""
+    return file.parent / Path(name).as_posix()
 
 
 def _find_depths(file: Path, frame: dict[str, Any], image: Path) -> Path | None:
     """Return the depth map that a frame names, or else that of its image in the folder `depths` beside `images`."""
     if frame.get("depth_file_path"):
-        return file.parent / str(frame["depth_file_path"])
+        return _beside(file, frame["depth_file_path"])
     images = file.parent / "images"
     return find_depths(images, str(image.relative_to(images))) if image.is_relative_to(images) else None
 
@@ -186,7 +191,7 @@ def _find_depths(file: Path, frame: dict[str, Any], image: Path) -> Path | None:
 def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
     """Return the mask that a frame names, or else that of its image in the folder `masks` beside `images`."""
     if frame.get("mask_path"):
-        return named_mask(file.parent / frame["mask_path"], downscale)
+        return named_mask(_beside(file, frame["mask_path"]), downscale)
     images = file.parent / "images"
     return find_mask(images, str(image.relative_to(images)), downscale) if image.is_relative_to(images) else None
 

@@ -1,15 +1,17 @@
 """Untrusted files: only regular files up to a largest size are opened.
 
 Links are followed, because their owner makes them on purpose. Their target must be a regular file: a device never ends,
-and a pipe waits for a writer.
+and a pipe waits for a writer. Remote files (`host.remote_files`) are fetched to temporary ones.
 """
 
 import os
 import stat
 from io import BufferedReader
 from pathlib import Path
+from typing import cast
 
 from a2tg_jax.host.operating_system import reading_flags
+from a2tg_jax.host.remote_files import fetched, is_remote, is_remote_file, is_remote_folder, remote_size
 
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
@@ -21,12 +23,19 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.
     """
+    if is_remote(path):
+        return is_remote_file(cast(Path, path))
     path = Path(path)
     if path.is_file():
         return True
     if not path.exists() or path.is_dir():
         return False
     raise ValueError(_refusal(path))
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a path is a folder."""
+    return is_remote_folder(path) if is_remote(path) else path.is_dir()
 
 
 def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
@@ -40,6 +49,8 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
       OSError: if it cannot be opened.
       ValueError: naming the path, if it is not a regular file, or is larger.
     """
+    if is_remote(path):
+        return _open_remote(cast(Path, path), most_bytes)
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError(_refusal(path))
     # It may have been replaced by a pipe meanwhile, for whose writer this does not wait.
@@ -57,9 +68,17 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
+def _open_remote(path: Path, most_bytes: int) -> BufferedReader:
+    """Open the fetched bytes of a remote file. Raises as `open_regular`."""
+    size = remote_size(path)
+    if size is not None and size > most_bytes:
+        raise ValueError(_too_large(path, size, most_bytes))
+    return fetched(path, size)
+
+
 def _refusal(path: str | os.PathLike[str]) -> str:
-    return f"{os.fspath(path)}: is not a regular file but a folder, device, pipe or socket; put a file there"
+    return f"{path}: is not a regular file but a folder, device, pipe or socket; put a file there"
 
 
 def _too_large(path: str | os.PathLike[str], size: int, most_bytes: int) -> str:
-    return f"{os.fspath(path)}: has {size:,} bytes, and {most_bytes:,} are the most that such a file may have"
+    return f"{path}: has {size:,} bytes, and {most_bytes:,} are the most that such a file may have"

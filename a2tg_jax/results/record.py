@@ -2,7 +2,7 @@
 
 A configuration file says the same or less; what it leaves out has the value that the command line gives it:
 
-    scene = "../scenes/fox"              # seen from the file's folder; or "synthetic"
+    scene = "../scenes/fox"              # seen from the file's folder; or s3://bucket/fox, or "synthetic"
     downscale = 2
     system = "a2tg"                      # or package.module:NAME
     preset = "quick"
@@ -27,6 +27,7 @@ from a2tg_jax.data.scene import scene_name, with_validation_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.remote_files import is_url, located
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.results.finish_options import read_finish
@@ -51,7 +52,7 @@ class SceneSource:
     """Source of a scene, from which it can be loaded again."""
 
     path: str
-    """Folder with photographs and poses, or "synthetic" for the built-in scene."""
+    """Folder with photographs and poses, its URL in object storage, or "synthetic" for the built-in scene."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8
@@ -233,7 +234,19 @@ def read_run_file(path: Path) -> RunFile:
     file = config_from_dict(RunFile, {**config_to_dict(RunFile()), **table}, f"{path}:")
     if file.scene is None or file.scene == SYNTHETIC:
         return file
-    return dataclasses.replace(file, scene=os.path.realpath(path.parent / file.scene))  # Also of links in a circle.
+    return dataclasses.replace(file, scene=scene_place(file.scene, path.parent))
+
+
+def scene_place(scene: str, folder: Path = Path()) -> str:
+    """Return the place of a scene as run.toml keeps it: a URL, or a full path without links.
+
+    Args:
+      scene: URL or path; file:// is a path.
+      folder: folder that a relative path starts from.
+    """
+    if is_url(scene) and not scene.startswith("file://"):
+        return scene.rstrip("/")
+    return os.path.realpath(folder / located(scene))  # Also of links in a circle.
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:

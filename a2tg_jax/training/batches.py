@@ -141,13 +141,14 @@ class PhotoStore:
         plan = plan_batches(views, len(order.indices(1)), room, has_depths)
         self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
-        self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead)
+        is_waiting = any(view.picture.is_remote for view in views)
+        self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead, is_waiting=is_waiting)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
         """Return photographs of one kind that include those of an iteration, and their int32 indices among them.
 
         Raises:
-          ValueError: if a photograph that was left on disk has gone or has changed.
+          ValueError, OSError: if a photograph that was left where it lies has gone, has changed or cannot be read.
         """
         indices = self._order.indices(iteration)
         if not self.is_resident:
@@ -194,13 +195,15 @@ def on_devices(photographs: Photographs, exchange: Exchange | None) -> Photograp
 class Ahead:
     """Threads that prepare the next batches in order."""
 
-    def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int):
+    def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int, *, is_waiting: bool = False):
         """Args:
         load: makes the batch of some views; its errors reach who waits for that batch.
         num_ahead: how many batches may be ready before they are wanted.
+        is_waiting: whether it waits for object storage more than it computes; then each batch has a thread.
         """
         self._load = load
-        self._pool = ThreadPoolExecutor(min(num_ahead, num_threads()), thread_name_prefix="photographs")
+        num = num_ahead if is_waiting else min(num_ahead, num_threads())
+        self._pool = ThreadPoolExecutor(num, thread_name_prefix="photographs")
         self._batches: dict[int, Future[Photographs]] = {}
 
     def first(self, wanted: dict[int, tuple[int, ...]]) -> Photographs:
