@@ -27,8 +27,13 @@ def pytest_addoption(parser):
     parser.addoption("--long", action="store_true", help="run the tests marked `long`, too")
 
 
+LONGEST = {"test_bytewise", "test_experiments", "test_systems", "test_viewer_browser"}
+"""Files that come first, so that no process is left with one of them while the others have nothing to do."""
+
+
 def pytest_collection_modifyitems(config, items):
-    """Skips tests that take long and have shorter kin, unless they are asked for."""
+    """Skips tests that take long and have shorter kin, unless they are asked for; the longest files come first."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
     if not config.getoption("--long"):
         for item in items:
             if item.get_closest_marker("long"):
@@ -49,6 +54,13 @@ def x64():
     """Runs the test with 64-bit floats."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def kept_programs(tmp_path_factory, monkeypatch):
+    """Lets processes that are started one after another share what they compile."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("programs")))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.02")
 
 
 @pytest.fixture

@@ -15,8 +15,14 @@ NUM_CASES = 500
 MOST_MEGABYTES = 300
 
 
-def test_changed_files_are_read_or_refused(tmp_path):
-    counts = fuzz.run(fuzz.Worker(tmp_path), range(NUM_CASES))
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A folder in which the first worker leaves the sound files to the others."""
+    return tmp_path_factory.mktemp("work")
+
+
+def test_changed_files_are_read_or_refused(work):
+    counts = fuzz.run(fuzz.Worker(work), range(NUM_CASES))
     assert not counts["bad"], counts["bad"]
     assert sum(sum(found.values()) for found in counts["readers"].values()) == NUM_CASES
     assert set(counts["readers"]) == {reader.name for reader in READERS}
@@ -85,8 +91,8 @@ print("; ".join(watch.taken()))
     assert found in done.stdout if found else not done.stdout.strip()
 
 
-def test_a_worker_that_ends_or_does_not_answer_is_started_again(tmp_path):
-    worker = fuzz.Worker(tmp_path)
+def test_a_worker_that_ends_or_does_not_answer_is_started_again(work):
+    worker = fuzz.Worker(work)
     try:
         worker.start()
         worker.seconds = 0.0
