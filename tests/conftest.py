@@ -7,6 +7,7 @@ from xla_flags import TEST_FLAGS
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("XLA_FLAGS", TEST_FLAGS)  # Command lines that tests start inherit them.
 
+import gc
 import pathlib
 
 import jax
@@ -15,6 +16,10 @@ import pytest
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# Tracing makes so many objects that their collection takes a fifteenth of the tests' time. What was imported stays.
+gc.freeze()
+gc.set_threshold(100_000, 50, 50)
+
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -22,8 +27,13 @@ def pytest_addoption(parser):
     parser.addoption("--long", action="store_true", help="run the tests marked `long`, too")
 
 
+LONGEST = {"test_bytewise", "test_experiments", "test_systems", "test_viewer_browser"}
+"""Files that come first, so that no process is left with one of them while the others have nothing to do."""
+
+
 def pytest_collection_modifyitems(config, items):
-    """Skips tests that take long and have shorter kin, unless they are asked for."""
+    """Skips tests that take long and have shorter kin, unless they are asked for; the longest files come first."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
     if not config.getoption("--long"):
         for item in items:
             if item.get_closest_marker("long"):
@@ -36,6 +46,7 @@ def fresh_caches():
     waits for ever where it gets none (vm.max_map_count)."""
     yield
     jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture
@@ -43,6 +54,13 @@ def x64():
     """Runs the test with 64-bit floats."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def kept_programs(tmp_path_factory, monkeypatch):
+    """Lets processes that are started one after another share what they compile."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("programs")))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.02")
 
 
 @pytest.fixture

@@ -143,8 +143,8 @@ def test_exposures_win_back_what_known_ones_took(scene, system, model):
 
 def test_a_run_tells_both_scores_and_what_it_learned(tmp_path, capsys):
     out = tmp_path / "run"
-    arguments = "train synthetic --preset smoke --downscale 4 --stage1-iterations 12 --stage2-iterations 8 "
-    arguments += "--exposure --refine-poses --compare gaussians-2d --densify.cap 810 --out"
+    arguments = "train synthetic --preset smoke --downscale 8 --stage1-iterations 12 --stage2-iterations 8 "
+    arguments += "--exposure --refine-poses --compare gaussians-2d --initial-gaussians 200 --densify.cap 210 --out"
     assert main([*arguments.split(), str(out)]) == 0
     told = capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())["models"]

@@ -307,6 +307,17 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
     check_start(scene, system, num_given=120)
 
 
+def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene):
+    changes = {"texture": {"select": "budget", "budget_mb": 0.03}, "initial_gaussians": None}
+    system = with_changes(a2tg.A2tg.preset("smoke"), changes, "test")
+    with pytest.raises(ValueError, match=r"0\.03, but \d+ Gaussians .*: raise it, or lower densify\.cap$"):
+        check_start(scene, system)
+    most = 30_000 // bytes_per_gaussian(system.sh_degree, 4)
+    check_start(scene, system, num_given=most)
+    with pytest.raises(ValueError, match=rf"0\.03, but {most + 1} Gaussians of one texel each .* MB: raise it$"):
+        check_start(scene, system, num_given=most + 1)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
 def test_presets_reach_ordinary_budgets(scene, name, preset):

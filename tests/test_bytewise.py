@@ -23,6 +23,10 @@ def smoke(**changes) -> Bytewise:
     return with_changes(Bytewise.preset("smoke"), {**short, **changes}, "test")
 
 
+SHARES = {"view_dependence": {"share": 0.1}, "texture": {"share": 0.05}}
+"""One first stage is compiled for all that have the same."""
+
+
 @pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
 def test_presets_can_be_trained(preset):
     Bytewise.preset(preset).check()
@@ -53,13 +57,12 @@ def test_every_mix_fills_its_bytes(scene, base_degree, shares):
 
 
 def test_the_highest_degree_is_kept(scene):
-    model = a2tg.fit(scene, smoke(sh_degree=1, view_dependence={"share": 0.2}), progress=False).model
+    model = a2tg.fit(scene, smoke(sh_degree=1, **SHARES), progress=False).model
     assert set(np.unique(model.layout.bands.degrees)) == {0, 1}
 
 
 def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_path):
-    options = {"view_dependence": {"share": 0.1}, "texture": {"share": 0.05}}
-    system = smoke(kernel={"rate": 0.02}, **options)
+    system = smoke(kernel={"rate": 0.02}, **SHARES)
     first = a2tg.fit_stage(scene, system, 0, progress=False).model
     before = np.asarray(first.appearance.shapes(first.params))
     assert before.std() > 0.02 and before.max() > 0 > before.min()
@@ -134,6 +137,6 @@ def test_what_cannot_be_trained_is_refused_by_name(changes, message):
 
 def test_the_authors_alpha_can_be_had_without_any_texture(scene):
     """All textures are empty at first, and the largest alpha is that of none."""
-    lookup = {"alpha": "global-maximum", "rgb": "unit"}
-    model = a2tg.fit(scene, smoke(texture={"lookup": lookup}), progress=False).model
+    lookup = {"lookup": {"alpha": "global-maximum", "rgb": "unit"}}
+    model = a2tg.fit(scene, smoke(**{**SHARES, "texture": SHARES["texture"] | lookup}), progress=False).model
     assert np.isfinite(model.render(scene.test[0].camera).color).all()

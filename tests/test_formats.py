@@ -25,11 +25,12 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.appearance import Shaped, Textured
+from a2tg_jax.appearance import MovableKernels, Shaped, Textured
 from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.io.gaussforge_files import SUFFIXES
 from a2tg_jax.results import first_stage, preflight, run_training
@@ -176,6 +177,10 @@ def test_what_a_format_does_not_keep():
     assert unseen_elsewhere(shaped, "a.a2tgz") == unseen_elsewhere(Model(some_gaussians()), "a.glb") == ""
     kernels = Model(some_gaussians(), params._replace(inner=()), layout._replace(inner=()), appearance=Shaped())
     assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (--bake turns them into plain splats)"
+    moving = Shaped(MovableKernels())
+    params, layout = moving.allocate(jax.random.key(0), some_gaussians())
+    found = lost_by(Model(some_gaussians(), params, layout, appearance=moving), "a.ply")
+    assert found == [lost_by(kernels, "a.ply")[0], "what MovableKernels shows beside Gaussians"]
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
     model = Model(some_gaussians(), origin=dataclasses.replace(model.origin, corrections=learned))
     assert lost_by(model, "a.npz") == []
@@ -288,6 +293,11 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
     run, given = RunFolder(tmp_path / "run"), first_stage.given_splats(record)
     assert told[0][-1] == first_stage.number_given(run, record, given) == 40
     assert len(read) == 1, "a resumed run counts the model of its first stage"
+    write_archive(run.model("a2tg-gaussians"), {}, {"means": np.zeros((40, 3))}, format="a2tg-jax model")
+    assert first_stage.number_given(run, record, given) == 40, "nothing but the means is read"
+    write_archive(run.model("a2tg-gaussians"), {}, {"quats": np.zeros((40, 4))}, format="a2tg-jax model")
+    with pytest.raises(ValueError, match="it has no means"):
+        first_stage.number_given(run, record, given)
     run.model("a2tg-gaussians").unlink()
     monkeypatch.setattr(train, "tell_forecast", lambda *args: told.append(args))
     monkeypatch.setattr(SceneSource, "load", lambda self, room=None: scene)

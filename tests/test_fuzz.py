@@ -16,7 +16,19 @@ MOST_MEGABYTES = 300
 
 
 def test_changed_files_are_read_or_refused(tmp_path):
-    counts = fuzz.run(fuzz.Worker(tmp_path), range(NUM_CASES))
+    """By a worker that is started again after it did not answer, and after it ended."""
+    worker = fuzz.Worker(tmp_path)
+    try:
+        worker.start()
+        worker.seconds = 0.0
+        assert worker.ask(0, READERS[0].files[0])["kind"] == "hang"
+        worker.seconds = fuzz.SECONDS_A_CASE
+        worker.start()
+        worker._process.kill()
+        assert worker.ask(0, READERS[0].files[0])["kind"] == "crash -9"
+        counts = fuzz.run(worker, range(NUM_CASES))
+    finally:
+        worker.stop()
     assert not counts["bad"], counts["bad"]
     assert sum(sum(found.values()) for found in counts["readers"].values()) == NUM_CASES
     assert set(counts["readers"]) == {reader.name for reader in READERS}
@@ -83,22 +95,6 @@ print("; ".join(watch.taken()))
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert found in done.stdout if found else not done.stdout.strip()
-
-
-def test_a_worker_that_ends_or_does_not_answer_is_started_again(tmp_path):
-    worker = fuzz.Worker(tmp_path)
-    try:
-        worker.start()
-        worker.seconds = 0.0
-        assert worker.ask(0, READERS[0].files[0])["kind"] == "hang"
-        worker.seconds = fuzz.SECONDS_A_CASE
-        worker.start()
-        worker._process.kill()
-        assert worker.ask(0, READERS[0].files[0])["kind"] == "crash -9"
-        worker.start()
-        assert worker.ask(0, READERS[0].files[0])["kind"] == "read"
-    finally:
-        worker.stop()
 
 
 def test_a_case_is_the_same_every_time_and_a_change_changes():

@@ -158,8 +158,9 @@ def test_rays_of_a_lens_are_those_of_its_pixels():
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1)])
 def test_corners_without_a_ray_are_not_empty(scene, up):
     camera, points = scene.train[0].camera, scene.points + np.float32([0, 0, 500])
-    pinhole = is_bare(camera, points, np.array(up, np.float64))
-    lens = is_bare(with_lens(camera, ~LEFT), points, np.array(up, np.float64))
+    pinhole, lens = (
+        is_bare(seen, cell_rays(seen), points, np.array(up, np.float64)) for seen in (camera, with_lens(camera, ~LEFT))
+    )
     assert pinhole[LEFT.ravel()].any()
     np.testing.assert_array_equal(lens, pinhole & ~LEFT.ravel())
 
@@ -283,8 +284,9 @@ class TestStart:
             with pytest.raises(ValueError, match=r"masks or .* the sky out: 4\d\.\d% .* and 0\.0% counts: leave out"):
                 start(masked, mcmc(sky_gaussians=20))
         pixels = np.dstack([scene.train[0].image, np.where(ground_only, 255, 0).astype(np.uint8)])
-        with pytest.raises(ValueError, match="alpha channels leave the sky out"):
-            initial_model(changed(scene, picture=pixels), mcmc(sky_gaussians=20))
+        for start in (check_start, initial_model):
+            with pytest.raises(ValueError, match="alpha channels leave the sky out"):
+                start(changed(scene, picture=pixels), mcmc(sky_gaussians=20))
         check_start(changed(scene, mask=~ground_only), mcmc(sky_gaussians=20))
 
     def test_shares_are_of_what_lenses_see(self, scene):

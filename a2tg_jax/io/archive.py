@@ -50,6 +50,15 @@ def read_archive(path: str | os.PathLike[str], *, format: str = FORMAT) -> tuple
     return header, _read_entries(Path(path), format, lambda name: name != HEADER)
 
 
+def read_archive_array(path: str | os.PathLike[str], name: str, *, format: str = FORMAT) -> np.ndarray:
+    """Return one array, without reading the others. Raises as `read_archive` does."""
+    read_archive_header(path, format=format)
+    entries = _read_entries(Path(path), format, lambda found: found == name)
+    if name not in entries:
+        raise _damaged(Path(path), format, f"it has no {name}")
+    return entries[name]
+
+
 def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -> dict[str, Any]:
     """Return the header alone, without reading the arrays. Raises as `read_archive` does."""
     path = Path(path)

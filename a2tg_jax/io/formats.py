@@ -188,18 +188,24 @@ def beside_gaussians(model: Model) -> str:
     return " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
 
 
+def _bakeable(model: Model) -> str:
+    """Return `beside_gaussians` with its remedy; "" if nothing."""
+    beside = beside_gaussians(model)
+    return f"{beside} {BAKES}" if beside else ""
+
+
 def _lost_appearance(model: Model) -> list[str]:
     """Return in words what plain splats do not keep of what a model shows."""
-    if bakeable := beside_gaussians(model):
-        return [f"{bakeable} {BAKES}"]
-    kind = type(model.appearance.base).__name__
-    return [] if kind == "Plain" else [f"what {kind} shows beside Gaussians"]
+    base, lost = model.appearance.base, [_bakeable(model)]
+    kind = type(getattr(base, "inner", base).base if base.shapes_name is not None else base).__name__
+    if kind != "Plain" and model.textures is None:
+        lost.append(f"what {kind} shows beside Gaussians")
+    return [found for found in lost if found]
 
 
 def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
     """Return in words what a file of some suffix keeps of a model and other programs do not show; "" if nothing."""
-    bakeable = beside_gaussians(model) if format_of(path).has_extension else ""
-    return f"{bakeable} {BAKES}" if bakeable else ""
+    return _bakeable(model) if format_of(path).has_extension else ""
 
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:

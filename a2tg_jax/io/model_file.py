@@ -22,7 +22,7 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.archive import read_archive, read_archive_array, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
@@ -87,6 +87,18 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
         raise ValueError(f"{os.fspath(path)}: the model is damaged or of another version ({reason})") from error
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {shortened(str(error), LONGEST_REASON)}") from error
+
+
+def number_in_file(path: str | os.PathLike[str]) -> int:
+    """Return the number of Gaussians in a file of `save_model`, without reading more than their means.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not a model, is damaged, or is of another version.
+    """
+    means = read_archive_array(path, "means", format=FORMAT)
+    check_shape(f"{os.fspath(path)}: means", means, ("N", 3))
+    return len(means)
 
 
 def _model_of(

@@ -13,7 +13,7 @@ from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.formats import load_splats
-from a2tg_jax.io.model_file import load_model, save_model
+from a2tg_jax.io.model_file import number_in_file, save_model
 from a2tg_jax.io.ply import plain_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder
@@ -66,7 +66,7 @@ def number_given(run: RunFolder, record: RunRecord, given: GivenSplats | None) -
     first = run.model(record.plan.main[0])
     if given is None:
         return None
-    return load_model(first).num if first.is_file() else given.splats.num
+    return number_in_file(first) if first.is_file() else given.splats.num
 
 
 def write_first_stage(run: RunFolder, planned: PlannedStage, given: GivenSplats, scene: Scene) -> None:

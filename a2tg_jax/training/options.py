@@ -384,8 +384,12 @@ class System:
         names = (self.option_of(event, "cap") for event in events)
         return tuple(dict.fromkeys(name for name in names if name is not None)) or ("initial_gaussians",)
 
-    def check_number(self, num: int) -> None:
+    def check_number(self, num: int, *, has_first_stage: bool = True) -> None:
         """Refuse options that cannot be trained from this number of Gaussians.
+
+        Args:
+          num: number of Gaussians at the start.
+          has_first_stage: whether the first stage is trained; without it their number does not grow before textures.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.

@@ -99,10 +99,16 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
 
 
 def check_sky(scene: Scene, num: int) -> None:
-    """Raise ValueError if the training views show no sky, or masks leave it out. Photographs are not read, so that
-    alpha channels do not count here."""
+    """Raise ValueError if the training views show no sky, or masks or alpha channels leave it out. Of the photographs,
+    those with an alpha channel are read."""
     up = up_of(scene)
-    check_shares([emptiness(view, scene.points, up, counts_of(view)) for view in scene.train], num)
+    check_shares(
+        [
+            emptiness(view.camera, cell_rays(view.camera), scene.points, up, counts_of(view, view.alpha))
+            for view in scene.train
+        ],
+        num,
+    )
 
 
 def check_shares(views: Sequence[Emptiness], num: int) -> None:
@@ -135,37 +141,40 @@ def sphere(scene: Scene) -> tuple[np.ndarray, float]:
     return center, DISTANCE * float(np.quantile(distances, FAR_SHARE))
 
 
-def counts_of(view: View) -> np.ndarray:
-    """Return [H, W] whether a pixel counts by its mask."""
-    return np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
+def counts_of(view: View, alpha: np.ndarray | None) -> np.ndarray:
+    """Return [H, W] whether a pixel counts by the mask and the alpha channel of a view."""
+    counts = np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
+    return counts if alpha is None else counts & (alpha == 255)
 
 
 def cells_of(view: View, points: np.ndarray, up: np.ndarray) -> Cells:
-    """Return the cells of a view; its photograph is read. Arguments as of `is_bare`."""
-    rays, spacing = cell_rays(view.camera)
-    counts, pixels = counts_of(view), view.picture.read()
-    if view.has_alpha:
-        counts = counts & (pixels[..., 3] == 255)
-    found, center = emptiness(view, points, up, counts), np.asarray(view.camera.center, np.float64)
-    return Cells(center, cKDTree(rays), spacing, found, _blocks(pixels[..., :3], view.camera) / 255)
+    """Return the cells of a view; its photograph is read once. Arguments as of `is_bare`."""
+    camera, pixels = view.camera, view.picture.read()
+    rays, spacing = cell_rays(camera)
+    counts = counts_of(view, pixels[..., 3] if view.has_alpha else None)
+    found, center = emptiness(camera, (rays, spacing), points, up, counts), np.asarray(camera.center, np.float64)
+    return Cells(center, cKDTree(rays), spacing, found, _blocks(pixels[..., :3], camera) / 255)
 
 
-def emptiness(view: View, points: np.ndarray, up: np.ndarray, counts: np.ndarray) -> Emptiness:
+def emptiness(
+    camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray, up: np.ndarray, counts: np.ndarray
+) -> Emptiness:
     """Return what is empty in a view, of which the pixels `counts` [H, W] count. Other arguments as of `is_bare`."""
-    bare = is_bare(view.camera, points, up)
-    is_whole = _blocks(counts[..., None], view.camera)[:, 0] == 1
-    return Emptiness(has_ray(cell_rays(view.camera)[0]), bare, bare & is_whole)
+    bare = is_bare(camera, cells, points, up)
+    is_whole = _blocks(counts[..., None], camera)[:, 0] == 1
+    return Emptiness(has_ray(cells[0]), bare, bare & is_whole)
 
 
-def is_bare(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
+def is_bare(camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return [C] whether a cell of a view has a ray, is above the ground, and no point [P, 3] projects near it.
 
     Args:
       camera: of the view.
+      cells: its `cell_rays`.
       points: [P, 3] of the scene.
       up: [3] its vertical.
     """
-    rays, spacing = cell_rays(camera)
+    rays, spacing = cells
     towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
     is_far = cKDTree(towards).query(rays)[0] > REACH * spacing
     bare: np.ndarray = has_ray(rays) & is_far & (rays @ up > LOWEST)

@@ -6,13 +6,12 @@ import type { Browser, BrowserContextOptions, Page } from "playwright-core";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
 
 import { expectClose } from "../test/close";
-import { CHROMIUM, launch, serve } from "./chromium";
+import { CHROMIUM, DESK, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
 const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
 const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgw", import.meta.url)));
 const PHONE: BrowserContextOptions = { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true };
-const DESK: BrowserContextOptions = { viewport: { width: 640, height: 480 } };
 
 describe.skipIf(CHROMIUM === undefined)("the page", () => {
   let browser: Browser;

@@ -5,10 +5,13 @@ import { createServer } from "node:http";
 import type { AddressInfo } from "node:net";
 
 import { chromium } from "playwright-core";
-import type { Browser } from "playwright-core";
+import type { Browser, BrowserContextOptions } from "playwright-core";
 
 const PLACES = [process.env.CHROMIUM ?? "", "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
 export const CHROMIUM = PLACES.find((path) => path !== "" && existsSync(path));
+
+/** A page whose canvas has few pixels, because they are drawn in software. Its layout is that of any screen. */
+export const DESK: BrowserContextOptions = { viewport: { width: 640, height: 480 }, deviceScaleFactor: 0.25 };
 
 /** Launch Chromium headless, with WebGL 2 in software. */
 export function launch(): Promise<Browser> {

@@ -67,7 +67,7 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
     const { background, views } = JSON.parse(readFileSync(join(folder, "views.json"), "utf8")) as Case;
     const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgw": readFileSync(join(folder, "scene.a2tgw")) });
     // The canvas is drawn too, slowly in software, so keep it small.
-    const page = await browser.newPage({ viewport: { width: 160, height: 120 } });
+    const page = await browser.newPage({ viewport: { width: 160, height: 120 }, deviceScaleFactor: 0.25 });
     const errors: string[] = [];
     page.on("pageerror", (error) => errors.push(error.message));
     page.on("console", (message) => {

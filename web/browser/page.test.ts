@@ -14,7 +14,7 @@ import type { Pose } from "../src/camera";
 import { norm, subtract } from "../src/math";
 import type { Vec3 } from "../src/math";
 import { expectClose } from "../test/close";
-import { CHROMIUM, launch, serve } from "./chromium";
+import { CHROMIUM, DESK, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
 const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
@@ -33,8 +33,8 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   });
 
   /** Open the page and wait for the scene. `elsewhere` collects requests to other servers. */
-  async function opened(hash = "", size = { width: 640, height: 480 }): Promise<{ page: Page; elsewhere: string[] }> {
-    const page = await browser.newPage({ viewport: size });
+  async function opened(hash = "", options = DESK): Promise<{ page: Page; elsewhere: string[] }> {
+    const page = await browser.newPage(options);
     const elsewhere: string[] = [];
     page.on("request", (request) => {
       if (!/^(blob|data):/.test(request.url()) && !request.url().startsWith(served.address)) {
@@ -179,7 +179,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   });
 
   test("a page without a training asks for its own files alone", async () => {
-    const page = await browser.newPage();
+    const page = await browser.newPage(DESK);
     const asked: string[] = [];
     page.on("request", (request) => asked.push(request.url().replace(served.address, "/")));
     await page.goto(served.address);
@@ -214,7 +214,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
       "/pause": () => tell(true),
       "/resume": () => tell(false),
     });
-    const page = await browser.newPage({ viewport: { width: 640, height: 480 } });
+    const page = await browser.newPage(DESK);
     await page.goto(other.address);
     await page.waitForSelector("#training:not([hidden])");
     expect(await page.textContent("#state")).toContain("20 of 100");
@@ -237,7 +237,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   });
 
   test("the panel fits on a phone's screen", async () => {
-    const { page } = await opened("", { width: 390, height: 844 });
+    const { page } = await opened("", { viewport: { width: 390, height: 844 } });
     expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBe(390);
     const closed = await page.locator("#panel").boundingBox();
     expect(closed?.height).toBeLessThan(60);
@@ -271,7 +271,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     prepare?: (page: Page) => Promise<unknown>,
   ): Promise<string | null> {
     const other = await serve({ "/": PAGE, ...files });
-    const page = await browser.newPage();
+    const page = await browser.newPage(DESK);
     await prepare?.(page);
     await page.goto(other.address);
     const found = await page.locator("#message:not([hidden])").textContent();
@@ -306,7 +306,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
       path,
       PAGE.replace('<script type="module">', () => `${data}\n<script type="module">`),
     );
-    const page = await browser.newPage();
+    const page = await browser.newPage(DESK);
     await page.goto(pathToFileURL(path).href);
     await page.evaluate(() => window.a2tg?.loaded);
     expect(await page.evaluate(() => window.a2tg?.viewer.splats?.num)).toBe(300);
