@@ -1,9 +1,11 @@
 """Measure the options for scenes in the wild on the built-in scene, spoilt on purpose in ways that are known.
 
     python experiments/wild.py --out OUT [--only 'distractors;few views']
+    python experiments/wild.py --out OUT --capture SCENE
 
 Each spoilt capture is trained with and without the option that should help, and the whole capture, too, to see what the
-option costs where nothing is wrong. Scores are PSNR on views left out of training, whose photographs are unspoilt.
+option costs where nothing is wrong. Scores are PSNR on views left out of training, whose photographs are unspoilt. With
+--capture the options are compared on a real capture, of which every fourth view is left out.
 
 Each training is kept in OUT/wild.json as soon as it is measured, so that a second call goes on. The table is
 OUT/wild.md.
@@ -14,6 +16,7 @@ import functools
 import itertools
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +104,12 @@ def few_points() -> a2tg.Scene:
     return dataclasses.replace(scene, points=scene.points[::6], colors=scene.colors[::6])
 
 
+def real(path: Path) -> a2tg.Scene:
+    """Return a real capture, downscaled until it is hardly wider than `CAPTURE_WIDTH`."""
+    width = a2tg.load_scene(path).train[0].camera.width
+    return a2tg.load_scene(path, downscale=max(1, width // CAPTURE_WIDTH), test_every=CAPTURE_EVERY)
+
+
 def painted(scene: a2tg.Scene, change: Callable[[int, np.ndarray], np.ndarray]) -> a2tg.Scene:
     """Return the scene with changed training photographs."""
     views = [dataclasses.replace(view, picture=change(index, view.image)) for index, view in enumerate(scene.train)]
@@ -161,6 +170,17 @@ CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
 """Captures and, for each, the options to compare."""
 
 
+SKY_1000 = {"sky_gaussians": 1_000}
+OF_CAPTURES: dict[str, dict[str, Any]] = {
+    "plain": {}, "background white": {"background": "white"}, "sky_gaussians 1000": SKY_1000,
+    "affine": {"exposure": True}, "sky_gaussians 1000, affine": {**SKY_1000, "exposure": True},
+    "min_views 2": {"floaters": {"min_views": 2}}, "robust": ROBUST,
+}  # fmt: skip
+"""Options that are compared on a real capture, with `LARGER`."""
+LARGER = {"stage1_iterations": 2_000, "densify": {"cap": 6_000}}
+CAPTURE_WIDTH, CAPTURE_EVERY = 280, 4
+"""Least width of the photographs of a real capture, and which of its views are left out."""
+
 SIZES = "other sizes"
 SIZE_FIGURES = "psnr", "psnr_supersampled", "psnr_trained_there"
 SEEN_AT = (16, 32, 64, 128, 256)
@@ -220,14 +240,19 @@ def table(found: Mapping[str, Mapping[str, float]]) -> str:
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--only", default=";".join((*CASES, SIZES)), help="captures, with semicolons between them")
+    parser.add_argument("--capture", type=Path, help="scene folder of a real capture, in place of --only")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
     kept, session = KeptFigures(arguments.out, "wild", table), a2tg.Session(tidy_memory)
-    for name in arguments.only.split(";"):
+    cases, names = CASES, arguments.only.split(";")
+    if arguments.capture is not None:
+        larger = {label: {**LARGER, **options} for label, options in OF_CAPTURES.items()}
+        cases, names = {"real": (functools.partial(real, arguments.capture), larger)}, ["real"]
+    for name in names:
         if name == SIZES:
             measure_sizes(kept, session)
             continue
-        make, compared = CASES[name]
+        make, compared = cases[name]
         scene = make()
         for label, seed in itertools.product(compared, SEEDS):
             options = {**compared[label], "seed": seed}
