@@ -6,7 +6,6 @@ after it stay idle (`step.TrainState.status`); the loop mends the cause and laun
 
 import dataclasses
 import functools
-import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -116,7 +115,8 @@ class StageRun:
         session: what trainings of this process share; None: a new one.
         """
         self.session = Session() if session is None else session
-        self.exchange = self.session.exchange
+        exchange = self.session.exchange
+        self.exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
         check_lenses(self.views, self.num_devices)
         self.stage = system.stages()[index]
@@ -401,7 +401,6 @@ class StageRun:
 
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
         """Return the exchange with room for the rows that travel in some views once all rows exist."""
-        exchange = dataclasses.replace(exchange, views_at_once=math.gcd(self.system.batch_size, exchange.num))
         model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
         most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)
