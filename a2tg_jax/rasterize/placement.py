@@ -30,7 +30,7 @@ def are_drawn_here(exchange: Exchange | None, num_views: int, height: int) -> li
         return [True] * num_views
     sharding = exchange.sharding_of_pictures(num_views, height)
     parts = sharding.addressable_devices_indices_map((num_views, height)).values()
-    drawn = {view for views, _ in parts for view in range(num_views)[views]}
+    drawn = {view for part in parts if part is not None for view in range(num_views)[part[0]]}
     return [view in drawn for view in range(num_views)]
 
 

@@ -23,7 +23,7 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.rasterize.exchange import Exchange, spread
-from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, of_first, readable
+from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batches import BatchOrder, PhotoStore, check_lenses
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -283,6 +283,8 @@ class StageRun:
         due = self._due(iteration) if are_events_decided_by_host() else None
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background, due)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
+        if self.exchange is not None:  # Else XLA may choose a sharding for them that JAX cannot name.
+            views, rows = jax.tree.map(functools.partial(everywhere, self.exchange), (views, rows))
         return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
 
     def _due(self, iteration: int) -> tuple[bool, ...]:
