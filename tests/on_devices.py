@@ -17,11 +17,12 @@ import a2tg_jax as a2tg
 from a2tg_jax.rasterize.exchange import exchange_among, spread
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.training import Session
+from a2tg_jax.training import Session, loop
+from a2tg_jax.training.batches import PhotoStore
+from a2tg_jax.training.divergence import jitted_attempt
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.start import padded
-from a2tg_jax.training.step import attempt
 
 ROWS = 96
 """Number of Gaussians that are rendered: divisible by 4."""
@@ -112,18 +113,31 @@ def fit(own, count, **options):
 def batches(folder):
     """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
     own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True)
-    for index, size in ((1, 4), (0, 6)):
+    for index, size, is_streamed in ((1, 4, False), (0, 6, False), (0, 6, True)):
         own = dataclasses.replace(own, batch_size=size)
-        found = []
-        for devices in (None, jax.devices()):
-            run = StageRun(scene(), own, index, plain(), session=Session(devices=devices))
-            arguments = run.arguments(1)
-            if devices is not None:
-                assert arguments[0].render.exchange.num_at_once(size) == (2 if size == 6 else size)
-            tried = jax.jit(attempt, static_argnums=0)(*arguments)
-            views = tried.views._replace(num_pairs=0, grads=tried.grads)
-            found.append((views, tried.state.model))
-        close(*found)
+        if not is_streamed:
+            alone = attempted(StageRun(scene(), own, index, plain()).arguments(1))
+        loop.PhotoStore = functools.partial(PhotoStore, room=0 if is_streamed else None)
+        run = StageRun(scene(), own, index, plain(), session=Session(devices=jax.devices()))
+        arguments = run.arguments(1)
+        assert arguments[0].render.exchange.num_at_once(size) == (2 if size == 6 else size)
+        if is_streamed:
+            check_parts(arguments[4].images, [run.views[index].image for index in run.order.indices(1)])
+        close(alone, attempted(arguments))
+        run.photographs.close()
+
+
+def attempted(arguments):
+    tried = jitted_attempt()(*arguments)
+    return tried.views._replace(num_pairs=0, grads=tried.grads), tried.state.model
+
+
+def check_parts(images, expected):
+    """Two devices hold the halves of the first three photographs, two others those of the last three."""
+    parts = [np.asarray(part.data) for part in images.addressable_shards]
+    assert [part.shape for part in parts] == [(3, 27, 72, 3)] * 4
+    halves = [np.concatenate(parts[:2], axis=1), np.concatenate(parts[2:], axis=1)]
+    np.testing.assert_array_equal(np.concatenate(halves), expected)
 
 
 def training(folder):

@@ -7,6 +7,8 @@ python tests/on_processes.py --losses                a process of a training is 
 """
 
 import argparse
+import dataclasses
+import functools
 import os
 import signal
 import socket
@@ -25,6 +27,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.host.processes import LOST, Place, joined
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
+from a2tg_jax.training.batches import BatchOrder, PhotoStore
 
 SYSTEMS = {
     "a2tg": lambda length: system(
@@ -34,8 +37,11 @@ SYSTEMS = {
         stage1_iterations=length,
         stage2_iterations=length,
     ),
-    "mcmc": lambda length: system(Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length),
+    "streamed": lambda length: system(
+        Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length, batch_size=6
+    ),
 }
+"""The second one does not leave its photographs on the devices."""
 SMALL = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
 PRUNING = ("--floaters.min-views", "2", "--floaters.at", "0.25")
 """Options with which process 0 prunes for all."""
@@ -105,6 +111,8 @@ def fit(own, path, session, **options):
 def train(place, name, length, folder):
     """Train together, then on the first process alone, from the start and from the common checkpoint."""
     loop.LOG_EVERY = 1
+    if name == "streamed":
+        loop.PhotoStore = functools.partial(PhotoStore, room=0)
     own = SYSTEMS[name](length)
     with joined(place) as team:
         path = Path(folder) / "checkpoint.npz" if team.is_first else None
@@ -124,10 +132,34 @@ def train(place, name, length, folder):
     print(f"{name}: {end:.3f} dB alone, {others[0]:.3f} by {team.count} processes", file=sys.stderr)
 
 
-def wait(place):
-    """Meet the other processes for ever."""
+def read_own_photographs(place):
+    """Read streamed batches of a view for each process, of which this one draws and reads its own alone."""
+    read = []
+
+    def counted(view):
+        load = lambda: read.append(view.name) or view.image  # noqa: E731
+        return dataclasses.replace(view, picture=dataclasses.replace(view.picture, read=load))
+
+    views = a2tg.synthetic_scene(num_views=6, width=24, height=15, num_points=20).train
+    order, exchange = BatchOrder(views, place.num_processes, 0), Session(devices=jax.devices()).exchange
+    exchange = exchange.for_batches(place.num_processes)
+    photographs = PhotoStore(tuple(map(counted, views)), order, 3, exchange, room=0)
+    own = [views[order.indices(iteration)[place.process_id]] for iteration in (1, 2, 3)]
+    for iteration, view in enumerate(own, 1):
+        batch, places = photographs.batch(iteration)
+        (part,) = batch.images.addressable_shards
+        assert places is None and batch.images.shape == (place.num_processes, 15, 24, 3)
+        np.testing.assert_array_equal(part.data, view.image[None])
+    photographs.close()
+    assert sorted(read) == sorted(view.name for view in own)
+
+
+def wait(place, what):
+    """Meet the other processes for ever, after reading photographs if that is asked for."""
     with joined(place) as team:
         team.advice = lambda: "go on"
+        if what == "read":
+            read_own_photographs(place)
         while True:
             multihost_utils.process_allgather(np.zeros(1))
             print("met", flush=True)
@@ -182,7 +214,10 @@ def main():
     args = parser.parse_args()
     if args.coordinator is not None:
         place = Place(args.coordinator, args.num_processes, args.process_id, args.seconds)
-        wait(place) if args.what == "wait" else train(place, args.system, args.length, args.folder)
+        if args.what == "train":
+            train(place, args.system, args.length, args.folder)
+        else:
+            wait(place, args.what)
     elif args.losses:
         losses()
     else:

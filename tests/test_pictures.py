@@ -126,6 +126,27 @@ def test_all_batches_have_opacities_and_masks_where_one_has(tmp_path):
     assert sum(bool((batch.alphas == 255).all()) for batch in batches) == 1
 
 
+def test_photographs_that_other_processes_draw_are_not_read(tmp_path, monkeypatch):
+    """Neither their masks and depth maps; their cameras come along."""
+    read = []
+
+    def counted(view):
+        load = lambda: read.append(view.name) or np.full((32, 40, 4), 9, np.uint8)  # noqa: E731
+        picture, depth = Picture((32, 40, 4), load), np.ones((32, 40), np.float32)
+        return dataclasses.replace(view, picture=picture, mask=np.ones((32, 40), bool), depth=depth)
+
+    views = tuple(counted(view) for view in synthetic_scene(num_views=6, width=40, height=32, num_points=20).train)
+    order = BatchOrder(views, 3, 0)
+    monkeypatch.setattr(batches, "are_drawn_here", lambda *_: [False, True, False])
+    store = PhotoStore(views, order, 1, has_depths=True, room=0)
+    batch, places = store.batch(1)
+    store.close()
+    assert read == [views[order.indices(1)[1]].name] and places is None
+    for arrays in (batch.images, batch.alphas, batch.masks, batch.depths):
+        assert arrays[1].all() and not arrays[[0, 2]].any()
+    assert np.asarray(batch.Ks).all(axis=0)[0, 0] and len(batch.viewmats) == 3
+
+
 def test_room_must_not_be_negative(tmp_path):
     with pytest.raises(ValueError, match=r"room must be at least 0 bytes; got -1"):
         load_scene(tmp_path, room=-1)

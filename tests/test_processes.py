@@ -50,17 +50,17 @@ def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     assert first.returncode == LOST
 
 
-def waiting():
-    """Two processes that have met."""
-    processes = pair(["--what", "wait", "--seconds", "2"])
+def waiting(what="wait"):
+    """Two processes that have met, and read photographs before if that is asked for."""
+    processes = pair(["--what", what, "--seconds", "2"])
     for process in processes:
         if process.stdout.readline() != "met\n":
             pytest.fail(str(ended(processes, 10)))
     return processes
 
 
-def test_an_error_of_the_first_process_ends_both_at_once():
-    first, other = waiting()
+def test_each_process_reads_what_it_draws_and_an_error_of_the_first_ends_both_at_once():
+    first, other = waiting("read")
     first.send_signal(signal.SIGINT)
     told = [process.communicate(timeout=20)[1] for process in (first, other)]
     assert "KeyboardInterrupt" in told[0] and first.returncode == -signal.SIGINT

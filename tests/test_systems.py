@@ -244,7 +244,7 @@ def test_photographs_stay_on_the_device_while_they_fit(scene):
     assert everything.is_resident and not nothing.is_resident
     for iteration in (1, 4, 2, 9):
         images = [
-            photographs.images[places]
+            photographs.of(places).images
             for photographs, places in map(lambda store: store.batch(iteration), (everything, nothing))
         ]
         np.testing.assert_array_equal(*images)

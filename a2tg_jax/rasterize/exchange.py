@@ -31,6 +31,8 @@ from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
 
 AXIS = "rows"
 """Axis of the mesh along which rows of splats, and bands of pixels, lie on devices."""
+VIEWS = "views"
+"""Axis of a mesh of the same devices along which the views lie that are drawn at once."""
 ROOM_OF_A_BAND = 2.0
 """Room for the pairs of a band, as a multiple of an even share of the capacity."""
 
@@ -51,6 +53,10 @@ class Exchange:
         """Number D of devices."""
         return self.mesh.size
 
+    def for_batches(self, num_views: int) -> "Exchange":
+        """Return the exchange that draws as many views of a batch at once as it can."""
+        return dataclasses.replace(self, views_at_once=math.gcd(num_views, self.num))
+
     def num_at_once(self, num_views: int) -> int:
         """Return how many of some views are drawn at once: a divisor of their number, and of D."""
         return math.gcd(num_views, self.views_at_once)
@@ -69,6 +75,19 @@ class Exchange:
         """Return where the rows of an array lie, along one of its axes."""
         is_divided = len(shape) > axis and shape[axis] >= self.num and shape[axis] % self.num == 0
         return NamedSharding(self.mesh, P(*[None] * axis, AXIS) if is_divided else P())
+
+    def sharding_of_pictures(self, num_views: int, height: int) -> NamedSharding:
+        """Return where the pictures [V, H, ...] of a batch lie: each on the devices that draw its view, which share its
+        rows of pixels if their number divides H.
+
+        The g-th of G groups of devices draws the g-th part of the views, one after the other.
+        """
+        num_groups = self.num_at_once(num_views)
+        if num_groups == 1:
+            return self.sharding_of((num_views, height), axis=1)
+        devices = self.mesh.devices.reshape(num_groups, -1)
+        mesh = Mesh(devices, (VIEWS, AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
+        return NamedSharding(mesh, P(VIEWS, None if height % devices.shape[1] else AXIS))
 
     def filled_up(self, x: Array, value: float | None = None) -> Array:
         """Return rows followed by so many of a value, or copies of the last one, that D divides their number."""

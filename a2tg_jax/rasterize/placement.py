@@ -18,6 +18,22 @@ def spread_pixels(exchange: Exchange, pictures: Array) -> Array:
     return placed(pictures, exchange.sharding_of(pictures.shape, axis=1))
 
 
+def spread_views(exchange: Exchange, pictures: Array) -> Array:
+    """Return pictures [V, H, ...] of a batch on the devices that draw them (host). Only those views are read that
+    `are_drawn_here`."""
+    return placed(pictures, exchange.sharding_of_pictures(*pictures.shape[:2]))
+
+
+def are_drawn_here(exchange: Exchange | None, num_views: int, height: int) -> list[bool]:
+    """Return whether this process's devices draw at least a part of each view of a batch."""
+    if exchange is None:
+        return [True] * num_views
+    sharding = exchange.sharding_of_pictures(num_views, height)
+    parts = sharding.addressable_devices_indices_map((num_views, height)).values()
+    drawn = {view for part in parts if part is not None for view in range(num_views)[part[0]]}
+    return [view in drawn for view in range(num_views)]
+
+
 def everywhere(exchange: Exchange, x: Array) -> Array:
     """Return an array that every device has whole (host)."""
     return placed(x, NamedSharding(exchange.mesh, P()))

@@ -2,18 +2,19 @@
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax import Array
+from numpy.typing import DTypeLike
 
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.rasterize.exchange import Exchange
-from a2tg_jax.rasterize.placement import asked_by_any, everywhere, spread_pixels
+from a2tg_jax.rasterize.placement import are_drawn_here, asked_by_any, everywhere, spread_pixels, spread_views
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -46,8 +47,10 @@ class Photographs(NamedTuple):
     rays: Array | None = None
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
 
-    def of(self, views: Array) -> "Photographs":
-        """Return the views of some indices."""
+    def of(self, views: Array | None) -> "Photographs":
+        """Return the views of some indices; None: all."""
+        if views is None:
+            return self
         chosen: Photographs = jax.tree.map(lambda x: x[views], self._replace(rays=None))
         return chosen._replace(rays=self.rays)
 
@@ -132,7 +135,8 @@ class PhotoStore:
         views: of one scene.
         order: views of each iteration.
         last: the stage's last iteration.
-        exchange: devices over which the rows of pixels are spread; None: one.
+        exchange: devices that draw the views of an iteration, and over which photographs that stay there are spread
+          by rows of pixels; None: one.
         has_depths: whether their depth maps come along.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
@@ -142,10 +146,11 @@ class PhotoStore:
         self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
         is_waiting = any(view.picture.is_remote for view in views)
-        self._ahead = Ahead(lambda indices: self._stacked(indices, views), self.num_ahead, is_waiting=is_waiting)
+        self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
 
-    def batch(self, iteration: int) -> tuple[Photographs, np.ndarray]:
-        """Return photographs of one kind that include those of an iteration, and their int32 indices among them.
+    def batch(self, iteration: int) -> tuple[Photographs, np.ndarray | None]:
+        """Return photographs of one kind that include those of an iteration, and their int32 indices among them, or
+        None if they are just those of the iteration.
 
         Raises:
           ValueError, OSError: if a photograph that was left where it lies has gone, has changed or cannot be read.
@@ -154,7 +159,7 @@ class PhotoStore:
         if not self.is_resident:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             batch = self._ahead.first({key: self._order.indices(key) for key in following})
-            return on_devices(batch, self._exchange), np.arange(len(indices), dtype=np.int32)
+            return on_devices(batch, self._exchange, spread_views), None
         stack, places = self._stack(self._order.kinds[indices[0]])
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
@@ -162,32 +167,40 @@ class PhotoStore:
         """Return all photographs of a kind on the device, and the place of each view's."""
         if kind not in self._stacks:
             found = [index for index, own in enumerate(self._order.kinds) if own == kind]
-            stack = on_devices(self._stacked(found, self._views), self._exchange)
+            stack = on_devices(self._stacked(found), self._exchange, spread_pixels)
             if self._exchange is None:
                 stack = jax.device_put(stack)
             self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[kind]
 
-    def _stacked(self, indices: Sequence[int], among: tuple[View, ...] | None = None) -> Photographs:
-        return stack_views([self._views[index] for index in indices], among, has_depths=self._has_depths)
+    def _read(self, indices: Sequence[int]) -> Photographs:
+        """Return the photographs of an iteration, without those that other processes' devices draw."""
+        height = self._views[indices[0]].picture.size[0]
+        return self._stacked(indices, are_drawn_here(self._exchange, len(indices), height))
+
+    def _stacked(self, indices: Sequence[int], are_read: Sequence[bool] | None = None) -> Photographs:
+        views = [self._views[index] for index in indices]
+        return stack_views(views, self._views, has_depths=self._has_depths, are_read=are_read)
 
     def close(self) -> None:
         """Ends the threads."""
         self._ahead.close()
 
 
-def on_devices(photographs: Photographs, exchange: Exchange | None) -> Photographs:
-    """Return photographs with their rows of pixels spread over the devices; without an exchange they stay."""
+def on_devices(
+    photographs: Photographs, exchange: Exchange | None, spread: Callable[[Exchange, Array], Array]
+) -> Photographs:
+    """Return photographs with their pictures spread over the devices by a function; without an exchange they stay."""
     if exchange is None:
         return photographs
-    on_all, in_rows = (functools.partial(place, exchange) for place in (everywhere, spread_pixels))
+    on_all, in_parts = (functools.partial(place, exchange) for place in (everywhere, spread))
     return Photographs(
         viewmats=on_all(photographs.viewmats),
         Ks=on_all(photographs.Ks),
-        images=in_rows(photographs.images),
-        alphas=None if photographs.alphas is None else in_rows(photographs.alphas),
-        masks=None if photographs.masks is None else in_rows(photographs.masks),
-        depths=None if photographs.depths is None else in_rows(photographs.depths),
+        images=in_parts(photographs.images),
+        alphas=None if photographs.alphas is None else in_parts(photographs.alphas),
+        masks=None if photographs.masks is None else in_parts(photographs.masks),
+        depths=None if photographs.depths is None else in_parts(photographs.depths),
         rays=photographs.rays,
     )
 
@@ -268,7 +281,10 @@ def device_room() -> float:
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 
 
-def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False) -> Photographs:
+def stack_views(
+    views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False,
+    are_read: Sequence[bool] | None = None,
+) -> Photographs:  # fmt: skip
     """Return views of one image size and lens, stacked on the host.
 
     Args:
@@ -276,25 +292,31 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them. None: `views`.
       has_depths: whether depth maps come along; NaN where a view has none.
+      are_read: whether the pictures of each view are read; those of the others are zeros. None: all.
     """
-    alike = [view for view in among or views if view.picture.size == views[0].picture.size]
-    pixels = [view.picture.read() for view in views]
-    alphas = None
+    size = views[0].picture.size
+    alike = [view for view in among or views if view.picture.size == size]
+    read = {place: view for place, view in enumerate(views) if are_read is None or are_read[place]}
+    pixels = {place: view.picture.read() for place, view in read.items()}
+    stacked = functools.partial(_stacked, len(views), size)
+    alphas = masks = depths = None
     if any(view.has_alpha for view in alike):
-        opaque = np.full(views[0].picture.size, 255, np.uint8)
-        alphas = _stacked([own[..., 3] if own.shape[2] == 4 else opaque for own in pixels])
-    masks = None
+        opaque = np.full(size, 255, np.uint8)
+        alphas = stacked({place: own[..., 3] if own.shape[2] == 4 else opaque for place, own in pixels.items()})
     if any(view.mask is not None for view in alike):
-        whole = np.ones(views[0].picture.size, bool)
-        masks = _stacked([whole if view.mask is None else view.mask.read() for view in views])
+        whole = np.ones(size, bool)
+        of_views = {place: whole if view.mask is None else view.mask.read() for place, view in read.items()}
+        masks = stacked(of_views, bool)
+    if has_depths:
+        depths = stacked({place: _depth(view) for place, view in read.items()}, np.float32)
     return Photographs(
         viewmats=np.stack([np.asarray(view.camera.viewmat) for view in views]),  # type: ignore[arg-type]
         Ks=np.stack([np.asarray(view.camera.K) for view in views]),  # type: ignore[arg-type]
-        images=_stacked([own[..., :3] for own in pixels]),  # type: ignore[arg-type]
+        images=stacked({place: own[..., :3] for place, own in pixels.items()}, channels=(3,)),  # type: ignore[arg-type]
         alphas=alphas,  # type: ignore[arg-type]
         masks=masks,  # type: ignore[arg-type]
         rays=views[0].camera.rays,
-        depths=_stacked([_depth(view) for view in views]) if has_depths else None,  # type: ignore[arg-type]
+        depths=depths,  # type: ignore[arg-type]
     )
 
 
@@ -303,10 +325,19 @@ def _depth(view: View) -> np.ndarray:
     return np.full(view.picture.size, np.nan, np.float32) if view.depth is None else view.depth.read()
 
 
-def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
-    """Return `np.stack` of arrays in aligned memory, which `jax.device_put` adopts on CPUs without a copy."""
-    shape, dtype = (len(arrays), *arrays[0].shape), arrays[0].dtype
-    num_bytes = int(np.prod(shape)) * dtype.itemsize
-    room = np.empty(num_bytes + ALIGNMENT, np.uint8)
+def _stacked(
+    num: int, size: tuple[int, int], arrays: Mapping[int, np.ndarray], dtype: DTypeLike = np.uint8,
+    channels: tuple[int, ...] = (),
+) -> np.ndarray:  # fmt: skip
+    """Return so many arrays [H, W, ...] in one, those at some places and zeros at the others.
+
+    Its memory is aligned, so that `jax.device_put` adopts it on CPUs without a copy.
+    """
+    shape = (num, *size, *channels)
+    num_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+    room = np.zeros(num_bytes + ALIGNMENT, np.uint8)
     start = -room.ctypes.data % ALIGNMENT
-    return np.stack(arrays, out=room[start : start + num_bytes].view(dtype).reshape(shape))
+    stack = room[start : start + num_bytes].view(dtype).reshape(shape)
+    for place, own in arrays.items():
+        stack[place] = own
+    return stack

@@ -11,9 +11,10 @@ import jax
 import numpy as np
 
 from a2tg_jax.core.jit import Jitted
+from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.training.checkpoint import Checkpoint, History
-from a2tg_jax.training.step import Attempt, attempt
+from a2tg_jax.training.step import Attempt, StepSettings, attempt
 
 EXPLOSION = 100.0
 """A loss that is larger than so many times that of the stage's first logged iteration is an explosion, …"""
@@ -40,8 +41,15 @@ def largest_loss(history: History) -> float:
 
 
 @functools.cache
-def _jitted_attempt() -> Jitted[..., Attempt]:
-    return Jitted(attempt, static_argnums=(0,))
+def jitted_attempt() -> Jitted[..., Attempt]:
+    """Return `attempt`, jitted, with its results spread over the devices of the settings."""
+    return Jitted(_spread_attempt, static_argnums=(0,))
+
+
+def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
+    # Else XLA may choose shardings that JAX cannot name, as where it has divided the devices among views.
+    tried: Attempt = spread(settings.render.exchange, attempt(settings, *arguments))
+    return tried
 
 
 def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
@@ -51,7 +59,7 @@ def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
       arguments: of `train_step`, with the state before the step that could not be taken.
       names: of its views.
     """
-    tried: Attempt = readable(_jitted_attempt()(*arguments))
+    tried: Attempt = readable(jitted_attempt()(*arguments))
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {told}" for told in _not_finite(tried.grads)]

@@ -6,7 +6,6 @@ after it stay idle (`step.TrainState.status`); the loop mends the cause and laun
 
 import dataclasses
 import functools
-import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -24,7 +23,7 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, rows_of_view
 from a2tg_jax.rasterize.exchange import Exchange, spread
-from a2tg_jax.rasterize.placement import asked_by_any, check_same, gathered, of_first, readable
+from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batches import BatchOrder, PhotoStore, check_lenses
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
@@ -116,7 +115,8 @@ class StageRun:
         session: what trainings of this process share; None: a new one.
         """
         self.session = Session() if session is None else session
-        self.exchange = self.session.exchange
+        exchange = self.session.exchange
+        self.exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
         check_lenses(self.views, self.num_devices)
         self.stage = system.stages()[index]
@@ -283,6 +283,8 @@ class StageRun:
         due = self._due(iteration) if are_events_decided_by_host() else None
         settings = StepSettings(self._settings(self._size(iteration)), self.system.background, due)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
+        if self.exchange is not None:  # Else XLA may choose a sharding for them that JAX cannot name.
+            views, rows = jax.tree.map(functools.partial(everywhere, self.exchange), (views, rows))
         return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
 
     def _due(self, iteration: int) -> tuple[bool, ...]:
@@ -401,7 +403,6 @@ class StageRun:
 
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
         """Return the exchange with room for the rows that travel in some views once all rows exist."""
-        exchange = dataclasses.replace(exchange, views_at_once=math.gcd(self.system.batch_size, exchange.num))
         model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
         most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)

@@ -125,8 +125,8 @@ def jitted_step() -> Jitted[..., tuple[TrainState, StepInfo]]:
 
 
 def train_step(
-    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
-    scene_scale: Array, key: Array, rows: Any = None,
+    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
+    views: Array | None, scene_scale: Array, key: Array, rows: Any = None,
 ) -> tuple[TrainState, StepInfo]:  # fmt: skip
     """Run one iteration.
 
@@ -136,7 +136,7 @@ def train_step(
       clock: `stage.clock()`.
       state: donated.
       photographs: of one image size.
-      views: [V] int32 indices of the photographs to use.
+      views: [V] int32 indices of the photographs to use; None: all of them.
       scene_scale: factor of the means' learning rate.
       key: of the stage; each iteration folds in its number.
       rows: [V] int32, their numbers among all training views; needed for corrections.
@@ -154,8 +154,8 @@ def train_step(
 
 
 def attempt(
-    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs, views: Array,
-    scene_scale: Array, key: Array, rows: Any = None,
+    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
+    views: Array | None, scene_scale: Array, key: Array, rows: Any = None,
 ) -> Attempt:  # fmt: skip
     """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
@@ -165,7 +165,7 @@ def attempt(
     batch = photographs.of(views)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
     batch = batch if batch.depths is None else batch._replace(depths=batch.depths.astype(dtype))
-    backgrounds = _backgrounds(keys[0], settings.background, views.shape[0], dtype)
+    backgrounds = _backgrounds(keys[0], settings.background, batch.viewmats.shape[0], dtype)
     own = rows_of(state.corrections, rows)
     found = _gradients(settings, stage, clock, state, batch, backgrounds, iteration, own)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
@@ -255,16 +255,20 @@ def _gradients(
     if num_at_once == 1:
         gradients = jax.lax.map(functools.partial(gradients_by, differentiate), arrays)
         return gradients
-    rounds = jax.tree.map(lambda x: x.reshape(num // num_at_once, num_at_once, *x.shape[1:]), arrays)
+    rounds = jax.tree.map(lambda x: x.reshape(num_at_once, -1, *x.shape[1:]).swapaxes(0, 1), arrays)
     gradients = jax.lax.map(functools.partial(gradients_by, differentiate_together), rounds)
     return _of_views(gradients, num_at_once)
 
 
 def _of_views(rounds: BatchGradients, num_at_once: int) -> BatchGradients:
-    """Return the gradients of rounds of views [V/G, G, ...] as those of views [V, ...]; of parameters, mean ones."""
+    """Return the gradients of rounds of views [V/G, G, ...] as those of views [V, ...]; of parameters, mean ones.
+
+    Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs
+    (`Exchange.sharding_of_pictures`).
+    """
     gaussians, sums, rows = rounds.grads
     rounds = rounds._replace(grads=(gaussians, None, rows))
-    views: BatchGradients = jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), rounds)
+    views: BatchGradients = jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:]), rounds)
     means = jax.tree.map(lambda x: x / num_at_once, sums)
     return views._replace(grads=(views.grads[0], means, views.grads[2]))
 
