@@ -255,7 +255,7 @@ def _gradients(
     if num_at_once == 1:
         gradients = jax.lax.map(functools.partial(gradients_by, differentiate), arrays)
         return gradients
-    rounds = jax.tree.map(lambda x: x.reshape(num_at_once, -1, *x.shape[1:]).swapaxes(0, 1), arrays)
+    rounds = jax.tree.map(lambda x: x.reshape(num_at_once, num // num_at_once, *x.shape[1:]).swapaxes(0, 1), arrays)
     gradients = jax.lax.map(functools.partial(gradients_by, differentiate_together), rounds)
     return _of_views(gradients, num_at_once)
 
@@ -268,7 +268,9 @@ def _of_views(rounds: BatchGradients, num_at_once: int) -> BatchGradients:
     """
     gaussians, sums, rows = rounds.grads
     rounds = rounds._replace(grads=(gaussians, None, rows))
-    views: BatchGradients = jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:]), rounds)
+    views: BatchGradients = jax.tree.map(
+        lambda x: x.swapaxes(0, 1).reshape(x.shape[0] * x.shape[1], *x.shape[2:]), rounds
+    )
     means = jax.tree.map(lambda x: x / num_at_once, sums)
     return views._replace(grads=(views.grads[0], means, views.grads[2]))
 
