@@ -42,7 +42,7 @@ def place_of(
 
 def _check_address(coordinator: str) -> None:
     """Raise ValueError unless the text is HOST:PORT, with IPv6 addresses in brackets."""
-    if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+(%\w+)?\]|[^:\[\]]+):\d+", coordinator):
+    if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+(%[\w.-]+)?\]|[^:\[\]]+):\d+", coordinator):
         raise ValueError(f"--coordinator must be HOST:PORT, [IPv6]:PORT or auto; got {coordinator!r}")
 
 

@@ -31,7 +31,7 @@ from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
 
 AXIS = "rows"
 """Axis of the mesh along which rows of splats, and bands of pixels, lie on devices."""
-VIEWS = "views"
+VIEW_AXIS = "views"
 """Axis of a mesh of the same devices along which the views lie that are drawn at once."""
 ROOM_OF_A_BAND = 2.0
 """Room for the pairs of a band, as a multiple of an even share of the capacity."""
@@ -86,8 +86,8 @@ class Exchange:
         if num_groups == 1:
             return self.sharding_of((num_views, height), axis=1)
         devices = self.mesh.devices.reshape(num_groups, -1)
-        mesh = Mesh(devices, (VIEWS, AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
-        return NamedSharding(mesh, P(VIEWS, None if height % devices.shape[1] else AXIS))
+        mesh = Mesh(devices, (VIEW_AXIS, AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
+        return NamedSharding(mesh, P(VIEW_AXIS, None if height % devices.shape[1] else AXIS))
 
     def filled_up(self, x: Array, value: float | None = None) -> Array:
         """Return rows followed by so many of a value, or copies of the last one, that D divides their number."""
@@ -96,8 +96,9 @@ class Exchange:
         return jnp.concatenate([x, jnp.repeat(last, num, axis=0)]) if num else x
 
 
-def spread(exchange: Exchange | None, tree: Any) -> Any:
-    """Return arrays with their rows spread over the devices; those that D does not divide are on every device.
+def spread(exchange: Exchange | None, tree: Any, axis: int = 0) -> Any:
+    """Return arrays with their rows, along an axis, spread over the devices; those that D does not divide are on every
+    device.
 
     Under jit it constrains where results lie; else it moves the arrays. Without an exchange they stay.
     """
@@ -105,7 +106,7 @@ def spread(exchange: Exchange | None, tree: Any) -> Any:
         return tree
 
     def of_leaf(x: Any) -> Any:
-        sharding = exchange.sharding_of(jnp.shape(x))
+        sharding = exchange.sharding_of(jnp.shape(x), axis)
         is_traced = isinstance(x, jax.core.Tracer)
         return jax.lax.with_sharding_constraint(x, sharding) if is_traced else placed(x, sharding)
 
@@ -143,7 +144,7 @@ class Bands:
         return Bands(grid, grid if num == 1 else grid._replace(height=height), num)
 
     def reached(self, M: Array, cutoff: Array, near_plane: float) -> Array:
-        """Return [D, n] whether each splat's box reaches each band."""
+        """Return [bands, n] whether each splat's box reaches each band of a view."""
         boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), self.whole)
         first = boxes.y0
         end = first + boxes.counts // jnp.maximum(boxes.columns, 1)
@@ -155,7 +156,7 @@ def composite_in_bands(
     settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, rule: AppearanceRule,
     cutoff: Array, jacobian: Array, probe: Array,
 ) -> Composited:  # fmt: skip
-    """Composite G views as `compositor.composite` does one, each device a band of a view.
+    """Composite G views, the leading axis of all arrays, as `compositor.composite` does one: each device a band.
 
     The number of pairs is the capacity that has room for the fullest band and for all that is sent to it.
 
@@ -193,7 +194,7 @@ def composite_in_bands(
 
 
 def rows_to_send(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid) -> Array:
-    """Return the largest number of rows that a device sends to another one for a view, drawn beside others or alone.
+    """Return the largest number of rows that a device sends to another one for a view that is drawn beside others.
 
     Args:
       exchange: the D devices.

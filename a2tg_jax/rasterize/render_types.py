@@ -45,7 +45,7 @@ class RenderSettings:
     """Factor k by which views are drawn larger; each pixel is the mean over k × k. It lets a model be seen much smaller
     than it was trained without aliasing, at k² times the cost."""
     exchange: Exchange | None = None
-    """Devices that render each image together (`exchange_among`); None: one."""
+    """Devices that render together, an image or several at once (`exchange_among`); None: one."""
 
     def __post_init__(self) -> None:
         if not self.near_plane > 0:

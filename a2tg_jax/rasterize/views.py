@@ -96,7 +96,16 @@ def render_together(
       rule: shared by the views.
       settings: with a capacity and an exchange, whose number of devices G divides; without supersampling.
       has_geometry, sh_degree, num_live, statistic: as for `render_traced`.
+
+    Raises:
+      ValueError: if the settings lack an exchange or are supersampled, or G does not divide the devices.
     """
+    num_views = backgrounds.shape[0]
+    if settings.exchange is None or settings.exchange.num % num_views:
+        num_devices = 1 if settings.exchange is None else settings.exchange.num
+        raise ValueError(f"so many views must divide the devices of settings.exchange; got {num_views}, {num_devices}")
+    if settings.supersample > 1:
+        raise ValueError("supersample must be 1 where several views are drawn at once")
     return _rendered(
         jax.vmap, gaussians, cameras, rule, backgrounds, settings,
         has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,

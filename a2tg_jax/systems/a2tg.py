@@ -164,16 +164,22 @@ class A2tg(System):
             ),
         }  # fmt: skip
 
-    def check_number(self, num: int, *, has_first_stage: bool = True) -> None:
+    def check_number(self, num: int) -> None:
         """Refuse a budget of textures that the Gaussians of the first stage already exhaust."""
+        if self.densify.is_enabled:
+            num = Mcmc(self.densify.cap).grown(num, self.stage1_iterations)
+        self._check_budget(num, "raise it, or lower densify.cap")
+
+    def check_given_number(self, num: int) -> None:
+        """Refuse a budget of textures that the given Gaussians already exhaust."""
+        self._check_budget(num, "raise it")
+
+    def _check_budget(self, num: int, remedy: str) -> None:
         if self._texture().select != "budget" or self.memory_budget is not None or not self.densify.is_enabled:
             return
         assert self.texture.budget_mb is not None
-        if has_first_stage:
-            num = Mcmc(self.densify.cap).grown(num, self.stage1_iterations)
         needed = num * bytes_per_gaussian(self.sh_degree, FLOATS_PER_TEXEL) / MEGABYTE
         if self.texture.budget_mb < needed:
-            remedy = "raise it, or lower densify.cap" if has_first_stage else "raise it"
             raise ValueError(
                 f"texture.budget_mb is {self.texture.budget_mb}, but {num:,} Gaussians of one texel each take "
                 f"{needed:.3f} MB: {remedy}"

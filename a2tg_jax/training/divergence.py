@@ -48,8 +48,13 @@ def jitted_attempt() -> Jitted[..., Attempt]:
 
 def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
     # Else XLA may choose shardings that JAX cannot name, as where it has divided the devices among views.
-    tried: Attempt = spread(settings.render.exchange, attempt(settings, *arguments))
-    return tried
+    tried, exchange = attempt(settings, *arguments), settings.render.exchange
+    of_views = tried.views.grads, tried.views.statistic
+    nothing: Any = None
+    views = tried.views._replace(grads=nothing, statistic=nothing)
+    rest: Attempt = spread(exchange, tried._replace(views=views))
+    grads, statistic = spread(exchange, of_views, axis=1)
+    return rest._replace(views=rest.views._replace(grads=grads, statistic=statistic))
 
 
 def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:

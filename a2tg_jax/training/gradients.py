@@ -137,7 +137,7 @@ class View(NamedTuple):
         return self._replace(camera=corrected_camera(self.corrections, self.rows, self.camera))
 
 
-VIEWS = View(camera=0, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
+AXES_OF_VIEWS = View(camera=0, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
 """Axes of several views in one, of which the corrections are shared, for `jax.vmap`."""
 
 
@@ -224,7 +224,9 @@ def differentiate_together(
     def of_parameters(
         gaussians: Gaussians, params: Any, rows: tuple[Array, ...], probe: Array | None
     ) -> tuple[Array, tuple[Any, ...]]:
-        seen = jax.vmap(lambda view: view.corrected, in_axes=(VIEWS,), out_axes=VIEWS)(views._replace(rows=rows))
+        seen = jax.vmap(lambda view: view.corrected, in_axes=(AXES_OF_VIEWS,), out_axes=AXES_OF_VIEWS)(
+            views._replace(rows=rows)
+        )
         outputs, num_pairs = render_together(
             gaussians, seen.camera, dataclasses.replace(model, params=params).rule, views.background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
@@ -233,7 +235,7 @@ def differentiate_together(
         def of_view(gaussians: Gaussians, view: View, output: RenderOutput) -> tuple[Array, Any]:
             return loss(dataclasses.replace(model, gaussians=gaussians, params=params), view, output)
 
-        values, told = jax.vmap(of_view, in_axes=(0, VIEWS, 0))(gaussians, seen, outputs)
+        values, told = jax.vmap(of_view, in_axes=(0, AXES_OF_VIEWS, 0))(gaussians, seen, outputs)
         return jnp.sum(values), (values, told, num_pairs)
 
     copies: Gaussians = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_views, *x.shape)), model.gaussians)

@@ -384,16 +384,17 @@ class System:
         names = (self.option_of(event, "cap") for event in events)
         return tuple(dict.fromkeys(name for name in names if name is not None)) or ("initial_gaussians",)
 
-    def check_number(self, num: int, *, has_first_stage: bool = True) -> None:
-        """Refuse options that cannot be trained from this number of Gaussians.
-
-        Args:
-          num: number of Gaussians at the start.
-          has_first_stage: whether the first stage is trained; without it their number does not grow before textures.
+    def check_number(self, num: int) -> None:
+        """Refuse options that cannot be trained from this number of Gaussians at the start.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
+
+    def check_given_number(self, num: int) -> None:
+        """Do what `check_number` does, for Gaussians of a file in place of the first stage. It calls that unless
+        overridden."""
+        self.check_number(num)
 
     def _check_numbers(self) -> None:
         """Refuse numbers that are not finite or outside the range of an option that every system has."""

@@ -99,7 +99,7 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
     if num_given is None:
         with system.naming_options():
             _rows_needed(system.stages()[0], num, system)
-    system.check_number(num, has_first_stage=num_given is None)
+    (system.check_number if num_given is None else system.check_given_number)(num)
     if any(stage.has_depths for stage in system.stages()):
         check_depths(scene.train)
     if system.sky_gaussians:

@@ -202,8 +202,8 @@ class BatchGradients(NamedTuple):
     num_pairs: Array
     is_overflow: Array
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
-    """Gradients in the Gaussians, the appearance parameters, and the view's row of each correction. Those of
-    parameters are of rounds of views, whose mean each is."""
+    """Gradients in the Gaussians, the appearance parameters, and the view's row of each correction. Where G views are
+    drawn at once, those in parameters are [V/G, ...], each a mean over G views."""
     statistic: Array | None
     """[V, N, 4]."""
 
@@ -239,10 +239,10 @@ def _gradients(
         error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
         return value, (error, output.overflow)
 
-    def gradients_by(differentiate: Callable[..., Differentiated], arrays: tuple[Any, ...]) -> BatchGradients:
+    def gradients_by(derivative: Callable[..., Differentiated], arrays: tuple[Any, ...]) -> BatchGradients:
         viewmat, K, background, rows, pictures = arrays
         view = View(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
-        found = differentiate(loss, model, view, settings.render, **options)
+        found = derivative(loss, model, view, settings.render, **options)
         error, overflow = found.told
         grads = found.gaussians, found.params, found.rows
         return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
