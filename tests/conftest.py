@@ -57,13 +57,6 @@ def x64():
 
 
 @pytest.fixture
-def kept_programs(tmp_path_factory, monkeypatch):
-    """Lets processes that are started one after another share what they compile."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("programs")))
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.02")
-
-
-@pytest.fixture
 def shared():
     """The folder of real scenes and LPIPS weights; the test is skipped where it is absent."""
     if not SHARED.is_dir():

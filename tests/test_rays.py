@@ -19,6 +19,7 @@ from a2tg_jax.core.cameras import Camera, looking, resize_camera
 from a2tg_jax.data.scene import kinds_of
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import pairs_of_view
+from a2tg_jax.rasterize.exchange import Exchange
 from a2tg_jax.systems.stage1 import PruneConfig
 from a2tg_jax.training.batches import check_lenses
 from a2tg_jax.training.loop import StageRun
@@ -257,7 +258,7 @@ def test_one_device_trains_through_lenses(kept):
     check_lenses(kept.train, 1)
     with pytest.raises(ValueError, match=r"keeps its lens, .*: leave out --devices .* --lens undistort"):
         check_lenses(kept.train, 2)
-    session = SimpleNamespace(exchange=SimpleNamespace(num=2))
+    session = SimpleNamespace(exchange=Exchange(SimpleNamespace(size=2)))
     with pytest.raises(ValueError, match="--devices"):
         StageRun(kept, a2tg.Gaussians2dMcmc(), 0, None, session=session)
 
