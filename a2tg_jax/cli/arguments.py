@@ -14,6 +14,7 @@ from tyro.conf import arg
 
 from a2tg_jax.cli.errors import UNRECOGNIZED, plain, told_unknown, unknown_words
 from a2tg_jax.cli.values import registry
+from a2tg_jax.host.urls import is_url, without_secrets
 
 Parsed = TypeVar("Parsed")
 
@@ -47,6 +48,13 @@ def flag_with_value(name: str, value: Any) -> str:
         return flag_of(name if value else f"{group}{dot}no_{own}")
     words = value if isinstance(value, list | tuple) else [value]
     return shlex.join([flag_of(name), *map(str, words)])
+
+
+def check_path(text: str) -> None:
+    """Raise ValueError if a path is a URL, which would name a folder of this machine."""
+    if is_url(text):
+        told = without_secrets(text)
+        raise ValueError(f"{told}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
 def with_flags(message: str, arguments: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, TextIO
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import defaulting_to, parse, with_flags
+from a2tg_jax.cli.arguments import check_path, defaulting_to, parse, with_flags
 from a2tg_jax.cli.convert import Convert
 from a2tg_jax.cli.doctor import Doctor
 from a2tg_jax.cli.download import Download
@@ -25,9 +25,9 @@ from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.host import signals
-from a2tg_jax.host.remote_files import is_url
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
+from a2tg_jax.host.urls import is_url
 from a2tg_jax.results.compression import compress, compression_text
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
@@ -218,9 +218,10 @@ def _parse(name: str, arguments: list[str]) -> Command:
 def _check_urls(arguments: Sequence[str], command: Command) -> None:
     """Raise ValueError for a URL that is not the scene to train; as a path it would name a folder of this machine."""
     values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments]
+    paths = [value for value in vars(command).values() if isinstance(value, Path)]
     for url in filter(is_url, values):
-        if url != getattr(command, "scene", None):
-            raise ValueError(f"{url}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
+        if url != getattr(command, "scene", None) or Path(url) in paths:
+            check_path(url)
 
 
 def _show_warning(

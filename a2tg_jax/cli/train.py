@@ -11,7 +11,7 @@ import jax
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from a2tg_jax.cli.arguments import defaulting_to, flag_of, flag_with_value
+from a2tg_jax.cli.arguments import check_path, defaulting_to, flag_of, flag_with_value
 from a2tg_jax.cli.place import HEARTBEAT_TIMEOUT, place_of
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.core.display import counted
@@ -272,6 +272,8 @@ def train_defaults(arguments: list[str]) -> Train:
     path = _value_of("--config", arguments)
     system, preset = _value_of("--system", arguments), _value_of("--preset", arguments)
     out = _value_of("--out", arguments)
+    check_path(path)
+    check_path(out)
     if out and "--resume" in arguments and "--overwrite" not in arguments:
         # Several processes read the folder at a time; the first one claims it later.
         is_alone = not _value_of("--coordinator", arguments)

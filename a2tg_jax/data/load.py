@@ -19,7 +19,7 @@ from a2tg_jax.data.scene import Scene, check_test_every, warn_of_lenses
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.remote_files import is_remote, located, reach
+from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, located
 from a2tg_jax.host.text import as_argument
 
 NO_SCENE_FILE = (
@@ -34,7 +34,7 @@ NO_REMOTE_SCENE = (
 
 
 def load_scene(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | RemotePath,
     *,
     downscale: int = 1,
     test_every: int = 8,
@@ -132,9 +132,9 @@ def _loader(path: Path) -> Callable[..., Scene] | None:
 
 def _load_remote(path: Path, options: dict[str, Any]) -> Scene:
     """Load a scene from object storage."""
-    is_json = path.suffix.lower() == ".json"
-    reach(path.parent if is_json else path)
-    if is_json:
+    suffix = path.suffix.lower()
+    check_reachable(path.parent if suffix in (".json", ".xml") else path)
+    if suffix == ".json":
         return load_transforms(path, **options)
     if (load := _loader(path)) is not None:
         return load(**options)

@@ -290,9 +290,10 @@ def assemble_scene(
     )
 
 
-def scene_name(folder: Path) -> str:
-    """Return the end of a folder's path, from the last name that tells more than "scene" or "colmap" does."""
-    parts = ("", *str(folder).split("/")[2:]) if is_remote(folder) else folder.resolve().parts
+def scene_name(folder: Path | str) -> str:
+    """Return the end of a folder's path or URL, from the last name that tells more than "scene" or "colmap" does."""
+    is_url = isinstance(folder, str) or is_remote(folder)
+    parts = ("", *str(folder).split("/")[2:]) if is_url else Path(folder).resolve().parts
     told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
     return "/".join(parts[told[-1] if told else -1 :])
 

@@ -73,7 +73,7 @@ def _open_remote(path: Path, most_bytes: int) -> BufferedReader:
     size = remote_size(path)
     if size is not None and size > most_bytes:
         raise ValueError(_too_large(path, size, most_bytes))
-    return fetched(path, size)
+    return fetched(path, size, most_bytes)
 
 
 def _refusal(path: str | os.PathLike[str]) -> str:

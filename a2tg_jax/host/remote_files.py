@@ -7,25 +7,25 @@ listed once, and files are fetched whole. What fails is tried again.
 import errno
 import functools
 import os
-import re
 import tempfile
 import threading
 import time
-import urllib.parse
-import urllib.request
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import IO, Any, NamedTuple, Protocol, TypeVar, cast
 
 from a2tg_jax.host.text import shortened
+from a2tg_jax.host.urls import checked_url, path_here
 
 PAUSES = (1.0, 4.0, 15.0)
 """Seconds between the attempts to read something."""
 PIECE = 1 << 26
 """Largest number of bytes of one request."""
-URL = re.compile(r"[A-Za-z][\w+.:-]+://")
+LIBRARIES = ("s3fs", "gcsfs", "adlfs", "paramiko", "aiohttp")
+"""Libraries of stores whose packages have their modules' names."""
 FINAL = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, NotImplementedError)
 """Errors that another attempt does not mend."""
 
@@ -36,50 +36,51 @@ class Unreachable(OSError):
     """Error of a store that does not answer, or does not give what it is asked for."""
 
 
-class Entry(NamedTuple):
-    """File or folder in a listing."""
+class RemotePath(Protocol):
+    """Path of universal_pathlib (`UPath`)."""
 
-    is_file: bool
+    @property
+    def fs(self) -> Any:
+        """File system of fsspec."""
+
+    @property
+    def path(self) -> str:
+        """Path in the file system."""
+
+
+class Entry(NamedTuple):
+    """File, folder or link in a listing."""
+
+    kind: str
+    """ "file", "directory", "link", or another word of fsspec's."""
     size: int | None
     """Number of bytes; None if the store does not tell it."""
 
 
 Listing = dict[str, Entry]
-_listings: dict[tuple[Any, str], Listing] = {}
+_listings: dict[tuple[Any, str], "Future[Listing]"] = {}
 """Listings of folders, by file system and path."""
 _lock = threading.Lock()
 
 
-def is_url(text: str) -> bool:
-    """Return whether a text is a URL, such as s3://bucket/scene."""
-    return URL.match(text) is not None
-
-
-def is_remote(path: str | os.PathLike[str]) -> bool:
+def is_remote(path: str | os.PathLike[str] | RemotePath) -> bool:
     """Return whether a path is one of universal_pathlib that the operating system does not know."""
     return not isinstance(path, str | os.PathLike)
 
 
-def located(path: str | os.PathLike[str]) -> Path:
+def located(path: str | os.PathLike[str] | RemotePath) -> Path:
     """Return the path that a text means: of universal_pathlib for a URL, but of this machine for file://.
 
     Raises:
-      ValueError: if a library is missing, fsspec does not know the protocol, or the URL has a password.
+      ValueError: if it is no path, a library is missing, fsspec does not know the protocol, or the URL has a secret.
     """
-    if is_remote(path):
-        return cast(Path, path)
-    text = os.fspath(path)
-    if not is_url(text):
-        return Path(path)
-    parts = urllib.parse.urlsplit(text)
-    if parts.scheme == "file":
-        return Path(urllib.request.url2pathname(parts.path))
-    if parts.password is not None:
-        raise ValueError(
-            f"{text.replace(parts.password, '…')}: has a password, which the run folder would keep; leave it out, and "
-            "give it in fsspec's configuration (~/.config/fsspec)"
-        )
-    return _of_store(text.rstrip("/"))
+    if isinstance(path, str | os.PathLike):
+        text = os.fspath(path)
+        here = path_here(text)
+        return _of_store(checked_url(text)) if here is None else here
+    if not (hasattr(type(path), "fs") and hasattr(type(path), "path")):
+        raise ValueError(f"path must be a path, a URL, or a UPath of universal_pathlib; got {path!r}")
+    return cast(Path, path)
 
 
 def _of_store(url: str) -> Path:
@@ -90,16 +91,17 @@ def _of_store(url: str) -> Path:
         raise ValueError(f"{url}: a URL needs universal_pathlib: pip install 'a2tg-jax[remote]'") from None
     try:
         path = UPath(url)
-        _ = path.fs
+        _ = path.fs, path.path
     except ImportError as error:
-        package = getattr(error.__cause__ or error, "name", None) or "its library"
-        raise ValueError(f"{url}: {error}: pip install {package}") from None
+        package = getattr(error.__cause__ or error, "name", None)
+        advice = f": pip install {package}" if package in LIBRARIES else ""
+        raise ValueError(f"{url}: {error}{advice}") from None
     except Exception as error:  # what file systems raise when they are made
         raise ValueError(f"{url}: cannot be opened ({_reason(error)})") from None
     return cast(Path, path)
 
 
-def reach(folder: Path) -> None:
+def check_reachable(folder: Path) -> None:
     """List a folder anew, in one attempt, so that a mistake in a URL or in credentials is told at once.
 
     Raises:
@@ -113,9 +115,9 @@ def reach(folder: Path) -> None:
 
 
 def is_remote_file(path: Path) -> bool:
-    """Return whether a file is listed in its folder."""
-    entry = _listed(path.parent).get(path.name)
-    return entry is not None and entry.is_file
+    """Return whether a file is listed in its folder. Links are followed."""
+    entry = _entry(path)
+    return entry is not None and entry.kind == "file"
 
 
 def is_remote_folder(path: Path) -> bool:
@@ -129,27 +131,30 @@ def remote_size(path: Path) -> int | None:
     Raises:
       FileNotFoundError: if it is not listed in its folder.
     """
-    entry = _listed(path.parent).get(path.name)
-    if entry is None or not entry.is_file:
+    entry = _entry(path)
+    if entry is None or entry.kind != "file":
         raise _missing(path)
     return entry.size
 
 
-def fetched(path: Path, size: int | None) -> BufferedReader:
+def fetched(path: Path, size: int | None, most_bytes: int) -> BufferedReader:
     """Return an open temporary file with the bytes of a remote one. It has no name, and goes when it is closed.
 
     Args:
       path: the remote file.
-      size: its number of bytes; None: unknown.
+      size: its number of bytes as listed, which need not be true; None: unknown.
+      most_bytes: size above which it is refused.
 
     Raises:
       OSError: naming the file, if it has gone, may not be read, or cannot be after all attempts (`Unreachable`).
+      ValueError: naming the file, if it is larger.
     """
-    ranges = [(None, None)] if size is None or size <= PIECE else [(at, at + PIECE) for at in range(0, size, PIECE)]
     file = tempfile.TemporaryFile()  # noqa: SIM115 - the caller closes it
     try:
-        for start, end in ranges:
-            file.write(_tried(path, functools.partial(_piece, path, start, end)))
+        if not size or not _is_filled(file, path, size):
+            _tried(path, functools.partial(_stream, path, file, most_bytes))
+        if file.tell() > most_bytes:
+            raise ValueError(f"{path}: has more than {most_bytes:,} bytes, the most that such a file may have")
     except BaseException:
         file.close()
         raise
@@ -157,19 +162,78 @@ def fetched(path: Path, size: int | None) -> BufferedReader:
     return cast(BufferedReader, file)
 
 
-def _piece(path: Any, start: int | None, end: int | None) -> bytes:
+def _is_filled(file: IO[bytes], path: Path, size: int) -> bool:
+    """Write a file of a listed size in pieces, and return whether it has no more bytes. The last piece asks for one."""
+    for start in range(0, size, PIECE):
+        end = start + PIECE if start + PIECE < size else size + 1
+        file.write(_tried(path, functools.partial(_piece, path, start, end)))
+    return file.tell() <= size
+
+
+def _piece(path: Any, start: int, end: int) -> bytes:
     data: bytes = path.fs.cat_file(path.path, start=start, end=end)
     return data
 
 
+def _stream(path: Any, file: IO[bytes], most_bytes: int) -> None:
+    """Write a file of unknown size in pieces, up to the first one beyond the bound."""
+    file.seek(0)
+    file.truncate()
+    with path.fs.open(path.path, "rb") as source:
+        while file.tell() <= most_bytes and (data := source.read(min(PIECE, most_bytes + 1 - file.tell()))):
+            file.write(data)
+
+
+def _entry(path: Path) -> Entry | None:
+    """Return what is listed of a path, or what a link leads to; None if there is nothing."""
+    listing = _listed(path.parent)
+    entry = listing.get(path.name)
+    if entry is not None and entry.kind == "link":
+        entry = listing[path.name] = _target(path)
+    return entry
+
+
+def _target(path: Any) -> Entry:
+    try:
+        found = _tried(path, functools.partial(path.fs.info, path.path))
+    except FileNotFoundError:
+        return Entry("nothing", None)
+    return Entry(found["type"], found.get("size"))
+
+
 def _listed(folder: Path, pauses: tuple[float, ...] | None = None) -> Listing:
-    """Return the files and folders in a folder, by name, from its first listing; nothing if there is no such folder."""
+    """Return the files and folders in a folder, by name, from its first listing; nothing if there is no such folder.
+
+    Other threads that want the same folder wait for this listing.
+    """
     place = cast(Any, folder)
-    key = place.fs, place.path
     with _lock:
-        if key not in _listings:
-            _listings[key] = _tried(folder, functools.partial(_list, place), pauses)
-        return _listings[key]
+        listing = _listings.get(_key(place))
+        if is_first := listing is None:
+            listing = _listings[_key(place)] = Future()
+    assert listing is not None
+    if is_first:
+        try:
+            is_told = _may_exist(place)
+            listing.set_result(_tried(folder, functools.partial(_list, place), pauses) if is_told else {})
+        except BaseException as error:
+            with _lock:
+                _listings.pop(_key(place), None)
+            listing.set_exception(error)
+    return listing.result()
+
+
+def _key(folder: Any) -> tuple[Any, str]:
+    return folder.fs, folder.path.rstrip("/")
+
+
+def _may_exist(folder: Any) -> bool:
+    """Return False if a folder lies below a listed one, and is in no listing itself. Some stores refuse to list it."""
+    if ".." in folder.parts:
+        return True
+    with _lock:
+        is_below = any(_key(parent) in _listings for parent in folder.parents if _key(parent) != _key(folder))
+    return not is_below or folder.name in _listed(folder.parent)
 
 
 def _list(folder: Any) -> Listing:
@@ -179,7 +243,7 @@ def _list(folder: Any) -> Listing:
     except (FileNotFoundError, NotADirectoryError):
         return {}
     return {
-        name.rpartition("/")[2]: Entry(entry["type"] == "file", entry.get("size"))
+        name.rpartition("/")[2]: Entry(entry["type"], entry.get("size"))
         for name, entry in found
         if name.strip("/") != own
     }

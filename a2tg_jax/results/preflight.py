@@ -9,7 +9,7 @@ from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.remote_files import is_url
+from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import format_of
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model

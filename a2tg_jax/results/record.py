@@ -27,8 +27,8 @@ from a2tg_jax.data.scene import scene_name, with_validation_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.remote_files import is_url, located
 from a2tg_jax.host.text import shortened
+from a2tg_jax.host.urls import checked_url, is_url, path_here
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.results.finish_options import read_finish
 from a2tg_jax.results.folder import RunFolder
@@ -72,8 +72,10 @@ class SceneSource:
     @property
     def name(self) -> str:
         """Name of the scene in titles."""
-        path = Path(self.path)
-        return SYNTHETIC if self.path == SYNTHETIC else scene_name(path.parent if path.suffix == ".json" else path)
+        if self.path == SYNTHETIC:
+            return SYNTHETIC
+        folder = os.path.dirname(self.path) if Path(self.path).suffix == ".json" else self.path
+        return scene_name(folder if is_url(folder) else Path(folder))
 
     def load(self, room: int | None = None) -> Scene:
         """Return the scene in its normalised world.
@@ -243,10 +245,12 @@ def scene_place(scene: str, folder: Path = Path()) -> str:
     Args:
       scene: URL or path; file:// is a path.
       folder: folder that a relative path starts from.
+
+    Raises:
+      ValueError: if a URL holds a secret, or names no place.
     """
-    if is_url(scene) and not scene.startswith("file://"):
-        return scene.rstrip("/")
-    return os.path.realpath(folder / located(scene))  # Also of links in a circle.
+    here = path_here(scene)
+    return checked_url(scene) if here is None else os.path.realpath(folder / here)  # Also of links in a circle.
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
