@@ -16,7 +16,7 @@ MOST_MEGABYTES = 300
 
 
 def test_changed_files_are_read_or_refused(tmp_path):
-    """By a worker that is started again after it did not answer, and after it ended."""
+    """The worker that reads them is restarted when it hangs and when it crashes."""
     worker = fuzz.Worker(tmp_path)
     try:
         worker.start()

@@ -148,7 +148,7 @@ def fox(distorted, store):
 
 @pytest.mark.parametrize("share", [0.0, 1e-12, 0.5])
 def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, monkeypatch, fox, share):
-    """What is undistorted goes to disk up to a share of it, and is fetched and undistorted again beyond."""
+    """Undistorted photographs fill a share of the disk; those beyond it are fetched and undistorted again."""
     monkeypatch.setattr(photo_store, "SHARE_OF_DISK", share)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(photo_store.shutil, "disk_usage", lambda folder: SimpleNamespace(free=3 * 38 * 30 * 3 * 10**12))
@@ -164,7 +164,7 @@ def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, monkeyp
 
 
 def test_photographs_are_fetched_ahead_of_the_step(monkeypatch, fox, store):
-    """As many at a time as there are batches ahead, however few cores there are."""
+    """Each batch that is prepared ahead has a thread, even on one core."""
     monkeypatch.setenv("A2TG_NUM_THREADS", "1")
     views = load().train
     store.seconds = 0.05
@@ -215,7 +215,7 @@ def listed_as(monkeypatch, **told):
 
 @pytest.mark.parametrize("size", [None, 0, 7, 600])
 def test_the_bound_of_a_file_holds_whatever_its_store_lists(store, monkeypatch, size):
-    """What is read at a time is bounded too."""
+    """No single request exceeds the bound either."""
     monkeypatch.setattr(remote_files, "PIECE", 200)
     store.fs.pipe_file(f"{ROOT}/file", bytes(500))
     listed_as(monkeypatch, size=size)
