@@ -83,8 +83,8 @@ def travel_of_view(
     """Return the rows that a device of `settings.exchange` must be able to send to another one in a view, and the room
     for the borders between bands (host)."""
     camera = finer(camera, settings.supersample)
-    rows, borders = jax.device_get(_jitted_travel()(gaussians, camera, rule, settings, num_live))
-    return int(rows), BorderRoom(*borders.tolist())
+    rows, above, below = map(int, _jitted_travel()(gaussians, camera, rule, settings, num_live))
+    return rows, BorderRoom(above, below)
 
 
 @functools.cache

@@ -178,8 +178,10 @@ class Travel(NamedTuple):
 
     rows: Array
     """Largest number of rows that a device sends to another one."""
-    borders: Array
-    """[2] room for the borders, as `BorderRoom` has it."""
+    above: Array
+    """Rows of pixels by which borders move up."""
+    below: Array
+    """Rows of pixels by which they move down."""
 
 
 def travel(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid) -> Travel:
@@ -195,7 +197,7 @@ def travel(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid:
     boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), grid)
     borders = bands.borders(bands.pairs_of_rows(boxes))
     reached = bands.reached(boxes, borders).reshape(bands.num, exchange.num, -1)
-    return Travel(jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32)), bands.room_for(borders))
+    return Travel(jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32)), *bands.room_for(borders))
 
 
 class _Room(NamedTuple):
