@@ -1,0 +1,209 @@
+"""Training with rounding: its grids are those of the file, it makes up for rounding, and the loss stays in bounds."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_values import some_gaussians
+from test_compact import MODELS, SETTINGS, every_model, order_of
+from test_compaction import SCENE, a_model
+
+import a2tg_jax as a2tg
+from a2tg_jax.appearance import Shaped
+from a2tg_jax.finish import tuning
+from a2tg_jax.finish.compaction import Trial, loss_on_views
+from a2tg_jax.finish.rounding import GradualRounding, GridRounding, partly_rounded
+from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, smallest_tuned, tune_compact
+from a2tg_jax.io.compact import GROUPS, CompactChoices, decode_model, encode_model, grids_of, half_turned
+from a2tg_jax.model import Model
+from a2tg_jax.training import DivergedError
+
+COARSE = CompactChoices(
+    means=14, log_scales=4, quats=4, opacities=3, sh_0=4, sh_rest=3, texels=3, shapes=3, coder="none"
+)
+SYSTEM = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", sh_degree=0)
+FINE = CompactChoices().keeping(dict.fromkeys(GROUPS, 16))
+round_to = jax.jit(lambda rounding, model: rounding(model))
+
+
+def moved(model: Model, size: float = 0.05) -> Model:
+    """The model with other numbers, some of them beyond the ends of its grids."""
+    rng = np.random.default_rng(3)
+    return model.with_parameters(
+        jax.tree.map(lambda x: x + size * jnp.asarray(rng.normal(size=x.shape), x.dtype), model.parameters)
+    )
+
+
+def arrays_of(model: Model) -> dict[str, np.ndarray]:
+    own = {field.name: getattr(model.gaussians, field.name) for field in dataclasses.fields(model.gaussians)}
+    return {name: np.asarray(x) for name, x in (own | model.appearance.arrays(model.params, model.layout)).items()}
+
+
+def assert_same(found: Model, wanted: Model) -> None:
+    for name, values in arrays_of(found).items():
+        np.testing.assert_allclose(values, arrays_of(wanted)[name], rtol=2e-5, atol=2e-6, err_msg=name)
+
+
+@every_model
+def test_training_and_the_file_round_alike(name):
+    """Also numbers that training has moved, beyond the ends of the grids too."""
+    start = half_turned(MODELS[name]())
+    grids = grids_of(start, COARSE)
+    changed = moved(start)
+    rounded = round_to(GridRounding.to(grids, COARSE), changed)
+    assert encode_model(changed, COARSE, grids) == encode_model(rounded, COARSE, grids)
+    found = decode_model(encode_model(rounded, COARSE, grids))
+    assert_same(found, rounded[order_of(rounded, found)])
+    camera = start.origin.cameras[0]
+    images = [np.asarray(one.render(camera, settings=SETTINGS).color) for one in (found, rounded, changed)]
+    assert np.abs(images[0] - images[1]).max() < 2e-4 < np.abs(images[1] - images[2]).max()
+
+
+def test_own_grids_are_those_of_a_file_without():
+    start = half_turned(MODELS["banded, shaped and textured"]())
+    assert encode_model(start, COARSE, grids_of(start, COARSE)) == encode_model(start, COARSE)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float16"])
+def test_groups_kept_as_floats_are_not_rounded(precision):
+    start = half_turned(MODELS["banded, shaped and textured"]())
+    choices = CompactChoices().keeping(dict.fromkeys(GROUPS, precision))
+    grids = grids_of(start, choices)
+    assert not grids
+    rounded = GridRounding.to(grids, choices)(start)
+    assert all(map(np.array_equal, jax.tree.leaves(rounded), jax.tree.leaves(start)))
+
+
+def test_numbers_are_rounded_one_after_the_other_and_stay():
+    start = half_turned(MODELS["banded, shaped and textured"]())
+    rounding = GridRounding.to(grids_of(start, COARSE), COARSE)
+    event = GradualRounding(rounding)
+    times = event.init(start)
+    wanted = round_to(rounding, start)
+    before: set[int] = set()
+    for share in (0.0, 0.3, 0.6, 1.0):
+        is_rounded = jax.tree.map(lambda time, share=share: time < share, times)
+        found = jax.jit(partly_rounded)(rounding, moved(start, 1e-4), is_rounded)
+        same = jnp.concatenate(
+            [
+                jnp.isclose(a, b, rtol=1e-5, atol=1e-6).reshape(-1)
+                for a, b in zip(jax.tree.leaves(found.gaussians), jax.tree.leaves(wanted.gaussians), strict=True)
+            ]
+        )
+        on_grid = set(np.flatnonzero(same).tolist())
+        assert len(before - on_grid) <= 0.02 * len(same)  # w of quaternions moves along with their other numbers.
+        assert abs(len(on_grid) / len(same) - share) < 0.15
+        before = on_grid
+    assert_same(found, round_to(rounding, moved(start, 1e-4)))
+
+
+@functools.cache
+def trained_model() -> Model:
+    """A model that has learned; 16 bits round next to nothing."""
+    return tune_compact(a_model(), SCENE, SYSTEM, FINE, iterations=2000).model
+
+
+@functools.cache
+def tuned_model(choices: CompactChoices = COARSE) -> Tuned:
+    return tune_compact(trained_model(), SCENE, SYSTEM, choices, iterations=600)
+
+
+def test_tuning_makes_up_for_rounding():
+    """It ends well above the same training whose result is rounded afterwards, and below the one without rounding."""
+    fine = tuned_model(FINE).model
+    loss = loss_on_views(fine, SCENE.train)
+    lost, untuned = loss(tuned_model().model), loss(decode_model(encode_model(fine, COARSE)))
+    print(lost, untuned)
+    assert untuned > 0.2 and 0 < lost < 0.7 * untuned
+    assert tuned_model().model.origin == fine.origin == a_model().origin
+
+
+def test_the_file_holds_the_tuned_model():
+    found = tuned_model()
+    again = decode_model(found.data)
+    assert_same(again, found.model[order_of(found.model, again)])
+    loss = loss_on_views(found.model, SCENE.train)
+    assert abs(loss(again)) < 1e-4
+    rounded = round_to(GridRounding.to(found.grids, found.choices), found.model)
+    assert_same(rounded, found.model)
+
+
+def test_save_compact_writes_the_tuned_model(tmp_path):
+    found = tuned_model()
+    a2tg.save_compact(tmp_path / "scene.a2tgz", found.model, choices=found.choices, grids=found.grids)
+    assert (tmp_path / "scene.a2tgz").read_bytes() == found.data
+
+
+def test_a_diverged_tuning_is_an_error():
+    spoiled = dataclasses.replace(SYSTEM, rates=dataclasses.replace(SYSTEM.rates, log_scales=1e30))
+    with pytest.raises(DivergedError, match="stage tuning"):
+        tune_compact(a_model(), SCENE, spoiled, COARSE, iterations=3)
+
+
+@pytest.mark.parametrize(
+    ("model", "iterations", "words"),
+    [
+        (a_model(), 0, "iterations must be at least 1; got 0"),
+        (Model(some_gaussians(), *Shaped().allocate(jax.random.key(0), some_gaussians()), appearance=Shaped()), 5,
+         "model must show what the last stage of the system, .gaussians., trains: Plain.*; it shows Shaped"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_tuned_is_refused(model, iterations, words):
+    with pytest.raises(ValueError, match=words):
+        tune_compact(model, SCENE, SYSTEM, COARSE, iterations=iterations)
+
+
+# The search
+
+
+def search(monkeypatch, loss_after, max_loss=0.05):
+    """Tolerances tried, the file kept and the files tried, if tuning takes a loss away."""
+    tolerances, started = [], []
+
+    def within(model, losses, tolerance, trials):
+        tolerances.append(tolerance)
+        return Trial(CompactChoices(means=16 - len(tolerances)), 0, (tolerance,))
+
+    class File(Tuned):
+        data = property(lambda self: b"0" * round(100 / tolerances[self.choices.means * -1 + 15]))
+
+    def tune(model, choices):
+        started.append(model)
+        return File(f"after {tolerances[-1]}", choices, {})
+
+    def measured(found, losses):
+        return Trial(found.choices, len(found.data), (loss_after(tolerances[-1]),))
+
+    monkeypatch.setattr(tuning, "smallest_within", within)
+    monkeypatch.setattr(tuning, "_measured", measured)
+    tried, best = smallest_tuned("model", [], max_loss, [], tune)
+    return tolerances, tried, best, started
+
+
+def test_the_search_doubles_the_tolerance_and_then_halves_the_distance(monkeypatch):
+    tolerances, tried, best, started = search(monkeypatch, lambda before: 0.05 if before <= 1.5 else 0.3)
+    np.testing.assert_allclose(tolerances, [0.5, 1, 2, 2**0.5])
+    assert best.model == f"after {tolerances[-1]}" and len(tried) == MOST_TUNINGS
+    assert started == ["model", "after 0.5", "after 1.0", "after 1.0"]
+
+
+def test_a_search_in_which_nothing_stays_within_keeps_nothing(monkeypatch):
+    tolerances, tried, best, started = search(monkeypatch, lambda before: 0.051)
+    assert best is None and tolerances == sorted(tolerances, reverse=True) and min(tolerances) > 0.05
+    assert len(tried) == MOST_TUNINGS and set(started) == {"model"}
+
+
+def test_the_search_ends_at_the_coarsest_choices(monkeypatch):
+    choices = CompactChoices()
+    monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(choices, 0, (0.0,)))
+    monkeypatch.setattr(tuning, "_measured", lambda *a: Trial(choices, 7, (0.0,)))
+    tried, best = smallest_tuned("model", [], 0.05, [], lambda *a: Tuned("tuned", choices, {}))
+    assert len(tried) == 1 and best.model == "tuned"
+
+
+def test_coarser_choices_come_first():
+    assert all(list(steps) == sorted(steps) for steps in TUNED_LADDER.values())
+    assert all(set(steps) > set() and len(set(steps)) == len(steps) for steps in TUNED_LADDER.values())
