@@ -1,7 +1,6 @@
 """Compression of a model: the smallest compact file within a loss, and a table of the choices tried."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,10 +18,10 @@ from a2tg_jax.finish.compaction import (
     measure_choices,
     smallest_within,
 )
-from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, smallest_tuned, tune_compact
+from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, Tuned, smallest_tuned, tune_compact
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.compact import GROUPS, encode_model
+from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.rows import check_encodable
 from a2tg_jax.model import Model
@@ -138,9 +137,12 @@ def _tune(source: Path, run: RunFolder | None, scene: Scene | None, iterations: 
     if scene is None:
         raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
     plan = read_record(run).plan
-    return functools.partial(
-        tune_compact, scene=scene, system=plan[plan.main[-1]].system, iterations=iterations, progress=True
-    )
+    system = plan[plan.main[-1]].system
+
+    def tune(model: Model, choices: CompactChoices) -> Tuned:
+        return tune_compact(model, scene, system, choices, iterations=iterations, progress=True)
+
+    return tune
 
 
 def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
