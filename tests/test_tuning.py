@@ -159,22 +159,19 @@ def test_what_cannot_be_tuned_is_refused(model, iterations, words):
 
 
 def search(monkeypatch, loss_after, max_loss=0.05):
-    """Tolerances tried, the file kept and the files tried, if tuning takes a loss away."""
+    """Tolerances tried, files tried, the one kept and the models started from, if tuning changes a loss so."""
     tolerances, started = [], []
 
     def within(model, losses, tolerance, trials):
         tolerances.append(tolerance)
-        return Trial(CompactChoices(means=16 - len(tolerances)), 0, (tolerance,))
-
-    class File(Tuned):
-        data = property(lambda self: b"0" * round(100 / tolerances[self.choices.means * -1 + 15]))
+        return Trial(CompactChoices(means=max(16 - len(tolerances), 1)), 0, (tolerance,))
 
     def tune(model, choices):
         started.append(model)
-        return File(f"after {tolerances[-1]}", choices, {})
+        return Tuned(f"after {tolerances[-1]}", choices, {})
 
     def measured(found, losses):
-        return Trial(found.choices, len(found.data), (loss_after(tolerances[-1]),))
+        return Trial(found.choices, round(1000 / tolerances[-1]), (loss_after(tolerances[-1]),))
 
     monkeypatch.setattr(tuning, "smallest_within", within)
     monkeypatch.setattr(tuning, "_measured", measured)
@@ -189,13 +186,25 @@ def test_the_search_doubles_the_tolerance_and_then_halves_the_distance(monkeypat
     assert started == ["model", "after 0.5", "after 1.0", "after 1.0"]
 
 
+def test_the_search_begins_beyond_a_large_loss(monkeypatch):
+    tolerances, _, best, _ = search(monkeypatch, lambda before: before / 2, max_loss=1.5)
+    np.testing.assert_allclose(tolerances, [3, 6, 18**0.5, (3 * 18**0.5) ** 0.5])
+    assert best.model == "after 3.0"
+
+
+def test_a_larger_file_is_not_kept(monkeypatch):
+    _, tried, best, _ = search(monkeypatch, lambda before: 0.0 if before < 0.6 else 1.0)
+    assert [trial.losses[0] for trial in tried] == [0, 1, 1, 0]
+    assert best.model == "after " + str((0.5 * 0.5**0.5) ** 0.5)
+
+
 def test_a_search_in_which_nothing_stays_within_keeps_nothing(monkeypatch):
     tolerances, tried, best, started = search(monkeypatch, lambda before: 0.051)
     assert best is None and tolerances == sorted(tolerances, reverse=True) and min(tolerances) > 0.05
     assert len(tried) == MOST_TUNINGS and set(started) == {"model"}
 
 
-def test_the_search_ends_at_the_coarsest_choices(monkeypatch):
+def test_no_choices_are_tuned_twice(monkeypatch):
     choices = CompactChoices()
     monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(choices, 0, (0.0,)))
     monkeypatch.setattr(tuning, "_measured", lambda *a: Trial(choices, 7, (0.0,)))
@@ -205,4 +214,5 @@ def test_the_search_ends_at_the_coarsest_choices(monkeypatch):
 
 def test_coarser_choices_come_first():
     assert all(list(steps) == sorted(steps) for steps in TUNED_LADDER.values())
-    assert all(set(steps) > set() and len(set(steps)) == len(steps) for steps in TUNED_LADDER.values())
+    assert all(len(set(steps)) == len(steps) for steps in TUNED_LADDER.values())
+    assert set(TUNED_LADDER) == set(GROUPS)

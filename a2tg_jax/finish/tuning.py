@@ -5,6 +5,7 @@ training knew: it holds the tuned model to the last bit.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -22,6 +23,10 @@ RATE_OF_MEANS = 0.3
 """Factor of the means' learning rate, which has decayed by the time a model is finished."""
 FIRST_TOLERANCE = 0.5
 """Loss in dB before tuning that is tried first."""
+LEAST_TOLERANCE, LARGEST_TOLERANCE = 0.03, 30.0
+"""Losses in dB before tuning between which files are searched."""
+CLOSE = 1.1
+"""Ratio of a loss before tuning that was too large to one that was not below which the search ends."""
 MOST_TUNINGS = 4
 """Largest number of choices of bits that a model is tuned for."""
 COARSER: Mapping[str, tuple[int, ...]] = MappingProxyType(
@@ -152,25 +157,22 @@ def smallest_tuned(
     Returns:
       The files tried, and the smallest one within the loss; None if there is none.
     """
-    tried: list[Trial] = []
+    tried: dict[CompactChoices, Trial] = {}
     best: Tuned | None = None
-    known: set[CompactChoices] = set()
-    within, beyond, tolerance = max(max_loss, FIRST_TOLERANCE / 2**MOST_TUNINGS), 0.0, FIRST_TOLERANCE
-    while len(tried) < MOST_TUNINGS:
-        choices = smallest_within(model, losses, max(tolerance, max_loss), trials).choices
-        if choices in known:
-            break
-        known.add(choices)
-        found = tune(model if best is None else best.model, choices)
-        trial = _measured(found, losses)
-        tried.append(trial)
-        if trial.losses[0] <= max_loss:
+    within, beyond, tolerance = max(max_loss, LEAST_TOLERANCE), math.inf, max(FIRST_TOLERANCE, 2 * max_loss)
+    while len(tried) < MOST_TUNINGS and tolerance < LARGEST_TOLERANCE and beyond > CLOSE * within:
+        choices = smallest_within(model, losses, tolerance, trials).choices
+        if choices not in tried:
+            found = tune(model if best is None else best.model, choices)
+            tried[choices] = _measured(found, losses)
+            is_smaller = best is None or tried[choices].num_bytes < tried[best.choices].num_bytes
+            best = found if is_smaller and tried[choices].losses[0] <= max_loss else best
+        if tried[choices].losses[0] <= max_loss:
             within = tolerance
-            best = found if best is None or trial.num_bytes < len(best.data) else best
         else:
             beyond = tolerance
-        tolerance = (within * beyond) ** 0.5 if beyond else 2 * tolerance
-    return tried, best
+        tolerance = 2 * tolerance if beyond == math.inf else math.sqrt(within * beyond)
+    return list(tried.values()), best
 
 
 def _measured(found: Tuned, losses: Sequence[Loss]) -> Trial:
