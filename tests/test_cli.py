@@ -621,12 +621,12 @@ def test_compress_with_tuning(tiny_run, tmp_path, monkeypatch, capsys):
     run, *_ = tiny_run
     plain, tuned = tmp_path / "plain.a2tgz", tmp_path / "tuned.a2tgz"
     with monkeypatch.context() as patch:
-        patch.setattr(compression, "smallest_tuned", lambda *a: ([], None))
+        patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
         assert cli.main([*TUNE, str(run.path), "--out", str(plain), "--max-loss", "0.02"]) == 0
     capsys.readouterr()
     assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
     told, scene = capsys.readouterr().out, read_record(run).scene.load()
-    assert "then training for up to" in told and "\ntuned " in told
+    assert "then training up to" in told and "\ntuned " in told
     before, after = (
         evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
     )

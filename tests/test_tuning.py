@@ -159,7 +159,7 @@ def test_what_cannot_be_tuned_is_refused(model, iterations, words):
 
 
 def search(monkeypatch, loss_after, max_loss=0.05):
-    """Tolerances tried, files tried, the one kept and the models started from, if tuning changes a loss so."""
+    """Tolerances tried, what was found and the models started from, if tuning changes a loss so."""
     tolerances, started = [], []
 
     def within(model, losses, tolerance, trials):
@@ -168,48 +168,54 @@ def search(monkeypatch, loss_after, max_loss=0.05):
 
     def tune(model, choices):
         started.append(model)
-        return Tuned(f"after {tolerances[-1]}", choices, {})
+        return Tuned(f"after {tolerances[-1]:.2f}", choices, {})
 
     def measured(found, losses):
         return Trial(found.choices, round(1000 / tolerances[-1]), (loss_after(tolerances[-1]),))
 
     monkeypatch.setattr(tuning, "smallest_within", within)
     monkeypatch.setattr(tuning, "_measured", measured)
-    tried, best = smallest_tuned("model", [], max_loss, [], tune)
-    return tolerances, tried, best, started
+    return tolerances, smallest_tuned("model", [], max_loss, [], tune), started
 
 
-def test_the_search_doubles_the_tolerance_and_then_halves_the_distance(monkeypatch):
-    tolerances, tried, best, started = search(monkeypatch, lambda before: 0.05 if before <= 1.5 else 0.3)
+def test_the_search_doubles_the_tolerance_until_too_much_is_lost(monkeypatch):
+    tolerances, found, started = search(monkeypatch, lambda before: 0.05 if before <= 1.5 else 0.3)
     np.testing.assert_allclose(tolerances, [0.5, 1, 2, 2**0.5])
-    assert best.model == f"after {tolerances[-1]}" and len(tried) == MOST_TUNINGS
-    assert started == ["model", "after 0.5", "after 1.0", "after 1.0"]
+    assert found.tuned.model == "after 1.41" and found.chosen == found.tried[-1] and len(found.tried) == MOST_TUNINGS
+    assert started == ["model", "after 0.50", "after 1.00", "after 2.00"]
+
+
+def test_what_was_too_much_is_tried_again_after_more_training(monkeypatch):
+    left = iter([0.2, 0.0, 0.04, 0.3])
+    tolerances, found, _ = search(monkeypatch, lambda before: next(left))
+    np.testing.assert_allclose(tolerances, [0.5, 0.5**1.5, 0.5, 0.5**0.5])
+    assert found.tuned.model == "after 0.50" and found.chosen == found.tried[2]
 
 
 def test_the_search_begins_beyond_a_large_loss(monkeypatch):
-    tolerances, _, best, _ = search(monkeypatch, lambda before: before / 2, max_loss=1.5)
-    np.testing.assert_allclose(tolerances, [3, 6, 18**0.5, (3 * 18**0.5) ** 0.5])
-    assert best.model == "after 3.0"
+    tolerances, found, _ = search(monkeypatch, lambda before: before / 2, max_loss=1.5)
+    np.testing.assert_allclose(tolerances, [3, 6, 18**0.5, 3])
+    assert found.tuned.model == "after 3.00"
 
 
 def test_a_larger_file_is_not_kept(monkeypatch):
-    _, tried, best, _ = search(monkeypatch, lambda before: 0.0 if before < 0.6 else 1.0)
-    assert [trial.losses[0] for trial in tried] == [0, 1, 1, 0]
-    assert best.model == "after " + str((0.5 * 0.5**0.5) ** 0.5)
+    losses = iter([0.0, 1.0, 1.0, 0.0])
+    _, found, _ = search(monkeypatch, lambda before: next(losses))
+    assert found.chosen == found.tried[0] and found.tuned.model == "after 0.50"
 
 
 def test_a_search_in_which_nothing_stays_within_keeps_nothing(monkeypatch):
-    tolerances, tried, best, started = search(monkeypatch, lambda before: 0.051)
-    assert best is None and tolerances == sorted(tolerances, reverse=True) and min(tolerances) > 0.05
-    assert len(tried) == MOST_TUNINGS and set(started) == {"model"}
+    tolerances, found, _ = search(monkeypatch, lambda before: 0.401, max_loss=0.4)
+    np.testing.assert_allclose(tolerances, [0.8, 0.8 * 0.5**0.5, 0.4, 0.4])
+    assert found.chosen is None and found.tuned is None and len(found.tried) == MOST_TUNINGS
 
 
-def test_no_choices_are_tuned_twice(monkeypatch):
+def test_the_search_ends_at_the_coarsest_choices(monkeypatch):
     choices = CompactChoices()
     monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(choices, 0, (0.0,)))
     monkeypatch.setattr(tuning, "_measured", lambda *a: Trial(choices, 7, (0.0,)))
-    tried, best = smallest_tuned("model", [], 0.05, [], lambda *a: Tuned("tuned", choices, {}))
-    assert len(tried) == 1 and best.model == "tuned"
+    found = smallest_tuned("model", [], 0.05, [], lambda *a: Tuned("tuned", choices, {}))
+    assert len(found.tried) == 1 and found.tuned.model == "tuned"
 
 
 def test_coarser_choices_come_first():

@@ -116,8 +116,8 @@ class Compress:
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
     tune_iterations: int = 0
-    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. Up to 4 choices of
-    bits are tried so, each of which draws that many training views. 0: numbers are only rounded."""
+    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. It happens up to 4
+    times, for other bits each time. 0: numbers are only rounded."""
     overwrite: bool = False
     """Replace the file that --out names."""
 

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, Trial, smallest_within
@@ -23,12 +23,8 @@ RATE_OF_MEANS = 0.3
 """Factor of the means' learning rate, which has decayed by the time a model is finished."""
 FIRST_TOLERANCE = 0.5
 """Loss in dB before tuning that is tried first."""
-LEAST_TOLERANCE, LARGEST_TOLERANCE = 0.03, 30.0
-"""Losses in dB before tuning between which files are searched."""
-CLOSE = 1.1
-"""Ratio of a loss before tuning that was too large to one that was not below which the search ends."""
 MOST_TUNINGS = 4
-"""Largest number of choices of bits that a model is tuned for."""
+"""Largest number of times that a model is tuned."""
 COARSER: Mapping[str, tuple[int, ...]] = MappingProxyType(
     {
         "means": (8, 9),
@@ -138,14 +134,25 @@ def _check(model: Model, stage: Stage, iterations: int) -> None:
         )
 
 
+class TunedFiles(NamedTuple):
+    """Result of `smallest_tuned`."""
+
+    tried: list[Trial]
+    """All files of tuned models."""
+    chosen: Trial | None = None
+    """The smallest one within the loss; None if there is none."""
+    tuned: Tuned | None = None
+    """The model of that file."""
+
+
 def smallest_tuned(
     model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial], tune: Tune
-) -> tuple[list[Trial], Tuned | None]:
+) -> TunedFiles:
     """Search the smallest file of a tuned model within a loss (host).
 
-    Choices that lose more before tuning are tried, up to `MOST_TUNINGS`: that loss is doubled while the tuned model
-    stays within `max_loss`, and otherwise lowered by half its distance to the last one that did, in the logarithm.
-    Each tuning goes on from the last one that stayed within.
+    Choices that lose more before tuning are tuned for, `MOST_TUNINGS` times. That loss is doubled as long as the tuned
+    model stays within `max_loss`; from the first time on that it does not, the loss falls or grows by a factor of √2.
+    Each tuning goes on from the one before, so that what was too much once may be tried again.
 
     Args:
       model: the model.
@@ -153,26 +160,24 @@ def smallest_tuned(
       max_loss: in dB, by the first measure, of the file of the tuned model beside `model`.
       trials: what `measure_choices` found, as with `TUNED_LADDER`.
       tune: tunes a model for choices.
-
-    Returns:
-      The files tried, and the smallest one within the loss; None if there is none.
     """
-    tried: dict[CompactChoices, Trial] = {}
-    best: Tuned | None = None
-    within, beyond, tolerance = max(max_loss, LEAST_TOLERANCE), math.inf, max(FIRST_TOLERANCE, 2 * max_loss)
-    while len(tried) < MOST_TUNINGS and tolerance < LARGEST_TOLERANCE and beyond > CLOSE * within:
+    found, latest = TunedFiles([]), model
+    tolerance, factor = max(FIRST_TOLERANCE, 2 * max_loss), 2.0
+    for _ in range(MOST_TUNINGS):
         choices = smallest_within(model, losses, tolerance, trials).choices
-        if choices not in tried:
-            found = tune(model if best is None else best.model, choices)
-            tried[choices] = _measured(found, losses)
-            is_smaller = best is None or tried[choices].num_bytes < tried[best.choices].num_bytes
-            best = found if is_smaller and tried[choices].losses[0] <= max_loss else best
-        if tried[choices].losses[0] <= max_loss:
-            within = tolerance
-        else:
-            beyond = tolerance
-        tolerance = 2 * tolerance if beyond == math.inf else math.sqrt(within * beyond)
-    return list(tried.values()), best
+        if found.chosen is not None and choices == found.chosen.choices:
+            break
+        tuned = tune(latest, choices)
+        trial, latest = _measured(tuned, losses), tuned.model
+        found.tried.append(trial)
+        if trial.losses[0] > max_loss:
+            factor = math.sqrt(2)
+            tolerance = max(tolerance / factor, max_loss)
+            continue
+        if found.chosen is None or trial.num_bytes < found.chosen.num_bytes:
+            found = found._replace(chosen=trial, tuned=tuned)
+        tolerance *= factor
+    return found
 
 
 def _measured(found: Tuned, losses: Sequence[Loss]) -> Trial:

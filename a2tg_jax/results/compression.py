@@ -18,7 +18,7 @@ from a2tg_jax.finish.compaction import (
     measure_choices,
     smallest_within,
 )
-from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, Tuned, smallest_tuned, tune_compact
+from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, Tuned, TunedFiles, smallest_tuned, tune_compact
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
@@ -103,22 +103,19 @@ def compress(
     trials = measure_choices(model, measures, ladder)
     chosen = smallest_within(model, measures, max_loss, trials)
     data = encode_model(model, chosen.choices)
-    tuned: list[Trial] = []
-    if tune is not None:
-        tuned, best = smallest_tuned(model, measures, max_loss, trials, tune)
-        if best is not None and len(best.data) < len(data):
-            data = best.data
-            chosen = next(trial for trial in tuned if trial.choices == best.choices)
+    found = TunedFiles([]) if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
+    if found.tuned is not None and found.chosen is not None and found.chosen.num_bytes < chosen.num_bytes:
+        data, chosen = found.tuned.data, found.chosen
     if run is not None and out == path.with_suffix(SUFFIX):
         run.own(out)
     with replacing(out) as temporary:
         temporary.write_bytes(data)
-    return Compressed(out, model, trials, chosen, tuple(losses), tuned)
+    return Compressed(out, model, trials, chosen, tuple(losses), found.tried)
 
 
 def _plan_told(ladder: Ladder, tune_iterations: int) -> str:
     """Return what there is to try, in words."""
-    tunings = f", then training for up to {MOST_TUNINGS} of them" if tune_iterations else ""
+    tunings = f", then training up to {MOST_TUNINGS} times" if tune_iterations else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
     return f"trying {ways}{tunings}; on a CPU this takes minutes"
 
