@@ -63,6 +63,8 @@ if TYPE_CHECKING:
     from a2tg_jax.finish.compaction import smallest_within as smallest_within
     from a2tg_jax.finish.polishing import polish as polish
     from a2tg_jax.finish.shrinking import shrink_textures as shrink_textures
+    from a2tg_jax.finish.tuning import Tuned as Tuned
+    from a2tg_jax.finish.tuning import tune_compact as tune_compact
     from a2tg_jax.host.cores import set_num_threads as set_num_threads
     from a2tg_jax.host.startup import configure_cpu as configure_cpu
     from a2tg_jax.io.compact import CompactChoices as CompactChoices
@@ -194,6 +196,7 @@ _NAMES = {
     "a2tg_jax.finish.compaction": ("loss_beside_renders", "loss_on_views", "measure_choices", "smallest_within"),
     "a2tg_jax.finish.polishing": ("polish",),
     "a2tg_jax.finish.shrinking": ("shrink_textures",),
+    "a2tg_jax.finish.tuning": ("Tuned", "tune_compact"),
     "a2tg_jax.host.cores": ("set_num_threads",),
     "a2tg_jax.host.startup": ("configure_cpu",),
     "a2tg_jax.io.compact": ("CompactChoices", "load_compact", "save_compact"),

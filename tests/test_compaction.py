@@ -93,7 +93,7 @@ def test_greed_takes_what_saves_most_for_its_loss_and_stays_within():
 
 
 def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(compression, "measure_choices", lambda *a: measure_choices(*a, SMALL))
+    monkeypatch.setattr(compression, "LADDER", SMALL)
     save_model(tmp_path / "scene.npz", a_model())
     assert cli.main(["compress", str(tmp_path / "scene.npz"), "--max-loss", "0.3"]) == 0
     text = capsys.readouterr().out
@@ -104,6 +104,13 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
     told = f"{tmp_path / 'scene.a2tgz'}: {in_bytes(size)} on disk, {part} of the model's numbers, 0."
     assert text.splitlines()[-1].startswith(told) and text.endswith(" dB of PSNR lost\n")
     assert "dB lost, if 30 dB" in text and "opacities 2 " in text and "texels" not in text
+
+
+def test_a_file_without_its_run_is_not_tuned(tmp_path, capsys):
+    save_model(tmp_path / "scene.npz", a_model())
+    assert cli.main(["compress", str(tmp_path / "scene.npz"), "--tune-iterations", "10"]) == 2
+    assert "--tune-iterations needs the photographs of a run folder" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.a2tgz"))
 
 
 @pytest.mark.parametrize(("ratio", "told"), [(7.9, "one eighth"), (1.2, "all"), (2.4, "half"), (13.8, "1/14")])

@@ -51,7 +51,8 @@ def test_examples_run_and_learn():
 def test_library_runs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(a2tg, "fit", untrained)
-    names = run("library", {"__name__": "library"}, {"cameras, 200):": "cameras, 2):"})
+    fewer = {"cameras, 200):": "cameras, 2):", "iterations=1000": "iterations=2"}
+    names = run("library", {"__name__": "library"}, fewer)
     assert {path.name for path in tmp_path.iterdir()} == {"scene.npz", "scene.a2tgz"}
     assert names["found"].psnr > 3
     with pytest.raises(TypeError):

@@ -90,6 +90,13 @@ class CompactChoices:
         """Return the choices with some changed, by name."""
         return dataclasses.replace(self, **dict(others))
 
+    def of_part(self, name: str) -> Precision:
+        """Return the precision of a part of the file, such as sh_2 or texel_colors."""
+        groups = {"sh_0": "sh_0", "texel_colors": "texels", "texel_alphas": "texels"}
+        group = groups.get(name, "sh_rest" if name.startswith("sh_") else name)
+        precision: Precision = getattr(self, group)
+        return precision
+
     def check(self) -> Self:
         """Raise ValueError, naming the choice, if one is invalid."""
         for field in dataclasses.fields(self):
@@ -99,26 +106,37 @@ class CompactChoices:
         return self
 
 
+Grids = Mapping[str, tuple[float, ...]]
+"""First and last step of each group kept in bits, by the name of its part of the file; for each axis of the means,
+centre and spread come first."""
 GROUPS = tuple(field.name for field in dataclasses.fields(CompactChoices) if field.name != "coder")
 
 
 DEFAULT_CHOICES = CompactChoices()
 
 
-def save_compact(path: str | os.PathLike[str], model: Model, *, choices: CompactChoices = DEFAULT_CHOICES) -> None:
+def save_compact(
+    path: str | os.PathLike[str],
+    model: Model,
+    *,
+    choices: CompactChoices = DEFAULT_CHOICES,
+    grids: Grids | None = None,
+) -> None:
     """Write a model's live rows, its appearance and its origin in few bytes.
 
     Args:
       path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
       model: one that shows Plain, Textured, Shaped of these, or Banded of any of these.
       choices: how finely its numbers are kept.
+      grids: grids of the groups kept in bits, with which the model was tuned (`tune_compact`); None: those between the
+        smallest and the largest of the model's own numbers.
 
     Raises:
       ValueError: if the model shows anything else, has a number that is not finite or too large, or a
         choice cannot be.
     """
     check_saved(path, model, "save_compact")
-    data = encode_model(model, choices)
+    data = encode_model(model, choices, grids)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
@@ -137,16 +155,34 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
     return decode_model(read_regular(path, MOST_BYTES), str(path))
 
 
-def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES) -> bytes:
-    """Return the bytes of `save_compact`. Raises as it does."""
+def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES, grids: Grids | None = None) -> bytes:
+    """Return the bytes of `save_compact`. Raises as it does.
+
+    Args:
+      model: as there; with grids as `half_turned` gives it, with numbers that may have changed since.
+      choices: as there.
+      grids: as there (`grids_of`); numbers beyond their ends are cut to them.
+    """
     choices.check()
     check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance)
-    data, num_unpacked = _encoded(model.live, choices)
+    data, num_unpacked = _encoded(model.live, choices, grids)
     check_model(model)
     if num_unpacked > _room(data):  # So alike are its numbers that the file would be taken for a bomb.
-        data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"))
+        data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"), grids)
     return data
+
+
+def half_turned(model: Model) -> Model:
+    """Return the model that its file without rounding holds: its rows along a Z curve, and splats half-turned."""
+    exact = CompactChoices(coder="none").keeping(dict.fromkeys(GROUPS, "float32"))
+    return decode_model(encode_model(model, exact))
+
+
+def grids_of(model: Model, choices: CompactChoices) -> Grids:
+    """Return the grids of a file of these choices, for each group kept in bits of which the model has numbers."""
+    header, _ = _unframed(encode_model(model, dataclasses.replace(choices, coder="none")))
+    return {name: tuple(ends) for name, ends in header["ends"].items()}
 
 
 def decode_model(data: bytes, where: str = "the compact scene") -> Model:
@@ -169,10 +205,10 @@ def bytes_by_part(data: bytes) -> dict[str, int]:
 # From a model to bytes
 
 
-def _encoded(model: Model, choices: CompactChoices) -> tuple[bytes, int]:
+def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tuple[bytes, int]:
     """Return the file, and how many bytes it unpacks to."""
-    writer, rows = Writer(choices.coder), rows_of(model)
-    rows = ordered(rows, writer.means("means", rows.means.T, choices.means))
+    writer, rows = Writer(choices.coder, grids or {}), rows_of(model)
+    rows = ordered(rows, writer.means("means", rows.means.T, choices.means), turns=grids is None)
     writer.numbers("log_scales", rows.log_scales.T, choices.log_scales)
     writer.numbers("quats", rows.quats[:, 1:].T, choices.quats)
     is_bits = isinstance(choices.opacities, int)
@@ -180,8 +216,8 @@ def _encoded(model: Model, choices: CompactChoices) -> tuple[bytes, int]:
     degrees = np.unique(rows.degrees)
     writer.indices("degrees", np.searchsorted(degrees, rows.degrees), len(degrees))
     for degree, band in enumerate(rows.bands):
-        precision = choices.sh_0 if degree == 0 else choices.sh_rest
-        writer.numbers(f"sh_{degree}", band.transpose(2, 1, 0).reshape(3, -1), precision, is_color=True)
+        name, columns = f"sh_{degree}", band.transpose(2, 1, 0).reshape(3, -1)
+        writer.numbers(name, columns, choices.of_part(name), is_color=True)
     header: dict[str, Any] = {
         "num": len(rows.means),
         "base_degree": model.gaussians.sh_degree,
@@ -275,8 +311,8 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices,
     bands = []
     for degree in range(highest + 1):
         count = int(np.count_nonzero(degrees >= degree))
-        precision = choices.sh_0 if degree == 0 else choices.sh_rest
-        columns = reader.numbers(f"sh_{degree}", 3, (2 * degree + 1) * count, precision, is_color=True)
+        name = f"sh_{degree}"
+        columns = reader.numbers(name, 3, (2 * degree + 1) * count, choices.of_part(name), is_color=True)
         bands.append(columns.reshape(3, 2 * degree + 1, count).transpose(2, 1, 0))
     sizes, texels = None, None
     if "sizes" in header:

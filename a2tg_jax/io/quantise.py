@@ -183,11 +183,17 @@ def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
       The quaternions, float64, and [n] the axis about which each was turned: 0 is none, 1 to 3 are u, v and the normal.
     """
     quats = np.asarray(quats, np.float64)
+    axis = np.argmax(np.abs(quats), axis=1)
+    return with_positive_w(np.einsum("nij,nj->ni", HALF_TURNS[axis], quats)), axis
+
+
+def with_positive_w(quats: np.ndarray) -> np.ndarray:
+    """Return the same rotations as unit quaternions [n, 4], float64, of which no w is negative."""
+    quats = np.asarray(quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), [1.0, 0.0, 0.0, 0.0])
-    axis = np.argmax(np.abs(unit), axis=1)
-    turned = np.einsum("nij,nj->ni", HALF_TURNS[axis], unit)
-    return turned * np.where(turned[:, :1] < 0, -1.0, 1.0), axis
+    positive: np.ndarray = unit * np.where(unit[:, :1] < 0, -1.0, 1.0)
+    return positive
 
 
 def with_w(xyz: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.io.quantise import nearest_half_turn
+from a2tg_jax.io.quantise import nearest_half_turn, with_positive_w
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
@@ -79,9 +79,16 @@ def rows_of(model: Model) -> Rows:
     )  # fmt: skip
 
 
-def ordered(rows: Rows, order: np.ndarray) -> Rows:
-    """Return the splats order[0], order[1], …, turned by half if that makes their rotations smaller."""
-    quats, axis = nearest_half_turn(rows.quats[order])
+def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
+    """Return the splats order[0], order[1], …
+
+    Args:
+      rows: the splats.
+      order: indices [N].
+      turns: turn splats by half if that makes their rotations smaller; else w only becomes positive.
+    """
+    quats = rows.quats[order]
+    quats, axis = nearest_half_turn(quats) if turns else (with_positive_w(quats), np.zeros(len(order), np.int64))
     return Rows(
         means=rows.means[order],
         quats=quats,

@@ -5,6 +5,8 @@ Both go through the columns in one order. What the reader must know beside the b
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,11 +32,17 @@ class Layout:
 
 
 class Writer:
-    """Writer of coded columns, one after the other."""
+    """Writer of coded columns, one after the other.
 
-    def __init__(self, coder: Choice):
+    Args:
+      coder: of all parts.
+      ends: ends of groups kept in bits, as in `Layout.ends`; those of other groups follow from their numbers.
+    """
+
+    def __init__(self, coder: Choice, ends: Mapping[str, Sequence[float]] = MappingProxyType({})):
         self.coder = coder
         self.layout = Layout()
+        self._known_ends = ends
         self.num_unpacked = 0
         """Bytes before coding."""
         self._pieces: list[bytes] = []
@@ -72,7 +80,7 @@ class Writer:
         if not isinstance(precision, int):
             self.planes(name, quantise.to_byte_planes(_as_float(name, values, precision)))
             return
-        ends = quantise.ends_of(values, precision)
+        ends = Ends(*self._known_ends[name]) if name in self._known_ends else quantise.ends_of(values, precision)
         self.layout.ends[name] = list(ends)
         if ends.low == ends.high:
             self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
@@ -85,9 +93,10 @@ class Writer:
     def means(self, name: str, values: np.ndarray, precision: Precision) -> np.ndarray:
         """Write positions [3, n], and return their order [n] along the Z curve."""
         bits = precision if isinstance(precision, int) else MEANS_FLOAT_BITS
-        contractions = [Contraction.of(axis) for axis in values]
+        known = np.reshape(self._known_ends.get(name, ()), (-1, 4)).tolist()
+        contractions = [Contraction(*own[:2]) for own in known] or [Contraction.of(axis) for axis in values]
         contracted = [of.contracted(axis) for of, axis in zip(contractions, values, strict=True)]
-        ends = [quantise.ends_of(axis, bits) for axis in contracted]
+        ends = [Ends(*own[2:]) for own in known] or [quantise.ends_of(axis, bits) for axis in contracted]
         codes = [quantise.quantised(axis, end, bits) for axis, end in zip(contracted, ends, strict=True)]
         key = quantise.morton(np.stack(codes), bits)
         order = np.argsort(key, kind="stable")

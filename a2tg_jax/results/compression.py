@@ -10,6 +10,7 @@ from a2tg_jax.data import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
     LADDER,
+    Ladder,
     Loss,
     Trial,
     loss_beside_renders,
@@ -17,9 +18,10 @@ from a2tg_jax.finish.compaction import (
     measure_choices,
     smallest_within,
 )
+from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, Tuned, TunedFiles, smallest_tuned, tune_compact
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.compact import GROUPS, encode_model
+from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.rows import check_encodable
 from a2tg_jax.model import Model
@@ -53,10 +55,17 @@ class Compressed:
     chosen: Trial
     measures: tuple[str, ...]
     """Names of the loss measures of the trials."""
+    tuned: Sequence[Trial] = ()
+    """Files of tuned models, in the order of trial."""
 
 
 def compress(
-    source: Path, out: Path | None = None, *, max_loss: float = 0.05, on_start: Callable[[str], None] = lambda _: None
+    source: Path,
+    out: Path | None = None,
+    *,
+    max_loss: float = 0.05,
+    tune_iterations: int = 0,
+    on_start: Callable[[str], None] = lambda _: None,
 ) -> Compressed:
     """Write the smallest compact file of a model within a given loss.
 
@@ -67,11 +76,15 @@ def compress(
       source: a run folder, of which the last model is taken; or a model, *.npz.
       out: the file; None is beside the model.
       max_loss: in dB.
+      tune_iterations: iterations of training with rounding for each choice of bits that is tried so
+        (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
       on_start: called with how much there is to try, once the arguments are checked.
 
     Raises:
-      FileNotFoundError: if there is no such model.
-      ValueError: if a compact file cannot hold it, nothing loses so little, or `out` is a folder or the model.
+      FileNotFoundError: if there is no such model, or no photographs to tune it with.
+      ValueError: if a compact file cannot hold it, nothing loses so little, `out` is a folder or the model, or a
+        model's file is to be tuned.
+      DivergedError: if tuning diverges; no file is written.
     """
     run = open_run(source) if source.is_dir() else None
     path, settings = (source, RenderSettings()) if run is None else _last_model(run)
@@ -82,16 +95,51 @@ def compress(
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if out.is_dir() or out.resolve() == path.resolve():
         raise ValueError(f"out must be a new file, or one other than the model; got {out}")
-    losses = _losses(model, None if run is None else _scene_of(run), settings)
-    num_ways = sum(map(len, LADDER.values()))
-    on_start(f"trying up to {num_ways} ways to round the model's numbers; on a CPU this takes minutes")
-    trials = measure_choices(model, list(losses.values()))
-    chosen = smallest_within(model, list(losses.values()), max_loss, trials)
+    scene = None if run is None else _scene_of(run)
+    tune = _tune(source, run, scene, tune_iterations) if tune_iterations else None
+    losses = _losses(model, scene, settings)
+    ladder, measures = LADDER if tune is None else TUNED_LADDER, list(losses.values())
+    on_start(_plan_told(ladder, tune_iterations))
+    trials = measure_choices(model, measures, ladder)
+    chosen = smallest_within(model, measures, max_loss, trials)
+    data = encode_model(model, chosen.choices)
+    found = TunedFiles([]) if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
+    if found.tuned is not None and found.chosen is not None and found.chosen.num_bytes < chosen.num_bytes:
+        data, chosen = found.tuned.data, found.chosen
     if run is not None and out == path.with_suffix(SUFFIX):
         run.own(out)
     with replacing(out) as temporary:
-        temporary.write_bytes(encode_model(model, chosen.choices))
-    return Compressed(out, model, trials, chosen, tuple(losses))
+        temporary.write_bytes(data)
+    return Compressed(out, model, trials, chosen, tuple(losses), found.tried)
+
+
+def _plan_told(ladder: Ladder, tune_iterations: int) -> str:
+    """Return what there is to try, in words."""
+    tunings = f", then training up to {MOST_TUNINGS} times" if tune_iterations else ""
+    ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
+    return f"trying {ways}{tunings}; on a CPU this takes minutes"
+
+
+def _tune(source: Path, run: RunFolder | None, scene: Scene | None, iterations: int) -> Tune:
+    """Return the function that tunes the model of a run.
+
+    Raises:
+      FileNotFoundError: if the run's photographs are missing.
+      ValueError: if there is no run, or the iterations are negative.
+    """
+    if iterations < 0:
+        raise ValueError(f"tune_iterations must be at least 0; got {iterations}")
+    if run is None:
+        raise ValueError(f"tune_iterations needs the photographs of a run folder; {source} is a file")
+    if scene is None:
+        raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
+    plan = read_record(run).plan
+    system = plan[plan.main[-1]].system
+
+    def tune(model: Model, choices: CompactChoices) -> Tuned:
+        return tune_compact(model, scene, system, choices, iterations=iterations, progress=True)
+
+    return tune
 
 
 def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
@@ -136,6 +184,7 @@ def compression_text(result: Compressed) -> str:
     columns = zip(
         ["kept as", "bytes", *(f"dB lost, {measure}" for measure in result.measures)],
         *rows,
+        *(["tuned", *_figures(trial)] for trial in result.tuned),
         ["chosen", *_figures(chosen)],
         strict=True,
     )
