@@ -46,7 +46,6 @@ from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import SYSTEMS, Session, System, find_system
-from a2tg_jax.training.batches import check_lenses
 
 BASELINE = "gaussians-2d-mcmc"
 DEFAULT_PRESET = "paper"
@@ -212,7 +211,6 @@ class Train:
         with opened(self.out) as run:
             record = self._resumed(run)
             scene = record.scene.load(room_for_photographs(most))
-            check_lenses(scene.train, session.num_devices)
             given = given_splats(record)
             tell_forecast(scene, record.plan, most, session.num_devices, number_given(run, record, given))
             result = go_on(

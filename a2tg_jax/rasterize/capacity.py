@@ -109,7 +109,7 @@ def _count_rows(
     M, cutoff = _drawn(gaussians, camera, rule, num_live)
     assert settings.exchange is not None
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    return rows_to_send(settings.exchange, M, cutoff, settings.near_plane, grid)
+    return rows_to_send(settings.exchange, M, cutoff, settings.near_plane, grid, camera.rays)
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:

@@ -27,7 +27,8 @@ from a2tg_jax.rasterize.compositor import Composited, composite_arrays
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.packing import pack_splats, unpack_splats
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
-from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
+from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels, tile_pixels
+from a2tg_jax.rasterize.tiles import TileGrid, TileLists, tile_lists, tile_rectangles
 
 AXIS = "rows"
 """Axis of the mesh along which rows of splats, and bands of pixels, lie on devices."""
@@ -143,9 +144,13 @@ class Bands:
         height = -(-grid.rows // num) * grid.tile_size
         return Bands(grid, grid if num == 1 else grid._replace(height=height), num)
 
-    def reached(self, M: Array, cutoff: Array, near_plane: float) -> Array:
-        """Return [bands, n] whether each splat's box reaches each band of a view."""
-        boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), self.whole)
+    def pixels(self, rays: Array | None) -> TilePixels | None:
+        """Return the pixels of the tiles of all bands, those below the image included; None of a pinhole camera."""
+        return None if rays is None else tile_pixels(rays, self.whole.tile_size, self.num * self.own.rows)
+
+    def reached(self, M: Array, cutoff: Array, near_plane: float, pixels: TilePixels | None) -> Array:
+        """Return [bands, n] whether each splat's box reaches each band of a view, or may reach it through a lens."""
+        boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), self.whole, pixels)
         first = boxes.y0
         end = first + boxes.counts // jnp.maximum(boxes.columns, 1)
         starts = jnp.arange(self.num, dtype=jnp.int32)[:, None] * self.own.rows
@@ -154,7 +159,7 @@ class Bands:
 
 def composite_in_bands(
     settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, rule: AppearanceRule,
-    cutoff: Array, jacobian: Array, probe: Array,
+    cutoff: Array, jacobian: Array, probe: Array, rays: Array | None,
 ) -> Composited:  # fmt: skip
     """Composite G views, the leading axis of all arrays, as `compositor.composite` does one: each device a band.
 
@@ -165,6 +170,7 @@ def composite_in_bands(
       exchange: the D devices; G divides D.
       capacity: number of pairs of a whole image.
       splats, cutoff, jacobian, probe: as for `composite`, [G, ...].
+      rays: [H, W, 2] of the lens that the views share (`Camera.rays`); None of a pinhole.
     """
     num_views = cutoff.shape[0]
     num_bands = exchange.num // num_views
@@ -177,15 +183,16 @@ def composite_in_bands(
         rows=min(cutoff.shape[1] // exchange.num, max(1, math.ceil(capacity * exchange.rows_per_pair))),
         rows_share=exchange.rows_per_pair,
     )  # fmt: skip
-    on_device = functools.partial(_composite_band, settings, Bands.of(settings.grid, num_bands), room, rule)
+    bands = Bands.of(settings.grid, num_bands)
+    on_device = functools.partial(_composite_band, settings, bands, room, rule)
     rows, of_views, everywhere = P(AXIS), P(None, AXIS), P()
     channels, transmittance, num_pairs, overflow = jax.shard_map(
         on_device,
         mesh=exchange.mesh,
-        in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere),
+        in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere, everywhere),
         out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
-    )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian)
+    )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian, bands.pixels(rays))
     height, width = settings.grid.height, settings.grid.width
     channels = channels.reshape(channels.shape[0], num_views, -1, width)[:, :, :height]
     transmittance = transmittance.reshape(num_views, -1, width)[:, :height]
@@ -193,17 +200,20 @@ def composite_in_bands(
     return Composited(jnp.moveaxis(channels, 1, 0), transmittance, num_pairs, overflow)
 
 
-def rows_to_send(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid) -> Array:
+def rows_to_send(
+    exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, rays: Array | None = None
+) -> Array:
     """Return the largest number of rows that a device sends to another one for a view that is drawn beside others.
 
     Args:
       exchange: the D devices.
       M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
       grid: tiles of the image.
+      rays: of the lens, as for `composite_in_bands`.
     """
     M, cutoff = exchange.filled_up(M), exchange.filled_up(cutoff, -1.0)
     bands = Bands.of(grid, exchange.num // exchange.views_at_once)
-    reached = bands.reached(M, cutoff, near_plane)
+    reached = bands.reached(M, cutoff, near_plane, bands.pixels(rays))
     return jnp.max(jnp.sum(reached.reshape(bands.num, exchange.num, -1), axis=2, dtype=jnp.int32))
 
 
@@ -223,9 +233,10 @@ class _Room(NamedTuple):
 def _composite_band(
     settings: CompositingSettings, bands: Bands, room: _Room, rule: AppearanceRule, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
+    pixels: TilePixels | None,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return channels [C, h, W] and transmittance [h, W] of this device's band, the capacity needed, the overflow."""
-    reach = functools.partial(bands.reached, near_plane=settings.near_plane)
+    reach = functools.partial(bands.reached, near_plane=settings.near_plane, pixels=pixels)
     reached = jax.vmap(reach)(jax.lax.stop_gradient(splats.M), cutoff)
     num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
     chosen, chosen_of_views = _chosen_rows(reached, room.rows)
@@ -240,17 +251,28 @@ def _composite_band(
 
     index = jax.lax.axis_index(AXIS)
     view, band = index // bands.num, index % bands.num
-    top = band * bands.own.height
-    M, jacobian = _shifted(splats.M, top), _shifted(jacobian[view][None], top)[0]
-    splats = splats._replace(M=M)
-    list_tiles = native.tile_lists if settings.compositor == "native" else tile_lists
-    lists = list_tiles(jax.lax.stop_gradient(M), cutoff, settings.near_plane, bands.own, room.pairs)
+    jacobian = jacobian[view]
+    if pixels is None:  # Else pixels keep their places in the image plane, from which M leads to them.
+        top = band * bands.own.height
+        splats, jacobian = splats._replace(M=_shifted(splats.M, top)), _shifted(jacobian[None], top)[0]
+    else:
+        pixels = band_pixels(pixels, band * bands.own.num, bands.own.num)
+    lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels)
     own = settings._replace(grid=bands.own, tile_batch=min(settings.tile_batch, bands.own.num))
     channels, transmittance = composite_arrays(own, rule, splats, texels, regions, cutoff, lists, jacobian, probe)
     is_sent = num_sent <= room.rows
     needed = jnp.maximum(lists.num_pairs / room.pairs_share, num_sent / room.rows_share)
     overflow = jax.lax.pmax((lists.overflow | ~is_sent).astype(jnp.int32), AXIS) > 0
     return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
+
+
+def _lists_of_band(
+    settings: CompositingSettings, bands: Bands, room: _Room, M: Array, cutoff: Array, pixels: TilePixels | None
+) -> TileLists:
+    """Return the splats of each tile of a band, given the pixels of its tiles if they have rays of their own."""
+    if pixels is None and settings.compositor == "native":
+        return native.tile_lists(M, cutoff, settings.near_plane, bands.own, room.pairs)
+    return tile_lists(M, cutoff, settings.near_plane, bands.own, room.pairs, pixels)
 
 
 def _chosen_rows(reached: Array, most: int) -> tuple[Array, Array]:

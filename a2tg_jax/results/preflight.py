@@ -20,7 +20,6 @@ from a2tg_jax.results.output import check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training import System
-from a2tg_jax.training.batches import check_lenses
 from a2tg_jax.training.start import check_start, initial_number, num_rows
 
 STATE_SIZE = 3
@@ -59,7 +58,6 @@ def check_new_run(
     num_given = None if given is None else given.splats.num
     check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory))
-    check_lenses(scene.train, num_devices)
     for system in record.systems.values():
         check_start(scene, system, num_given if system is record.system else None)
     check_room(record, scene, out, num_given)
