@@ -5,7 +5,12 @@
 The random scene of the other benchmarks at 1600×1060 pixels, spread over 1 to 64 devices, which draw one view together,
 or as many views at once as there are devices. A device sends a fixed number of rows to each other one, the largest that
 any pair needs; the least that must travel are the rows that reach a band which another device owns. Gradients come back
-in the same rows.
+in the same rows. Pixels of bands travel to the devices of an even cut, and their gradients back, in as many rows of
+pixels as the largest move of a border needs.
+
+The second scene is the same with a sky: of the Gaussians in the upper 30 % of the image six in seven are left out. For
+both the pairs of the fullest band, divided by the mean, are counted for bands with moved borders and for equally high
+ones.
 
     python -m benchmarks.scaling --train 2000000 --memory-gb 12 --out benchmarks/results/scaling_training.json
 
@@ -14,10 +19,12 @@ This trains so many Gaussians for some steps on several devices of this CPU, and
 
 import argparse
 import json
+import math
 import resource
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +34,11 @@ import a2tg_jax as a2tg
 from a2tg_jax import RenderSettings
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
-from a2tg_jax.rasterize.exchange import Bands
+from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
 from a2tg_jax.rasterize.kernels.packing import num_numbers
-from a2tg_jax.rasterize.tiles import TileGrid
+from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 from a2tg_jax.render import rule_of
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training.registry import with_changes
@@ -41,6 +48,10 @@ from experiments.lab.markdown import table as markdown
 NUMS, DEVICES = (100_000, 1_000_000, 4_000_000), (1, 2, 4, 8, 16, 64)
 WIDTH, HEIGHT = 1600, 1060
 PROBE, CUTOFF = 4, 1
+CHANNELS = 4
+"""Numbers of a pixel that travel: its colour and its transmittance."""
+SKY, KEPT_IN_SKY = 0.3, 7
+"""Share of the image that is sky; of so many Gaussians in it one is kept."""
 KIBIBYTE = 1024
 STATES = 4
 """Parameters, their gradients, and the two moments of Adam."""
@@ -52,27 +63,66 @@ def row_bytes() -> tuple[int, int]:
     return BYTES_PER_FLOAT * (splat + CUTOFF), BYTES_PER_FLOAT * splat
 
 
-def counted(num: int, devices: int, views: int) -> dict[str, float]:
+def boxes_of(num: int, grid: TileGrid, has_sky: bool) -> Rectangles:
+    """Return the tiles that the Gaussians of a scene cover; those left out of a sky cover none."""
+    gaussians, camera = random_scene(num, WIDTH, HEIGHT)
+
+    def covered(gaussians: a2tg.Gaussians, camera: a2tg.Camera) -> Rectangles:
+        M, _ = homographies(gaussians, camera)
+        rule = rule_of(gaussians, None, None, RenderSettings())
+        return tile_rectangles(screen_bounds(M, rule.cutoff(rule.opacities(gaussians)), NEAR_PLANE), grid)
+
+    boxes = jax.jit(covered)(gaussians, camera)
+    if not has_sky:
+        return boxes
+    is_shown = (jnp.arange(num) % KEPT_IN_SKY == 0) | (boxes.y0 >= math.ceil(SKY * grid.rows))
+    return boxes._replace(counts=jnp.where(is_shown, boxes.counts, 0))
+
+
+def fullest(bands: Bands, pairs: jax.Array, borders: jax.Array) -> float:
+    """Return the pairs of the fullest band, divided by the mean."""
+    ends = np.concatenate([[0], np.cumsum(np.asarray(pairs, np.int64))])
+    own = np.diff(ends[np.asarray(borders)])
+    return float(own.max() / own.mean())
+
+
+def pixel_bytes(bands: Bands) -> int:
+    """Return the bytes of the pixels that devices send to each other for a view, and of their gradients."""
+    rows = sum(hop.rows * (bands.num - abs(hop.bands)) for hop in bands.hops() if hop.bands)
+    return 2 * BYTES_PER_FLOAT * CHANNELS * WIDTH * rows
+
+
+def rows_between(bands: Bands, boxes: Rectangles, borders: jax.Array, devices: int) -> np.ndarray:
+    """Return [bands, devices] the rows that each device sends to each band."""
+    return np.asarray(bands.reached(boxes, borders)).reshape(bands.num, devices, -1).sum(axis=2)
+
+
+def counted(num: int, devices: int, views: int, has_sky: bool) -> dict[str, float | str]:
     """Return the counts of one rendering of `num` Gaussians, beside those of `views` − 1 others that are alike."""
     num = num // devices * devices
-    gaussians, camera = random_scene(num, WIDTH, HEIGHT)
-    M, _ = homographies(gaussians, camera)
-    rule = rule_of(gaussians, None, None, RenderSettings())
     bands = Bands.of(TileGrid(WIDTH, HEIGHT, 8), devices // views)
-    reached = np.asarray(jax.jit(bands.reached)(M, rule.cutoff(rule.opacities(gaussians)), jnp.float32(NEAR_PLANE)))
-    per_pair = reached.reshape(bands.num, devices, -1).sum(axis=2)
+    boxes = boxes_of(num, bands.whole, has_sky)
+    pairs = bands.pairs_of_rows(boxes)
+    borders = bands.borders(pairs)
+    bands = Bands.of(bands.whole, bands.num, BorderRoom(*bands.room_for(borders).tolist()))
+    per_pair, of_even_bands = (rows_between(bands, boxes, own, devices) for own in (borders, bands.even_borders()))
     least = per_pair.sum() - np.trace(per_pair)
     forward, back = row_bytes()
-    sent = per_pair.max() * bands.num * (devices - 1)
+    row = bands.num * (devices - 1) * (forward + back)
     return {
+        "scene": "random, with a sky" if has_sky else "random",
         "gaussians": num,
         "devices": devices,
         "views_at_once": views,
         "state_bytes_per_device": BYTES_PER_FLOAT * STATES * floats_per_gaussian(3) * num / devices,
         "rows_received": float(per_pair.sum(axis=1).max()),
         "least_bytes": float(least * (forward + back)),
-        "sent_bytes": float(sent * (forward + back)),
-        "copies_per_splat": float(per_pair.sum() / max(1, reached.any(axis=0).sum())),
+        "row_bytes": float(per_pair.max() * row),
+        "row_bytes_of_even_bands": float(of_even_bands.max() * row),
+        "pixel_bytes": float(pixel_bytes(bands)),
+        "copies_per_splat": float(per_pair.sum() / max(1, (boxes.counts > 0).sum())),
+        "fullest_band": fullest(bands, pairs, borders),
+        "fullest_of_even_bands": fullest(bands, pairs, bands.even_borders()),
     }
 
 
@@ -94,7 +144,8 @@ def main() -> None:
             sys.exit(f"the training took {trained['peak_gb']:.1f} GB, more than {args.memory_gb:g} GB")
         return
     found = [
-        counted(num, devices, views)
+        counted(num, devices, views, has_sky)
+        for has_sky in (False, True)
         for num in NUMS
         if num <= args.largest
         for devices in DEVICES
@@ -123,15 +174,19 @@ def training(num: int, steps: int) -> dict[str, float]:
     }
 
 
-def table(found: Sequence[Mapping[str, float]]) -> str:
+def table(found: Sequence[Mapping[str, Any]]) -> str:
     """Return a row for each case; bytes are of one view."""
     rows = []
     for row in found:
-        names = "state_bytes_per_device", "sent_bytes", "least_bytes"
-        state, sent, least = (f"{row[name] / 1e6:,.0f} MB" for name in names)
+        names = "state_bytes_per_device", "row_bytes", "least_bytes", "pixel_bytes"
+        state, *travelling = (f"{row[name] / 1e6:,.0f} MB" for name in names)
         counts = (f"{row[name]:,.0f}" for name in ("gaussians", "devices", "views_at_once"))
-        rows.append([*counts, state, f"{row['rows_received']:,.0f}", sent, least])
-    header = ["Gaussians", "devices", "views at once", "state on a device", "rows received", "sent by all", "least"]
+        balance = (f"{row[name]:.2f}" for name in ("fullest_of_even_bands", "fullest_band"))
+        rows.append([row["scene"], *counts, state, *balance, f"{row['rows_received']:,.0f}", *travelling])
+    header = [
+        "scene", "Gaussians", "devices", "views at once", "state on a device", "fullest, equally high", "fullest",
+        "rows received", "rows sent by all", "least", "pixels sent by all",
+    ]  # fmt: skip
     return markdown(header, rows)
 
 

@@ -1,6 +1,6 @@
 """Renders and trains on one, two and four devices of a CPU and compares; run by `test_devices` in a process of its own.
 
-python tests/on_devices.py rendering|overflowing|batches|lenses|training|textures FOLDER
+python tests/on_devices.py rendering|balance|overflowing|batches|lenses|training|textures FOLDER
 """
 
 import dataclasses
@@ -12,10 +12,15 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import PartitionSpec as P
 from scenes_random import fisheye
 
 import a2tg_jax as a2tg
-from a2tg_jax.rasterize.exchange import exchange_among, spread
+from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.rasterize.capacity import pairs_of_view
+from a2tg_jax.rasterize.exchange import AXIS, ROOM_OF_A_BAND, exchange_among, spread
+from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
+from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
@@ -87,6 +92,87 @@ def rendering(folder):
         assert found.gaussians.means.sharding.spec[0] == "rows", "the gradient stays where its rows are"
 
 
+def upper_quarter(height=512):
+    """A camera that shows the centres of all Gaussians in the upper quarter of a tall image."""
+    camera = scene().train[0].camera
+    squeezed = jnp.asarray(camera.K).at[1].multiply(0.25 * height / camera.height)
+    return dataclasses.replace(camera, K=squeezed, height=height)
+
+
+def balance(folder):
+    """All devices have about as many pairs if the splats show in a quarter of the image, and draw what one does; the
+    pixels of any bands reach the devices that have them in an even cut."""
+    camera, exchange = upper_quarter(), exchange_among(jax.devices())
+    any_bands_become_even(exchange)
+    settings = a2tg.plan_render(textured(), [camera])
+
+    def loss(model, output):
+        return jnp.mean(jnp.sin(output.color)) + 0.01 * jnp.mean(output.depth)
+
+    alone = a2tg.view_gradients(loss, textured(), camera, settings=settings)
+    own = dataclasses.replace(settings, exchange=exchange)
+    together = jax.jit(lambda m: a2tg.view_gradients(loss, m, camera, settings=own))
+    found = together(spread(exchange, textured()))
+    close(alone._replace(num_pairs=0), found._replace(num_pairs=0))
+    rule = textured().rule
+    pairs, boxes = pairs_of_view(textured().gaussians, camera, rule, settings), boxes_of(textured(), camera)
+    bands = Bands.of(TileGrid(camera.width, camera.height, settings.tile_size), exchange.num)
+    largest, largest_even = (
+        int(fullest(bands, boxes, cut)) for cut in (bands.borders(bands.pairs_of_rows(boxes)), bands.even_borders())
+    )
+    assert np.isclose(largest, found.num_pairs * ROOM_OF_A_BAND / exchange.num), "what the program itself has counted"
+    assert largest_even > 2.8 * pairs / exchange.num and largest < 1.2 * pairs / exchange.num
+
+
+def boxes_of(model, camera):
+    """Tiles of the splats of a model in a view."""
+    M, _ = homographies(model.gaussians, camera)
+    bounds = screen_bounds(
+        M, model.rule.cutoff(model.rule.opacities(model.gaussians)), a2tg.RenderSettings().near_plane
+    )
+    return tile_rectangles(bounds, TileGrid(camera.width, camera.height, a2tg.RenderSettings().tile_size))
+
+
+def fullest(bands, boxes, borders):
+    """Pairs of the fullest band, from the rectangles of the splats cut at its borders."""
+    end = boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1)
+    rows = jnp.minimum(end, borders[1:, None]) - jnp.maximum(boxes.y0, borders[:-1, None])
+    return jnp.max(jnp.sum(jnp.maximum(rows, 0) * boxes.columns, axis=1))
+
+
+def evened(exchange, bands, num_views, borders, local):
+    """Pixels [C, H, W] of all devices after `to_even`, from those of each band [D, C, h, W]."""
+
+    def on_device(local):
+        index = jax.lax.axis_index(AXIS)
+        return bands.to_even(local[0], borders[index // bands.num], index, num_views, AXIS)
+
+    specs = {"in_specs": P(AXIS), "out_specs": P(None, AXIS)}
+    return jax.jit(jax.shard_map(on_device, mesh=exchange.mesh, **specs, check_vma=False))(local)
+
+
+def any_bands_become_even(exchange):
+    """Pixels of bands with random borders, some of them empty, become the image: of one view, and of two at once."""
+    rng, grid = np.random.default_rng(0), TileGrid(5, 101, 8)
+    for num_views in (1, 2, 4):
+        num = exchange.num // num_views
+        for _ in range(4):
+            image = rng.random((num_views, 2, 101, 5))
+            cuts = np.sort(rng.integers(0, grid.rows + 1, (num_views, num - 1)), axis=1)
+            borders = np.pad(cuts, ((0, 0), (1, 1)), constant_values=((0, 0), (0, grid.rows))).astype(np.int32)
+            needed = np.max([Bands.of(grid, num).room_for(jnp.asarray(own)) for own in borders], axis=0)
+            bands = Bands.of(grid, num, BorderRoom(*needed.tolist()))
+            shown = [
+                np.pad(image[view, :, top * 8 :], ((0, 0), (0, 101), (0, 0)), constant_values=np.nan)
+                for view in range(num_views) for top in borders[view, :-1]
+            ]  # fmt: skip
+            local = np.stack([own[:, : bands.own.height] for own in shown])
+
+            found = np.asarray(evened(exchange, bands, num_views, jnp.asarray(borders), local))
+            found = found.reshape(2, num_views, -1, 5)[:, :, :101]
+            np.testing.assert_array_equal(found.swapaxes(0, 1), image.astype(np.float32))
+
+
 def close(expected, found):
     """Floats agree to 1e-5 of the largest of their array, all else is equal."""
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
@@ -114,6 +200,28 @@ def overflowing(folder):
         is_overflow, needed = told(64 if rows_per_pair == 1.0 else enough, rows_per_pair)
         assert is_overflow
         assert told(int(np.ceil(needed)), rows_per_pair)[0] is False, "what is asked for is enough"
+    borders_find_room()
+
+
+def borders_find_room():
+    """Training makes room for borders that move, and comes to the same bits as with enough room from the start."""
+    own = system(Gaussians2dMcmc, densify={"cap": ROWS}, stage1_iterations=4)
+    states = []
+    for room in (None, BorderRoom(0, 0)):
+        run = StageRun(scene(), own, 0, plain(), session=Session(devices=jax.devices()[:4]))
+        (size,) = {view.picture.size for view in run.views}
+        run.arguments(1)
+        run.exchanges[size] = dataclasses.replace(
+            run.exchanges[size], border_room=room or run.exchanges[size].border_room
+        )
+        capacity, taken = run.capacities[size], 0
+        while taken < 4:
+            taken += len(run.steps(taken + 1, 4))
+        assert bool(run.num_regrown) == (room is not None) and run.capacities[size] == capacity
+        states.append(run.model)
+        run.photographs.close()
+    for a, b in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def system(kind, **options):

@@ -12,7 +12,7 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1]))  # Last, so that the installed package comes first.
 
 from a2tg_jax.data.synthetic import still_life
-from benchmarks import bounds, meshes, stages
+from benchmarks import bounds, meshes, scaling, stages
 from benchmarks.tables import bounds as bounds_table
 
 
@@ -61,6 +61,15 @@ def test_bounds_add_up(counted):
     assert [one.flops > found[one.name].flops for one in twice] == ["compositing" in name for name in found]
     case = {"num": 300, "textures": "mixed", "stages": [stage.told for stage in found.values()]}
     assert "| 300, textured |" in bounds_table({"bounds": [case]})
+
+
+def test_devices_share_the_pairs_of_an_image_with_a_sky():
+    found = scaling.counted(3000, 4, 1, has_sky=True)
+    assert found["fullest_band"] < 1.15 < 1.5 < found["fullest_of_even_bands"] < 4
+    assert found["least_bytes"] <= found["row_bytes"] < found["row_bytes_of_even_bands"]
+    assert 0 < found["pixel_bytes"] < 2 * 4 * scaling.CHANNELS * scaling.WIDTH * scaling.HEIGHT * 3
+    alone = scaling.counted(3000, 4, 4, has_sky=True)
+    assert alone["fullest_band"] == 1 and alone["pixel_bytes"] == 0, "a view for each device"
 
 
 def test_normals_of_splats_on_the_built_in_scene_are_those_of_its_shapes():

@@ -15,7 +15,8 @@ from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
-from a2tg_jax.rasterize.exchange import rows_to_send
+from a2tg_jax.rasterize.exchange import Travel, travel
+from a2tg_jax.rasterize.image_bands import BorderRoom
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.supersampling import finer
 from a2tg_jax.rasterize.tile_pixels import pixels_of
@@ -76,12 +77,14 @@ def pairs_of_view(
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
 
-def rows_of_view(
+def travel_of_view(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
-) -> int:
-    """Return the rows that a device of `settings.exchange` must be able to send to another one in a view (host)."""
+) -> tuple[int, BorderRoom]:
+    """Return the rows that a device of `settings.exchange` must be able to send to another one in a view, and the room
+    for the borders between bands (host)."""
     camera = finer(camera, settings.supersample)
-    return int(_jitted_rows()(gaussians, camera, rule, settings, num_live))
+    rows, borders = jax.device_get(_jitted_travel()(gaussians, camera, rule, settings, num_live))
+    return int(rows), BorderRoom(*borders.tolist())
 
 
 @functools.cache
@@ -99,17 +102,17 @@ def _count_pairs(
 
 
 @functools.cache
-def _jitted_rows() -> Jitted[..., Array]:
-    return Jitted(_count_rows, static_argnums=(3,))
+def _jitted_travel() -> Jitted[..., Travel]:
+    return Jitted(_travel, static_argnums=(3,))
 
 
-def _count_rows(
+def _travel(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any
-) -> Array:
+) -> Travel:
     M, cutoff = _drawn(gaussians, camera, rule, num_live)
     assert settings.exchange is not None
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    return rows_to_send(settings.exchange, M, cutoff, settings.near_plane, grid, camera.rays)
+    return travel(settings.exchange, M, cutoff, settings.near_plane, grid, camera.rays)
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:

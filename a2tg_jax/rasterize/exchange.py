@@ -1,9 +1,10 @@
 """Compositing on several devices: splats travel to the devices that own the pixels they reach.
 
 N rows of splats are sharded over D devices, N/D each. G views are drawn at once, where G divides D. Each image is cut
-into D/G bands of whole rows of tiles, so that each device has one band. By one `all_to_all` every device sends to every
-other one the splats that reach its band, a fixed number of rows; JAX transposes it, which brings the gradients back. A
-splat that reaches two bands travels twice.
+into D/G bands of whole rows of tiles, one for each device, with about as many pairs in each (`image_bands`). By one
+`all_to_all` every device sends to every other one the splats that reach its band, a fixed number of rows; JAX
+transposes it, which brings the gradients back. A splat that reaches two bands travels twice. The pixels then go to the
+devices that an even cut of the image gives them to.
 
 The received rows keep the order of the model, so that a band is composited as it is on one device.
 """
@@ -24,17 +25,18 @@ from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import screen_bounds
 from a2tg_jax.rasterize.compositor import Composited, composite_arrays
+from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.packing import pack_splats, unpack_splats
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
-from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels, tile_pixels
+from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists, tile_lists, tile_rectangles
 
 AXIS = "rows"
 """Axis of the mesh along which rows of splats, and bands of pixels, lie on devices."""
 VIEW_AXIS = "views"
 """Axis of a mesh of the same devices along which the views lie that are drawn at once."""
-ROOM_OF_A_BAND = 2.0
+ROOM_OF_A_BAND = 1.5
 """Room for the pairs of a band, as a multiple of an even share of the capacity."""
 
 
@@ -46,6 +48,8 @@ class Exchange:
     """Devices along the one axis `AXIS`."""
     rows_per_pair: float = 1.0
     """Rows that one device can send to another, as a share of the capacity for pairs."""
+    border_room: BorderRoom | None = None
+    """Room for the borders between bands; None: for any borders."""
     views_at_once: int = 1
     """Largest number of views that are drawn at once; a divisor of D."""
 
@@ -128,35 +132,6 @@ def exchange_among(devices: Any) -> Exchange:
     return Exchange(mesh)
 
 
-@dataclasses.dataclass(frozen=True)
-class Bands:
-    """Bands of each view; all static."""
-
-    whole: TileGrid
-    """Grid of a view."""
-    own: TileGrid
-    """Grid of one band."""
-    num: int
-    """Number of bands of a view."""
-
-    @staticmethod
-    def of(grid: TileGrid, num: int) -> "Bands":
-        height = -(-grid.rows // num) * grid.tile_size
-        return Bands(grid, grid if num == 1 else grid._replace(height=height), num)
-
-    def pixels(self, rays: Array | None) -> TilePixels | None:
-        """Return the pixels of the tiles of all bands, those below the image included; None of a pinhole camera."""
-        return None if rays is None else tile_pixels(rays, self.whole.tile_size, self.num * self.own.rows)
-
-    def reached(self, M: Array, cutoff: Array, near_plane: float, pixels: TilePixels | None) -> Array:
-        """Return [bands, n] whether each splat's box reaches each band of a view, or may reach it through a lens."""
-        boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), self.whole, pixels)
-        first = boxes.y0
-        end = first + boxes.counts // jnp.maximum(boxes.columns, 1)
-        starts = jnp.arange(self.num, dtype=jnp.int32)[:, None] * self.own.rows
-        return (boxes.counts > 0) & (first < starts + self.own.rows) & (end > starts)
-
-
 def composite_in_bands(
     settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, rule: AppearanceRule,
     cutoff: Array, jacobian: Array, probe: Array, rays: Array | None,
@@ -183,27 +158,34 @@ def composite_in_bands(
         rows=min(cutoff.shape[1] // exchange.num, max(1, math.ceil(capacity * exchange.rows_per_pair))),
         rows_share=exchange.rows_per_pair,
     )  # fmt: skip
-    bands = Bands.of(settings.grid, num_bands)
+    bands = Bands.of(settings.grid, num_bands, exchange.border_room)
     on_device = functools.partial(_composite_band, settings, bands, room, rule)
     rows, of_views, everywhere = P(AXIS), P(None, AXIS), P()
-    channels, transmittance, num_pairs, overflow = jax.shard_map(
+    image, num_pairs, overflow = jax.shard_map(
         on_device,
         mesh=exchange.mesh,
         in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere, everywhere),
-        out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
+        out_specs=(P(None, AXIS), everywhere, everywhere),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
     )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian, bands.pixels(rays))
-    height, width = settings.grid.height, settings.grid.width
-    channels = channels.reshape(channels.shape[0], num_views, -1, width)[:, :, :height]
-    transmittance = transmittance.reshape(num_views, -1, width)[:, :height]
+    image = image.reshape(image.shape[0], num_views, -1, settings.grid.width)[:, :, : settings.grid.height]
     num_pairs, overflow = (jnp.broadcast_to(x, (num_views,)) for x in (num_pairs, overflow))
-    return Composited(jnp.moveaxis(channels, 1, 0), transmittance, num_pairs, overflow)
+    return Composited(jnp.moveaxis(image[:-1], 1, 0), image[-1], num_pairs, overflow)
 
 
-def rows_to_send(
+class Travel(NamedTuple):
+    """Need of room for a view that is drawn beside others; int32, traced."""
+
+    rows: Array
+    """Largest number of rows that a device sends to another one."""
+    borders: Array
+    """[2] room for the borders, as `BorderRoom` has it."""
+
+
+def travel(
     exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, rays: Array | None = None
-) -> Array:
-    """Return the largest number of rows that a device sends to another one for a view that is drawn beside others.
+) -> Travel:
+    """Return the room that a view needs.
 
     Args:
       exchange: the D devices.
@@ -213,8 +195,10 @@ def rows_to_send(
     """
     M, cutoff = exchange.filled_up(M), exchange.filled_up(cutoff, -1.0)
     bands = Bands.of(grid, exchange.num // exchange.views_at_once)
-    reached = bands.reached(M, cutoff, near_plane, bands.pixels(rays))
-    return jnp.max(jnp.sum(reached.reshape(bands.num, exchange.num, -1), axis=2, dtype=jnp.int32))
+    boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), grid, bands.pixels(rays))
+    borders = bands.borders(bands.pairs_of_rows(boxes))
+    reached = bands.reached(boxes, borders).reshape(bands.num, exchange.num, -1)
+    return Travel(jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32)), bands.room_for(borders))
 
 
 class _Room(NamedTuple):
@@ -234,10 +218,9 @@ def _composite_band(
     settings: CompositingSettings, bands: Bands, room: _Room, rule: AppearanceRule, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
     pixels: TilePixels | None,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return channels [C, h, W] and transmittance [h, W] of this device's band, the capacity needed, the overflow."""
-    reach = functools.partial(bands.reached, near_plane=settings.near_plane, pixels=pixels)
-    reached = jax.vmap(reach)(jax.lax.stop_gradient(splats.M), cutoff)
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return [C + 1, h, W] channels and transmittance of this device's pixels, the capacity needed, the overflow."""
+    borders, reached = _cut(settings, bands, jax.lax.stop_gradient(splats.M), cutoff, pixels)
     num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
     chosen, chosen_of_views = _chosen_rows(reached, room.rows)
     send = functools.partial(_send, chosen_of_views)
@@ -251,28 +234,56 @@ def _composite_band(
 
     index = jax.lax.axis_index(AXIS)
     view, band = index // bands.num, index % bands.num
+    top, end = bands.pixels_of(borders[view], band)
     jacobian = jacobian[view]
     if pixels is None:  # Else pixels keep their places in the image plane, from which M leads to them.
-        top = band * bands.own.height
         splats, jacobian = splats._replace(M=_shifted(splats.M, top)), _shifted(jacobian[None], top)[0]
     else:
-        pixels = band_pixels(pixels, band * bands.own.num, bands.own.num)
-    lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels)
+        first, last = (own * bands.own.columns for own in (borders[view, band], borders[view, band + 1]))
+        pixels = band_pixels(pixels, first, bands.own.num, last - first)
+    lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels, end - top)
     own = settings._replace(grid=bands.own, tile_batch=min(settings.tile_batch, bands.own.num))
     channels, transmittance = composite_arrays(own, rule, splats, texels, regions, cutoff, lists, jacobian, probe)
-    is_sent = num_sent <= room.rows
+    image = jnp.concatenate([channels, transmittance[None]])
+    image = bands.to_even(image, borders[view], index, len(borders), AXIS)
     needed = jnp.maximum(lists.num_pairs / room.pairs_share, num_sent / room.rows_share)
-    overflow = jax.lax.pmax((lists.overflow | ~is_sent).astype(jnp.int32), AXIS) > 0
-    return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
+    is_moved_too_far = jnp.any(jax.vmap(bands.room_for)(borders) > jnp.asarray(bands.room))
+    overflow = lists.overflow | (num_sent > room.rows) | is_moved_too_far
+    overflow = jax.lax.pmax(overflow.astype(jnp.int32), AXIS) > 0
+    return image, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
 
 
 def _lists_of_band(
-    settings: CompositingSettings, bands: Bands, room: _Room, M: Array, cutoff: Array, pixels: TilePixels | None
-) -> TileLists:
-    """Return the splats of each tile of a band, given the pixels of its tiles if they have rays of their own."""
-    if pixels is None and settings.compositor == "native":
-        return native.tile_lists(M, cutoff, settings.near_plane, bands.own, room.pairs)
-    return tile_lists(M, cutoff, settings.near_plane, bands.own, room.pairs, pixels)
+    settings: CompositingSettings, bands: Bands, room: _Room, M: Array, cutoff: Array, pixels: TilePixels | None,
+    height: Array,
+) -> TileLists:  # fmt: skip
+    """Return the splats of each tile of a band of so many rows of pixels, given the pixels of its tiles if they have
+    rays of their own."""
+    if pixels is not None:
+        return tile_lists(M, cutoff, settings.near_plane, bands.own, room.pairs, pixels)
+    list_tiles = native.tile_lists if settings.compositor == "native" else tile_lists
+    return list_tiles(M, cutoff, settings.near_plane, bands.own, room.pairs, height=height)
+
+
+def _cut(
+    settings: CompositingSettings, bands: Bands, M: Array, cutoff: Array, pixels: TilePixels | None
+) -> tuple[Array, Array]:
+    """Return the borders [G, D/G + 1] of the bands, the same on all devices, and [G, D/G, n] which bands are reached by
+    each of this device's n splats.
+
+    Args:
+      settings, bands: static.
+      M, cutoff: [G, n, ...] of this device's splats, as for `core.geometry.screen_bounds`.
+      pixels: of all tiles, if they have rays of their own.
+    """
+    boxes = jax.vmap(
+        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.near_plane), settings.grid, pixels)
+    )(M, cutoff)  # fmt: skip
+    num_devices = bands.num * cutoff.shape[0]
+    most = jnp.int32((2**31 - 1) // num_devices)
+    pairs = jax.lax.psum(jnp.clip(jax.vmap(bands.pairs_of_rows)(boxes), 0, most), AXIS)
+    borders = jax.vmap(bands.borders)(pairs)
+    return borders, jax.vmap(bands.reached)(boxes, borders)
 
 
 def _chosen_rows(reached: Array, most: int) -> tuple[Array, Array]:

@@ -81,10 +81,12 @@ def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> Til
     )
 
 
-def band_pixels(pixels: TilePixels, first: Array, num: int) -> TilePixels:
-    """Return the pixels of so many tiles in a row, from tile `first` on."""
+def band_pixels(pixels: TilePixels, first: Array, num: int, num_shown: Array) -> TilePixels:
+    """Return the pixels of so many tiles in a row, from tile `first` on, of which the last ones may not be shown."""
     band: TilePixels = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, num), pixels)
-    return band
+    is_shown = (jnp.arange(num, dtype=jnp.int32) < num_shown)[:, None]
+    nowhere = jnp.asarray([[jnp.inf, jnp.inf, -jnp.inf, -jnp.inf]], band.boxes.dtype)
+    return band._replace(is_seen=band.is_seen & is_shown, boxes=jnp.where(is_shown, band.boxes, nowhere))
 
 
 def _boxes(places: Array, is_seen: Array) -> Array:

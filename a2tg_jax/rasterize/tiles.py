@@ -6,7 +6,7 @@ of P = tile_size² pixels are numbered row by row.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,12 @@ class TileLists(NamedTuple):
     """Whether the pairs did not fit; the lists are then empty."""
     pixels: TilePixels | None = None
     """Pixels of the tiles, if the camera has a ray for each pixel."""
+    height: Array | None = None
+    """int32 rows of pixels that are shown; None: those of the grid."""
+
+    def height_in(self, grid: TileGrid) -> Any:
+        """Return the rows of pixels that are shown of a grid."""
+        return grid.height if self.height is None else self.height
 
 
 class Rectangles(NamedTuple):
@@ -145,8 +151,9 @@ def _touches(outline: Outline, distance_to_box: Callable[[Array, Array], tuple[A
 
 
 def tile_lists(
-    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: TilePixels | None = None
-) -> TileLists:
+    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: TilePixels | None = None,
+    height: Array | None = None,
+) -> TileLists:  # fmt: skip
     """List the splats that touch each tile, ordered by depth, ties by index.
 
     Args:
@@ -154,10 +161,12 @@ def tile_lists(
       grid: tiles of the image.
       capacity: number of pairs that fit, before the outline test; `overflow` tells if there were more.
       pixels: of the tiles, if the camera has a ray for each pixel.
+      height: int32 rows of pixels that are shown, at most those of the grid; None: all.
     """
     bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
-    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, grid, pixels))
+    shown = grid if height is None else grid._replace(height=height)  # type: ignore[arg-type]
+    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, shown, pixels))
     total = total_pairs(rectangles.counts)
     overflow = exceeds(total, capacity)
     counts = jnp.where(overflow, 0, rectangles.counts)
@@ -181,7 +190,7 @@ def tile_lists(
     is_kept = (position < ends[-1]) & is_touched
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)
-    return TileLists(ids, starts, total, overflow, pixels)
+    return TileLists(ids, starts, total, overflow, pixels, height)
 
 
 def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:

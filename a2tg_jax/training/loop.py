@@ -21,8 +21,9 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, rows_of_view
+from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, travel_of_view
 from a2tg_jax.rasterize.exchange import Exchange, spread
+from a2tg_jax.rasterize.image_bands import BorderRoom
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -55,6 +56,8 @@ MOST_TOLD = 300
 PLANNED_VIEWS = 64
 GROWTH_ROOM = 1.5
 """Room in the lists of a stage, as a multiple of the pairs of the first image."""
+SURELY_FITTING = 0.999
+"""Share of the capacity that surely holds pairs whose number is rounded."""
 
 OnCheckpoint = Callable[[Checkpoint], None]
 OnLog = Callable[[Mapping[str, float]], object]
@@ -309,9 +312,7 @@ class StageRun:
         self.state = dataclasses.replace(self.state, status=fine)
         if info.status == OVERFLOW:
             self.num_regrown += 1
-            size = self._size(iteration)
-            self.capacities[size] = self._capacity(size, float(info.num_pairs) * GROWTH_ROOM)
-            return
+            return self._make_room(self._size(iteration), float(info.num_pairs))
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
             raise self._diverged(iteration, where, info)
@@ -321,6 +322,14 @@ class StageRun:
             f"training cannot go on {where}: {reasons}; check the cameras and points of the scene, or lower "
             "rates.logit_opacities"
         )
+
+    def _make_room(self, size: tuple[int, int], num_pairs: float) -> None:
+        """Make room for the pairs of views of a size or, if there was enough, for the borders between bands."""
+        exchange = self.exchanges.get(size)
+        if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
+            self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
+        else:
+            self.exchanges[size] = dataclasses.replace(exchange, border_room=exchange.border_room.wider())
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
         """Return the error that names the values that are not finite or too large."""
@@ -401,12 +410,16 @@ class StageRun:
         return dataclasses.replace(settings, capacity=self.capacities[size], exchange=self.exchanges.get(size))
 
     def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
-        """Return the exchange with room for the rows that travel in some views once all rows exist."""
+        """Return the exchange with room for the rows that travel in some views once all rows exist, and for the borders
+        between bands."""
         model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
-        most = max(rows_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras)
+        found = [travel_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras]
+        most = max(own for own, _ in found)
         share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
-        return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity)
+        above, below = (max(own) for own in zip(*(room for _, room in found), strict=True))
+        room = BorderRoom(*(int(GROWTH_ROOM * own) + settings.tile_size for own in (above, below)))
+        return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity, border_room=room)
 
     def _capacity(self, size: tuple[int, int], pairs: float) -> int:
         """Return a capacity for so many pairs in views of a size, one that the session knows if possible."""

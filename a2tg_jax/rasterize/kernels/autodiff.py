@@ -46,7 +46,7 @@ def composite_tiles(
             return jax.lax.cond(xla.is_unfinished(tiles.end, carry), add, lambda carry: carry, carry), None
 
         shape = settings.tile_batch, settings.num_channels, settings.grid.tile_size**2
-        carry = (start, *xla.initial_state(settings, tiles), jnp.zeros(shape, dtype))
+        carry = (start, *xla.initial_state(settings, lists, tiles), jnp.zeros(shape, dtype))
         (_, transmittance, _, channels), _ = jax.lax.scan(jax.checkpoint(step), carry, length=num_blocks)
         return channels, transmittance
 

@@ -19,7 +19,7 @@ def pack_inputs(
     Rays of pixels are packed apart (`native.composite`).
     """
     packed = pack_splats(splats, settings.has_geometry, cutoff).astype(splats.M.dtype)
-    size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
+    size = jnp.asarray([settings.grid.columns, settings.grid.width, lists.height_in(settings.grid)], jnp.int32)
     return lists.ids, lists.starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size
 
 

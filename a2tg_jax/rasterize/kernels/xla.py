@@ -84,7 +84,7 @@ def forward(
             return at + BLOCK, transmittance, is_live, channels + added
 
         shape = settings.tile_batch, settings.num_channels, settings.grid.tile_size**2
-        carry = (start, *initial_state(settings, tiles), jnp.zeros(shape, dtype))
+        carry = (start, *initial_state(settings, lists, tiles), jnp.zeros(shape, dtype))
         _, transmittance, _, channels = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)
         return channels, transmittance
 
@@ -121,7 +121,7 @@ def backward(
             *state, d_rows = pull_back(rows, at, tiles, *state, g[index])
             return (at + BLOCK, *state, _accumulate(totals, in_block, d_rows))
 
-        carry = (start, *initial_state(settings, tiles), suffix_sum[index], totals)
+        carry = (start, *initial_state(settings, lists, tiles), suffix_sum[index], totals)
         totals = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)[-1]
         return totals
 
@@ -131,12 +131,13 @@ def backward(
     return d_splats, d_texels, d_probe
 
 
-def initial_state(settings: CompositingSettings, tiles: Tiles) -> tuple[Array, Array]:
-    """Return transmittance 1 [G, P], and the live pixels [G, P]; those outside the image never are."""
+def initial_state(settings: CompositingSettings, lists: TileLists, tiles: Tiles) -> tuple[Array, Array]:
+    """Return transmittance 1 [G, P], and the live pixels [G, P]; those that are not shown never are."""
     if tiles.pixels is not None:
         return jnp.ones_like(tiles.pixels.is_seen, tiles.x.dtype), tiles.pixels.is_seen
     x, y = pixels_of_tile(settings.grid.tile_size, tiles.x.dtype)
-    is_inside = (tiles.x[:, None] + x < settings.grid.width) & (tiles.y[:, None] + y < settings.grid.height)
+    height = lists.height_in(settings.grid)
+    is_inside = (tiles.x[:, None] + x < settings.grid.width) & (tiles.y[:, None] + y < height)
     return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
 
 

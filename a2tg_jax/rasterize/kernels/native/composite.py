@@ -80,7 +80,9 @@ def backward(
     return unpack_gradients(settings, found, splats, texels, probe)
 
 
-def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
+def tile_lists(
+    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, height: Array | None = None
+) -> TileLists:
     """List the splats of each tile; arguments and result are those of `rasterize.tiles.tile_lists`."""
     from a2tg_jax.rasterize.kernels.native.lists import list_functions
 
@@ -89,9 +91,9 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
         f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
     )
     results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
-    size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)
+    size = jnp.asarray([grid.columns, grid.width, grid.height if height is None else height], jnp.int32)
     ids, starts, num_pairs, overflow = ffi.call(name, results, M, cutoff.astype(M.dtype), size)
-    return TileLists(ids, starts, num_pairs, overflow)
+    return TileLists(ids, starts, num_pairs, overflow, height=height)
 
 
 def _list_handler(functions: "ListFunctions", arguments: list[np.ndarray], results: list[np.ndarray]) -> None:

@@ -1,0 +1,86 @@
+"""Borders between bands: as even as rows of tiles allow, for any counts. `on_devices` composites with them."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes_random import as_camera, as_gaussians, draw_scene
+
+from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
+from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
+
+TILE = 8
+
+
+def bands_of(rows, num):
+    return Bands.of(TileGrid(40, rows * TILE, TILE), num)
+
+
+def least_largest(pairs, num):
+    """The least possible number of pairs of the fullest band, found by trying every cut of the first rows."""
+    sums = np.concatenate([[0], np.cumsum(pairs)])
+    least = sums.astype(float)
+    for _ in range(num - 1):
+        least = np.array([np.maximum(least[: end + 1], sums[end] - sums[: end + 1]).min() for end in range(len(sums))])
+    return least[-1]
+
+
+def profiles(rows):
+    rng = np.random.default_rng(0)
+    spread = np.arange(rows)
+    yield "even", np.full(rows, 700)
+    yield "nothing", np.zeros(rows, int)
+    yield "upper quarter", np.where(spread < rows // 4, 900, 0)
+    yield "last row", np.where(spread == rows - 1, 50, 0)
+    yield "sky", np.where(spread < rows // 3, 40, 1000) + rng.integers(0, 30, rows)
+    yield "noise", rng.integers(0, 2000, rows)
+
+
+@pytest.mark.parametrize("rows, num", [(133, 8), (133, 64), (67, 2), (7, 4), (3, 4)])
+def test_the_fullest_band_has_few_pairs(rows, num):
+    for name, pairs in profiles(rows):
+        borders = np.asarray(bands_of(rows, num).borders(jnp.asarray(pairs, jnp.int32)))
+        assert borders[0] == 0 and borders[-1] == rows and (np.diff(borders) >= 0).all(), name
+        largest = max(pairs[first:end].sum() for first, end in itertools.pairwise(borders))
+        assert largest <= 1.11 * least_largest(pairs, num) + pairs.max(), name
+
+
+def test_counts_near_the_largest_integer_are_cut_evenly():
+    borders = bands_of(128, 4).borders(jnp.full(128, 2**31 - 1, jnp.int32))
+    np.testing.assert_array_equal(borders, [0, 32, 64, 96, 128])
+
+
+def test_an_even_image_needs_no_room_and_room_bounds_bands():
+    bands = bands_of(64, 4)
+    assert bands.room_for(bands.even_borders()).tolist() == [0, 0]
+    borders = bands.borders(jnp.asarray(np.where(np.arange(64) < 16, 900, 0), jnp.int32))
+    above, below = bands.room_for(borders).tolist()
+    assert above > 20 * TILE and below == 0, "all borders move up"
+    own = Bands.of(bands.whole, 4, BorderRoom(above, below)).own
+    assert int(np.diff(borders).max()) <= own.rows < bands.whole.rows
+    assert [hop.bands for hop in Bands.of(bands.whole, 4, BorderRoom(0, 0)).hops()] == [0]
+
+
+def test_rows_of_tiles_have_the_pairs_of_the_lists():
+    scene = draw_scene(3, num=200, width=64, height=45)
+    M, _ = homographies(as_gaussians(scene, "float32"), as_camera(scene, "float32"))
+    cutoff, grid = jnp.full(200, 9.0), TileGrid(64, 45, TILE)
+    boxes = tile_rectangles(screen_bounds(M, cutoff, 0.2), grid)
+    bands = Bands.of(grid, 3)
+    pairs = np.asarray(bands.pairs_of_rows(boxes))
+    for row in range(grid.rows):
+        above, here = (
+            tile_lists(M, cutoff, 0.2, grid, 1 << 15, height=jnp.int32(min(45, end * TILE))) for end in (row, row + 1)
+        )
+        assert pairs[row] == float(here.num_pairs) - float(above.num_pairs) > 0
+    borders = bands.borders(jnp.asarray(pairs))
+    reached = np.asarray(bands.reached(boxes, borders))
+    first, end = np.asarray(boxes.y0), np.asarray(boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1))
+    for band, (top, bottom) in enumerate(itertools.pairwise(np.asarray(borders))):
+        expected = [
+            count > 0 and bool(set(range(a, b)) & set(range(top, bottom)))
+            for a, b, count in zip(first, end, np.asarray(boxes.counts), strict=True)
+        ]
+        np.testing.assert_array_equal(reached[band], expected)
