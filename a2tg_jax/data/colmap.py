@@ -133,10 +133,14 @@ def viewmat_of(image: Any) -> np.ndarray:
 def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo:
     """Return the files and the lens of one registered image."""
     file, still_to_downscale = locate_image(images_folder, image.name, downscale)
+
+    def refused(error: Exception) -> str:
+        if isinstance(lens, KeptLens):
+            return f"{file}: its camera model {error}"
+        return f"{file}: its camera model {error}; undistort the scene with COLMAP first"
+
     return Photo(
-        image.name, file, still_to_downscale, lambda _: lens,
-        source=str(file),
-        advice="" if isinstance(lens, KeptLens) else "; undistort the scene with COLMAP first",
+        image.name, file, still_to_downscale, lambda _: lens, refused,
         mask=find_mask(images_folder, image.name, downscale),
         depths=find_depths(images_folder, image.name),
     )  # fmt: skip

@@ -34,10 +34,8 @@ class Photo(NamedTuple):
     """Factor by which the file's pixels are downscaled."""
     lens_of: Callable[[tuple[int, int]], Lens]
     """Function from the file's (width, height) to the lens."""
-    source: str
-    """Beginning of an error about the lens."""
-    advice: str
-    """End of that error."""
+    refused: Callable[[Exception], str]
+    """Function from an error of the lens to a message that names the photograph."""
     mask: tuple[Path, int] | None
     """File of the mask, and the factor by which it is downscaled."""
     depths: Path | None
@@ -158,4 +156,4 @@ def _named(photo: Photo) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{photo.source}: its camera model {error}{photo.advice}") from None
+        raise ValueError(photo.refused(error)) from None

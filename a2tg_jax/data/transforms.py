@@ -176,8 +176,7 @@ def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> P
     image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
     return Photo(
         name, image_file, still_to_downscale, lambda stored: _lens(frame, stored, f"{file}: {name}", use),
-        source=f"{file}: {name}",
-        advice="",
+        refused=lambda error: f"{file}: {name}: its camera model {error}",
         mask=_find_mask(file, frame, image_folder / image_name, downscale),
         depths=_find_depths(file, frame, image_folder / image_name),
     )  # fmt: skip
