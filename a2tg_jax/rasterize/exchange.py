@@ -161,16 +161,18 @@ def composite_in_bands(
     bands = Bands.of(settings.grid, num_bands, exchange.border_room)
     on_device = functools.partial(_composite_band, settings, bands, room, rule)
     rows, of_views, everywhere = P(AXIS), P(None, AXIS), P()
-    image, num_pairs, overflow = jax.shard_map(
+    channels, transmittance, num_pairs, overflow = jax.shard_map(
         on_device,
         mesh=exchange.mesh,
         in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere, everywhere),
-        out_specs=(P(None, AXIS), everywhere, everywhere),
+        out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
     )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian, bands.pixels(rays))
-    image = image.reshape(image.shape[0], num_views, -1, settings.grid.width)[:, :, : settings.grid.height]
+    height, width = settings.grid.height, settings.grid.width
+    channels = channels.reshape(channels.shape[0], num_views, -1, width)[:, :, :height]
+    transmittance = transmittance.reshape(num_views, -1, width)[:, :height]
     num_pairs, overflow = (jnp.broadcast_to(x, (num_views,)) for x in (num_pairs, overflow))
-    return Composited(jnp.moveaxis(image[:-1], 1, 0), image[-1], num_pairs, overflow)
+    return Composited(jnp.moveaxis(channels, 1, 0), transmittance, num_pairs, overflow)
 
 
 class Travel(NamedTuple):
@@ -218,8 +220,8 @@ def _composite_band(
     settings: CompositingSettings, bands: Bands, room: _Room, rule: AppearanceRule, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
     pixels: TilePixels | None,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return [C + 1, h, W] channels and transmittance of this device's pixels, the capacity needed, the overflow."""
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Return channels [C, h, W] and transmittance [h, W] of this device's pixels, the capacity needed, the overflow."""
     borders, reached = _cut(settings, bands, jax.lax.stop_gradient(splats.M), cutoff, pixels)
     num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
     chosen, chosen_of_views = _chosen_rows(reached, room.rows)
@@ -244,13 +246,15 @@ def _composite_band(
     lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels, end - top)
     own = settings._replace(grid=bands.own, tile_batch=min(settings.tile_batch, bands.own.num))
     channels, transmittance = composite_arrays(own, rule, splats, texels, regions, cutoff, lists, jacobian, probe)
-    image = jnp.concatenate([channels, transmittance[None]])
-    image = bands.to_even(image, borders[view], index, len(borders), AXIS)
+    if bands.num > 1:
+        image = jnp.concatenate([channels, transmittance[None]])
+        image = bands.to_even(image, borders[view], index, len(borders), AXIS)
+        channels, transmittance = image[:-1], image[-1]
     needed = jnp.maximum(lists.num_pairs / room.pairs_share, num_sent / room.rows_share)
     is_moved_too_far = jnp.any(jax.vmap(bands.room_for)(borders) > jnp.asarray(bands.room))
     overflow = lists.overflow | (num_sent > room.rows) | is_moved_too_far
     overflow = jax.lax.pmax(overflow.astype(jnp.int32), AXIS) > 0
-    return image, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
+    return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
 
 
 def _lists_of_band(

@@ -148,13 +148,12 @@ class Bands(NamedTuple):
         """
         band, height = device % self.num, self.even_height
         first, end = self.pixels_of(borders, band)
-        padded = jnp.pad(image, ((0, 0), (height, height), (0, 0)))
         even = jnp.zeros((image.shape[0], height, image.shape[2]), image.dtype)
         for hop in self.hops():
             top = (band + hop.bands) * height + hop.first
             rows = top + jnp.arange(hop.rows, dtype=jnp.int32)
-            sent = jax.lax.dynamic_slice_in_dim(padded, top - first + height, hop.rows, axis=1)
-            sent = jnp.where(((rows >= first) & (rows < end))[:, None], sent, 0)
+            places = rows - first + jnp.where(rows < end, 0, image.shape[1])
+            sent = _rows_at(image, places)
             if hop.bands:
                 sent = jax.lax.ppermute(sent, axis, list(self._ways(hop.bands, num_views)))
             even = even.at[:, hop.first : hop.first + hop.rows].add(sent)
@@ -165,3 +164,11 @@ class Bands(NamedTuple):
         for device in range(self.num * num_views):
             if 0 <= device % self.num + bands < self.num:
                 yield device, device + bands
+
+
+def _rows_at(image: Array, places: Array) -> Array:
+    """Return rows [C, n, W] of an image [C, h, W] at ascending places [n]; zeros where a place is outside."""
+    rows: Array = image.at[:, places].get(
+        mode="fill", fill_value=0, wrap_negative_indices=False, unique_indices=True, indices_are_sorted=True
+    )
+    return rows
