@@ -1,6 +1,6 @@
 """Renders and trains on one, two and four devices of a CPU and compares; run by `test_devices` in a process of its own.
 
-python tests/on_devices.py rendering|balance|overflowing|batches|training|textures FOLDER
+python tests/on_devices.py rendering|balance|overflowing|batches|lenses|training|textures FOLDER
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
+from scenes_random import fisheye
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.geometry import homographies, screen_bounds
@@ -26,6 +27,7 @@ from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.divergence import jitted_attempt
 from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.start import padded
 
@@ -41,6 +43,24 @@ def scene():
 def plain():
     found = scene()
     return a2tg.Model(a2tg.init_from_points(found.points, found.colors, sh_degree=1, opacity=0.6))
+
+
+def behind_lenses(found):
+    """A scene behind two fisheyes, whose corner has no rays; the second one's focal length is a tenth longer."""
+    corner = np.add.outer(np.arange(54), np.arange(72)) < 20
+    shared = {}
+
+    def kept(index, view):
+        longer = 1.1 if index % 3 == 0 else 1.0
+        if longer not in shared:
+            K = view.camera.K * jnp.asarray([[longer], [longer], [1.0]])
+            rays = fisheye(dataclasses.replace(view.camera, K=K)).rays
+            shared[longer] = K, np.asarray(jnp.where(corner[..., None], jnp.nan, rays))
+        K, rays = shared[longer]
+        camera = dataclasses.replace(view.camera, K=K, rays=rays)
+        return dataclasses.replace(view, camera=camera, mask=None)
+
+    return dataclasses.replace(found, train=tuple(kept(index, view) for index, view in enumerate(found.train)))
 
 
 def textured():
@@ -231,6 +251,41 @@ def batches(folder):
         assert arguments[0].render.exchange.num_at_once(size) == (2 if size == 6 else size)
         if is_streamed:
             check_parts(arguments[4].images, [run.views[index].image for index in run.order.indices(1)])
+        close(alone, attempted(arguments))
+        run.photographs.close()
+
+
+def lenses(folder):
+    """Photographs behind two lenses, of which each device has the rays, have the gradients of one device."""
+    found = behind_lenses(scene())
+    camera = found.train[0].camera
+    moved = np.abs(camera.rays - np.moveaxis(np.mgrid[:54, :72][::-1], 0, -1) - 0.5)
+    assert np.nanmax(moved) > 5, "the lens bends by many pixels"
+    exchange = exchange_among(jax.devices())
+
+    def loss(model, output):
+        consistency = normal_consistency(output.normal, output.depth, output.alpha, camera)
+        return jnp.mean(output.color**2) + consistency + jnp.mean(output.distortion)
+
+    for model, compositor in ((textured(), "native"), (plain(), "xla")):
+        settings = dataclasses.replace(a2tg.plan_render(model, [camera]), compositor=compositor)
+        alone = a2tg.view_gradients(loss, model, camera, settings=settings)
+        own = dataclasses.replace(settings, exchange=exchange)
+        together = jax.jit(lambda m, own=own: a2tg.view_gradients(loss, m, camera, settings=own))
+        drawn = together(spread(exchange, model))
+        assert not drawn.output.overflow and float(alone.output.alpha.max()) > 0.5
+        close(alone._replace(num_pairs=0), drawn._replace(num_pairs=0))
+
+    base = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True)
+    for size, is_streamed in ((2, True), (4, False)):
+        own = dataclasses.replace(base, batch_size=size)
+        alone = attempted(StageRun(found, own, 0, plain()).arguments(1))
+        loop.PhotoStore = functools.partial(PhotoStore, room=0 if is_streamed else None)
+        run = StageRun(found, own, 0, plain(), session=Session(devices=jax.devices()))
+        arguments = run.arguments(1)
+        assert arguments[0].render.exchange.num_at_once(size) == size
+        rays = arguments[4].rays
+        assert len(rays.sharding.device_set) == 4 and rays.is_fully_replicated
         close(alone, attempted(arguments))
         run.photographs.close()
 

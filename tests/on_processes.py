@@ -16,14 +16,17 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from pathlib import Path
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 from on_devices import scene, system
+from test_pictures import write_scene
 
 import a2tg_jax as a2tg
+from a2tg_jax.data import decoding, photo_reading, photo_store
 from a2tg_jax.host.processes import LOST, Place, joined
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
@@ -154,12 +157,32 @@ def read_own_photographs(place):
     assert sorted(read) == sorted(view.name for view in own)
 
 
+def read_own_share():
+    """Read a scene together: each process decodes its share of the photographs, and the others when they are needed."""
+    read = []
+
+    def counted(file):
+        read.append(file)
+        return decoding.read_pixels(file)
+
+    photo_reading.read_pixels = photo_store.read_pixels = counted
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        write_scene(Path(folder), alpha=True)
+        scene = a2tg.load_scene(folder, room=0, is_divided=True)
+        assert len(read) == 6 // jax.process_count()
+        alone = a2tg.load_scene(folder)
+        for one, other in zip((*scene.train, *scene.test), (*alone.train, *alone.test), strict=True):
+            np.testing.assert_array_equal(one.picture.read(), other.picture.read())
+
+
 def wait(place, what):
     """Meet the other processes for ever, after reading photographs if that is asked for."""
     with joined(place) as team:
         team.advice = lambda: "go on"
         if what == "read":
             read_own_photographs(place)
+            read_own_share()
         while True:
             multihost_utils.process_allgather(np.zeros(1))
             print("met", flush=True)

@@ -228,6 +228,17 @@ def as_gaussians(scene: Scene, dtype: str) -> Gaussians:
     return Gaussians(**{name: jnp.asarray(getattr(scene, name), dtype) for name in fields})
 
 
+def fisheye(camera: Camera) -> Camera:
+    """The camera behind an equidistant lens: a pixel at r focal lengths from the middle looks at an angle of r."""
+    K, dtype = np.asarray(camera.K, np.float64), camera.K.dtype
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    places = np.linalg.solve(K, np.stack([x, y, np.ones_like(x)]).reshape(3, -1))[:2]
+    angles = np.linalg.norm(places, axis=0)
+    seen = np.concatenate([places * np.tan(angles) / angles, np.ones((1, places.shape[1]))])
+    rays = (K @ seen)[:2].T.reshape(camera.height, camera.width, 2)
+    return dataclasses.replace(camera, rays=jnp.asarray(rays, dtype))
+
+
 def as_camera(scene: Scene, dtype: str) -> Camera:
     """The scene's camera, in the package's form."""
     return Camera(jnp.asarray(scene.viewmat, dtype), jnp.asarray(scene.K, dtype), scene.width, scene.height)

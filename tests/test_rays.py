@@ -4,41 +4,27 @@ import dataclasses
 import functools
 import json
 import warnings
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
+from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, fisheye
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import PlainRule
 from a2tg_jax.core.cameras import Camera, looking, resize_camera
-from a2tg_jax.data.scene import kinds_of
+from a2tg_jax.data.scene import kinds_of, ray_bytes
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import pairs_of_view
-from a2tg_jax.rasterize.exchange import Exchange
 from a2tg_jax.systems.stage1 import PruneConfig
-from a2tg_jax.training.batches import check_lenses
-from a2tg_jax.training.loop import StageRun
+from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.start import initial_model
 
 WIDTH, HEIGHT = 43, 30
 BOTH = pytest.mark.parametrize("compositor", ["xla", "native"])
-
-
-def fisheye(camera: Camera) -> Camera:
-    """The camera behind an equidistant lens: a pixel at r focal lengths from the middle looks at an angle of r."""
-    K, dtype = np.asarray(camera.K, np.float64), camera.K.dtype
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    places = np.linalg.solve(K, np.stack([x, y, np.ones_like(x)]).reshape(3, -1))[:2]
-    angles = np.linalg.norm(places, axis=0)
-    seen = np.concatenate([places * np.tan(angles) / angles, np.ones((1, places.shape[1]))])
-    rays = (K @ seen)[:2].T.reshape(camera.height, camera.width, 2)
-    return dataclasses.replace(camera, rays=jnp.asarray(rays, dtype))
 
 
 def pinhole_rays(camera: Camera, K) -> Camera:
@@ -254,13 +240,14 @@ def test_pixels_too_far_from_the_direction_of_view_do_not_count(tmp_path):
         a2tg.load_scene(tmp_path, lens="crop")
 
 
-def test_one_device_trains_through_lenses(kept):
-    check_lenses(kept.train, 1)
-    with pytest.raises(ValueError, match=r"keeps its lens, .*: leave out --devices .* --lens undistort"):
-        check_lenses(kept.train, 2)
-    session = SimpleNamespace(exchange=Exchange(SimpleNamespace(size=2)))
-    with pytest.raises(ValueError, match="--devices"):
-        StageRun(kept, a2tg.Gaussians2dMcmc(), 0, None, session=session)
+@pytest.mark.parametrize("lacking", [0, 1])
+def test_rays_stay_on_the_device_if_those_of_all_lenses_fit(kept, lacking):
+    room = ray_bytes(kept.train) - lacking
+    photographs = PhotoStore(kept.train, BatchOrder(kept.train, 1, 0), 2, room=room)
+    first, second = (photographs.batch(iteration)[0].rays for iteration in (1, 2))
+    photographs.close()
+    assert (first is second) == (not lacking) and isinstance(first, jax.Array)
+    np.testing.assert_array_equal(second, kept.train[0].camera.rays)
 
 
 @pytest.mark.filterwarnings("ignore:training does not learn")

@@ -46,7 +46,6 @@ from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import SYSTEMS, Session, System, find_system
-from a2tg_jax.training.batches import check_lenses
 
 BASELINE = "gaussians-2d-mcmc"
 DEFAULT_PRESET = "paper"
@@ -185,7 +184,7 @@ class Train:
         run, session = RunFolder(self.out), tidy_session(devices_named(self.devices))
         team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
         record = self._resumed(open_run(self.out), is_written=False) if self.resume else self.record
-        scene = record.scene.load(room_for_photographs(bytes_allowed(self.max_memory)))
+        scene = record.scene.load(room_for_photographs(bytes_allowed(self.max_memory)), is_divided=True)
         follow(record, scene, session)
 
     def _run(self) -> None:
@@ -211,8 +210,7 @@ class Train:
         check_weights(weights)
         with opened(self.out) as run:
             record = self._resumed(run)
-            scene = record.scene.load(room_for_photographs(most))
-            check_lenses(scene.train, session.num_devices)
+            scene = record.scene.load(room_for_photographs(most), is_divided=self.coordinator is not None)
             given = given_splats(record)
             tell_forecast(scene, record.plan, most, session.num_devices, number_given(run, record, given))
             result = go_on(

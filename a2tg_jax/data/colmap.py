@@ -1,6 +1,5 @@
 """COLMAP scenes: a sparse model (.bin or .txt) beside a folder of images."""
 
-import dataclasses
 import logging
 import shutil
 import tempfile
@@ -16,11 +15,12 @@ from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.colmap_binary import RECORDS, check_binary
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.colmap_text import check_text
-from a2tg_jax.data.decoding import read_pixels
-from a2tg_jax.data.depth_files import depth_map, find_depths
-from a2tg_jax.data.images import check_aspect, locate_image, map_in_threads, num_readers
+from a2tg_jax.data.depth_files import find_depths
+from a2tg_jax.data.division import Division
+from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, load_mask
+from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
+from a2tg_jax.data.photo_reading import Photo, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat, scene_name
@@ -54,14 +54,16 @@ def _model_of(path: Path) -> Path:
 
 
 def load_colmap(
-    path: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
-) -> Scene:
+    path: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
+    division: Division | None = None,
+) -> Scene:  # fmt: skip
     """Read a COLMAP scene: every registered image as a view, and the sparse points.
 
     Args:
       path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
         beside the model, or up to two folders above.
       downscale, test_every, room, lens: as in `load_scene`.
+      division: processes that call this together; None: one.
 
     Raises:
       FileNotFoundError: if there is no model, no folder of images, or an image of the model is missing.
@@ -73,16 +75,16 @@ def load_colmap(
     images_folder = _find_images_folder(path, model, downscale)
     cameras = reconstruction.cameras.items()
     lenses = {key: checked_lens(camera, f"{model}: camera {key}", lens) for key, camera in cameras}
-    shelf = Shelf(room)
     registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
     _log_unregistered(images_folder, len(registered))
     reach = SAME_PLACE * spacing(registered)
 
-    def shoot(image: Any) -> Shot:
-        shot = _shot(image, lenses[image.camera_id], images_folder, downscale, shelf)
-        return dataclasses.replace(shot, panorama=panorama_of(image, reach))
+    def photo(image: Any) -> Photo:
+        return _photo(image, lenses[image.camera_id], images_folder, downscale)
 
-    shots = map_in_threads(shoot, registered, num_readers(path))
+    photos = map_in_threads(photo, registered, num_readers(path))
+    found = read_photos(photos, Shelf(room), division, path)
+    shots = [_shot(image, own, panorama_of(image, reach)) for image, own in zip(registered, found, strict=True)]
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
     train, test = every_kth(shots, test_every)
     cloud = _read_cloud(model, reconstruction)
@@ -128,22 +130,26 @@ def viewmat_of(image: Any) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _shot(image: Any, lens: Lens, images_folder: Path, downscale: int, shelf: Shelf) -> Shot:
-    """Return one registered image, undistorted and downscaled."""
+def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo:
+    """Return the files and the lens of one registered image."""
     file, still_to_downscale = locate_image(images_folder, image.name, downscale)
-    photograph = read_pixels(file)
-    check_aspect(file, photograph, *lens.size)
-    try:
-        pixels, K = lens.view_pixels(photograph, still_to_downscale)
-        rays = lens.rays(*pixels.shape[1::-1])
-    except ValueError as error:
+
+    def refused(error: Exception) -> str:
         if isinstance(lens, KeptLens):
-            raise ValueError(f"{file}: its camera model {error}") from None
-        raise ValueError(f"{file}: its camera model {error}; undistort the scene with COLMAP first") from None
-    mask = load_mask(find_mask(images_folder, image.name, downscale), lens, photograph, pixels)
-    kept = shelf.keep(pixels, file, None if pixels is photograph else lens.viewing(still_to_downscale))
-    depth = depth_map(find_depths(images_folder, image.name), lens, photograph, pixels)
-    return Shot(image.name, viewmat_of(image), K, kept, mask, rays, depth)
+            return f"{file}: its camera model {error}"
+        return f"{file}: its camera model {error}; undistort the scene with COLMAP first"
+
+    return Photo(
+        image.name, file, still_to_downscale, lambda _: lens, refused,
+        mask=find_mask(images_folder, image.name, downscale),
+        depths=find_depths(images_folder, image.name),
+    )  # fmt: skip
+
+
+def _shot(image: Any, read: Reading, panorama: int | None) -> Shot:
+    """Return one registered image whose photograph is read."""
+    mask = read.facts.mask
+    return Shot(image.name, viewmat_of(image), read.K, read.picture, mask, read.rays, read.depth, panorama)
 
 
 def spacing(images: Sequence[Any]) -> float:

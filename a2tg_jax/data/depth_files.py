@@ -39,18 +39,17 @@ def find_depths(images: Path, name: str) -> Path | None:
     return next((folder / each for each in own if is_regular(folder / each)), None)
 
 
-def depth_map(file: Path | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray) -> DepthMap | None:
+def depth_map(file: Path | None, lens: Lens, stored: tuple[int, int], size: tuple[int, int]) -> DepthMap | None:
     """Return the depth map of a view, undistorted and resized as its photograph when it is read; None for None.
 
     Args:
       file: from `find_depths`.
       lens: the photograph's camera.
-      photograph: as stored.
-      pixels: [H, W, ...] as the view has it.
+      stored: (width, height) of the photograph as stored.
+      size: (width, height) of the view.
     """
     if file is None:
         return None
-    size, stored = pixels.shape[1::-1], photograph.shape[1::-1]
 
     def load() -> np.ndarray:
         values = read_depths(file)

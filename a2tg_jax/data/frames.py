@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from a2tg_jax.data.division import Division, divided_masks
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture, Shelf
@@ -28,22 +29,25 @@ class Frames(NamedTuple):
 
 
 def load_frames(
-    made: Frames, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
-) -> Scene:
+    made: Frames, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
+    division: Division | None = None,
+) -> Scene:  # fmt: skip
     """Make a scene of frames of another program.
 
     Args:
       made: the frames.
       downscale, test_every, room, lens: as in `load_scene`.
+      division: processes that call this together; None: one.
 
     Raises:
       FileNotFoundError, ValueError: as `load_transforms`.
     """
     meta = {"frames": made.frames}
     check_meta(made.file, meta)
-    shots = sorted(read_shots(made.file, meta, downscale, Shelf(room), lens), key=lambda shot: shot.name)
+    (group,) = read_shots([(made.file, meta)], downscale, Shelf(room), lens, division)
+    shots = sorted(group, key=lambda shot: shot.name)
     if made.counted is not None:
-        shots = [_masked(shot, made.counted) for shot in shots]
+        shots = _masked(shots, made.counted, division)
     folder = made.file.resolve().parent
     return assemble_scene(scene_name(folder), *every_kth(shots, test_every), made.cloud, source=str(made.file))
 
@@ -55,7 +59,13 @@ def warn_of_missing_images(file: Path, lacking: Sequence[str], num_cameras: int)
         warnings.warn(f"{message}{shortened(lacking[0])}: not used", stacklevel=3)
 
 
-def _masked(shot: Shot, counted: Callable[[np.ndarray], np.ndarray]) -> Shot:
-    """Return a shot with a mask of its own pixels, unless it has one or all of them count."""
-    mask = counted(Picture.of(shot.pixels).read()) if shot.mask is None else None
-    return shot if mask is None or mask.all() else dataclasses.replace(shot, mask=Mask.of(mask))
+def _masked(shots: list[Shot], counted: Callable[[np.ndarray], np.ndarray], division: Division | None) -> list[Shot]:
+    """Return shots with a mask of their own pixels, unless they have one or all of them count."""
+
+    def mask_of(number: int) -> Mask | None:
+        shot = shots[number]
+        mask = counted(Picture.of(shot.pixels).read()) if shot.mask is None else None
+        return shot.mask if mask is None or mask.all() else Mask.of(mask)
+
+    masks = divided_masks([shot.name for shot in shots], mask_of, division)
+    return [dataclasses.replace(shot, mask=mask) for shot, mask in zip(shots, masks, strict=True)]

@@ -93,13 +93,13 @@ def downscaled_size(width: int, height: int, downscale: int) -> tuple[int, int]:
     return max(1, round(width / downscale)), max(1, round(height / downscale))
 
 
-def check_aspect(path: Path, pixels: np.ndarray, width: int, height: int) -> None:
-    """Raise ValueError if the image's aspect differs from that of the camera.
+def check_aspect(path: Path, stored: tuple[int, int], camera: tuple[int, int]) -> None:
+    """Raise ValueError if the image's aspect differs from that of the camera; both are (width, height).
 
     Raises:
       ValueError: naming the file and both sizes.
     """
-    image_height, image_width = pixels.shape[:2]
+    (image_width, image_height), (width, height) = stored, camera
     ratio = (image_width * height) / (image_height * width)
     if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(image_width, image_height)):
         raise ValueError(

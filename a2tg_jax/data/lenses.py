@@ -95,15 +95,25 @@ class Lens:
         Returns:
           (pixels [h', w', C] uint8, K [3, 3] for them).
         """
-        K, size = self.pinhole
-        image_size = pixels.shape[1], pixels.shape[0]
+        (K, size), stored = self.pinhole, (pixels.shape[1], pixels.shape[0])
         if not self.is_pinhole:
-            scales = np.divide(image_size, self.size)
-            undistorted_size = round(size[0] * scales[0]), round(size[1] * scales[1])
-            pixels = self._warp(pixels, scaled_intrinsics(K, size, undistorted_size), undistorted_size)
-            image_size = undistorted_size
-        new_size = downscaled_size(*image_size, downscale)
-        return resize_pixels(pixels, *new_size), scaled_intrinsics(K, size, new_size)
+            whole = self._undistorted_size(stored)
+            pixels = self._warp(pixels, scaled_intrinsics(K, size, whole), whole)
+        new_size, K = self.view_of(stored, downscale)
+        return resize_pixels(pixels, *new_size), K
+
+    def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
+        """Return (width, height) and K [3, 3] of the view of a photograph of a size, as `view_pixels` makes it."""
+        K, size = self.pinhole
+        new_size = downscaled_size(*self._undistorted_size(stored), downscale)
+        return new_size, scaled_intrinsics(K, size, new_size)
+
+    def _undistorted_size(self, stored: tuple[int, int]) -> tuple[int, int]:
+        """Return (width, height) of a photograph of a size after it is undistorted, before it is downscaled."""
+        if self.is_pinhole:
+            return stored
+        scales, size = np.divide(stored, self.size), self.pinhole[1]
+        return round(size[0] * scales[0]), round(size[1] * scales[1])
 
     def viewing(self, downscale: int) -> Callable[[np.ndarray], np.ndarray]:
         """Return the function from the pixels of a photograph to those of its view."""
@@ -153,8 +163,13 @@ class KeptLens(Lens):
 
     def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return a photograph divided by `downscale`, and its K [3, 3]; `rays` are places in the image plane of K."""
-        new_size = downscaled_size(pixels.shape[1], pixels.shape[0], downscale)
-        return resize_pixels(pixels, *new_size), scaled_intrinsics(self._matrix(), self.size, new_size)
+        new_size, K = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
+        return resize_pixels(pixels, *new_size), K
+
+    def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
+        """Return (width, height) and K [3, 3] of a photograph of a size, divided by `downscale`."""
+        new_size = downscaled_size(*stored, downscale)
+        return new_size, scaled_intrinsics(self._matrix(), self.size, new_size)
 
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] of each pixel of a photograph as they are."""

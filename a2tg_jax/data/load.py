@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
+from a2tg_jax.data.division import Division, among_processes
 from a2tg_jax.data.frames import Frames, load_frames
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
@@ -41,6 +42,7 @@ def load_scene(
     room: int | None = None,
     alpha: AlphaMeaning = "transparency",
     lens: LensUse = "undistort",
+    is_divided: bool = False,
 ) -> Scene:
     """Read photographs, cameras and points, and normalise the world.
 
@@ -62,6 +64,8 @@ def load_scene(
         pixels count.
       lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
         with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
+      is_divided: whether the processes of `jax.distributed` call this together. Each then reads an equal share of the
+        photographs, and of the others those that have room in its memory.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the input's.
@@ -75,12 +79,13 @@ def load_scene(
         raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
     if lens not in get_args(LensUse):
         raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
+    division = among_processes() if is_divided else None
     try:
-        scene = _load(located(path), downscale, test_every, room, lens)
+        scene = _load(located(path), downscale, test_every, room, lens, division)
     finally:
         forget_rays()
     warn_of_lenses(scene)
-    return alpha_as_mask(scene, str(path)) if alpha == "mask" else scene
+    return alpha_as_mask(scene, str(path), division) if alpha == "mask" else scene
 
 
 def is_scene(folder: Path) -> bool:
@@ -90,7 +95,9 @@ def is_scene(folder: Path) -> bool:
     return has_cameras or _frames(folder) is not None
 
 
-def _load(path: Path, downscale: int, test_every: int, room: int | None, lens: LensUse) -> Scene:
+def _load(
+    path: Path, downscale: int, test_every: int, room: int | None, lens: LensUse, division: Division | None
+) -> Scene:
     """Load the scene as it lies on disk."""
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
@@ -100,7 +107,9 @@ def _load(path: Path, downscale: int, test_every: int, room: int | None, lens: L
         raise FileNotFoundError(f"{path}: no such scene folder")
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
-    options: dict[str, Any] = {"downscale": int(downscale), "test_every": test_every, "room": room, "lens": lens}
+    options: dict[str, Any] = {
+        "downscale": int(downscale), "test_every": test_every, "room": room, "lens": lens, "division": division,
+    }  # fmt: skip
     if not is_here:
         return _load_remote(path, options)
     check_no_video(path)

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.division import Division, divided_masks
 from a2tg_jax.data.images import resize_pixels
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
@@ -49,7 +50,9 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
     return found
 
 
-def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray, pixels: np.ndarray) -> Mask | None:
+def load_mask(
+    found: tuple[Path, int] | None, lens: Lens, stored: tuple[int, int], view_size: tuple[int, int]
+) -> Mask | None:
     """Return the mask of a view, undistorted and downscaled as its photograph was; None for None.
 
     A pixel counts if all its source pixels count.
@@ -57,8 +60,8 @@ def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray
     Args:
       found: file and factor from `find_mask`.
       lens: the photograph's camera.
-      photograph: as stored.
-      pixels: [H, W, ...] as the view has it.
+      stored: (width, height) of the photograph as stored.
+      view_size: (width, height) of the view.
 
     Raises:
       ValueError: naming the file, if it is no image, or its size is neither the photograph's nor its camera's.
@@ -67,13 +70,13 @@ def load_mask(found: tuple[Path, int] | None, lens: Lens, photograph: np.ndarray
         return None
     file, still_to_downscale = found
     counts = read_pixels(file)[..., :3].any(axis=-1)
-    size, photograph_size = counts.shape[::-1], photograph.shape[1::-1]
-    if size not in (photograph_size, lens.size):
-        told = "x".join(map(str, size)), "x".join(map(str, photograph_size))
+    size = counts.shape[::-1]
+    if size not in (stored, lens.size):
+        told = "x".join(map(str, size)), "x".join(map(str, stored))
         raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
     planes, _ = lens.view_pixels(planes, still_to_downscale)
-    return Mask.of(resize_pixels(planes, *pixels.shape[1::-1])[..., 0] == 255)
+    return Mask.of(resize_pixels(planes, *view_size)[..., 0] == 255)
 
 
 def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) -> None:
@@ -101,24 +104,39 @@ def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) 
             _check_left(shot.mask, shot.name, source)
 
 
-def alpha_as_mask(scene: Scene, source: str) -> Scene:
+def alpha_as_mask(scene: Scene, source: str, division: Division | None = None) -> Scene:
     """Return the scene with the alpha of its photographs as masks. Only opaque pixels count.
+
+    Args:
+      scene: the scene.
+      source: name of the input in messages.
+      division: processes that call this together, and read a share of the photographs each; None: one.
 
     Raises:
       ValueError: naming a photograph without opaque pixels.
     """
+    views = [*scene.train, *scene.test]
 
-    def masked(view: View) -> View:
+    def mask_of(number: int) -> Mask | None:
+        view = views[number]
         if not view.has_alpha:
-            return view
-        picture, (height, width) = view.picture, view.picture.size
-        is_opaque = picture.read()[..., 3] == 255
+            return view.mask
+        is_opaque = view.picture.read()[..., 3] == 255
         mask = Mask.of(is_opaque if view.mask is None else is_opaque & view.mask.read())
         _check_left(mask, view.name, source)
-        opaque = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: picture.read()[..., :3])
-        return dataclasses.replace(view, picture=opaque, mask=mask)
+        return mask
 
-    return dataclasses.replace(scene, train=tuple(map(masked, scene.train)), test=tuple(map(masked, scene.test)))
+    masks = divided_masks([view.name for view in views], mask_of, division)
+    masked = [_opaque(view, mask) for view, mask in zip(views, masks, strict=True)]
+    return dataclasses.replace(scene, train=tuple(masked[: len(scene.train)]), test=tuple(masked[len(scene.train) :]))
+
+
+def _opaque(view: View, mask: Mask | None) -> View:
+    """Return a view without its alpha, and with a mask."""
+    picture, (height, width) = view.picture, view.picture.size
+    if view.has_alpha:
+        picture = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: view.picture.read()[..., :3])
+    return dataclasses.replace(view, picture=picture, mask=mask)
 
 
 def _at_scale(folder: Path, name: str, downscale: int) -> tuple[Path, int] | None:

@@ -1,7 +1,9 @@
 """Masks: pixels of a photograph that count, compressed in memory."""
 
+import base64
 import dataclasses
 import zlib
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +32,16 @@ class Mask:
             raise ValueError(f"a mask must be bool [H, W], True where pixels count; got {counts.dtype} {counts.shape}")
         height, width = counts.shape
         return Mask((height, width), int(counts.sum()), zlib.compress(np.packbits(counts).tobytes(), 1))
+
+    def told(self) -> list[Any]:
+        """Return what `of_told` reads, for JSON."""
+        return [*self.shape, self.num, base64.b64encode(self.data).decode()]
+
+    @staticmethod
+    def of_told(told: list[Any]) -> "Mask":
+        """Return the mask that `told` was made of."""
+        height, width, num, data = told
+        return Mask((height, width), num, base64.b64decode(data))
 
     @property
     def is_full(self) -> bool:

@@ -7,7 +7,7 @@ import tempfile
 import threading
 import weakref
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -100,6 +100,43 @@ class Shelf:
             if self._room >= 0:
                 return Picture.of(pixels)
             self._room += pixels.nbytes
+        return self._left(pixels, source, view)
+
+    def fitting(self, sizes: Sequence[int]) -> list[bool]:
+        """Return which pictures of so many bytes have room in memory, if they are kept in this order."""
+        room, fitting = self._room, []
+        for size in sizes:
+            fitting.append(size <= room)
+            room -= size if fitting[-1] else 0
+        return fitting
+
+    def later(self, shape: tuple[int, ...], source: Path, view: Processing | None) -> Picture:
+        """Return the picture in an image file that is not read before it is needed, and not kept in memory then.
+
+        Args:
+          shape: of its pixels.
+          source, view: as for `keep`.
+        """
+        lock, kept = threading.Lock(), list[Picture]()
+
+        def read() -> np.ndarray:
+            with lock:
+                if not kept:
+                    stored = read_pixels(source)
+                    pixels = np.ascontiguousarray(stored if view is None else view(stored))
+                    if pixels.shape != shape:
+                        raise ValueError(
+                            f"{source}: has pixels {list(pixels.shape)}, but {list(shape)} where another process has "
+                            "read it; give all processes the same photographs"
+                        )
+                    kept.append(self._left(pixels, source, view))
+                    return pixels
+            return kept[0].read()
+
+        return Picture(shape, read, is_remote=is_remote(source))
+
+    def _left(self, pixels: np.ndarray, source: Path | None, view: Processing | None) -> Picture:
+        """Return a picture of pixels without room in memory. Arguments as for `keep`."""
         if source is not None and (view is None or self._is_made_again(source, pixels.nbytes)):
             return _decoded_again(source, pixels, view)
         return self._put(pixels)

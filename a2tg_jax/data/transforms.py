@@ -6,6 +6,7 @@ both are in the file's own world, which is the original world here.
 """
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.decoding import read_pixels
-from a2tg_jax.data.depth_files import depth_map, find_depths
-from a2tg_jax.data.images import check_aspect, check_inside, locate_image, map_in_threads, num_readers
+from a2tg_jax.data.depth_files import find_depths
+from a2tg_jax.data.division import Division
+from a2tg_jax.data.images import check_inside, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import check_masks, find_mask, load_mask, named_mask
+from a2tg_jax.data.mask_files import check_masks, find_mask, named_mask
+from a2tg_jax.data.photo_reading import Photo, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import (
@@ -48,8 +50,9 @@ logger = logging.getLogger(__name__)
 
 
 def load_transforms(
-    file: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
-) -> Scene:
+    file: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
+    division: Division | None = None,
+) -> Scene:  # fmt: skip
     """Read a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
@@ -58,13 +61,14 @@ def load_transforms(
     Args:
       file: path of transforms.json.
       downscale, test_every, room, lens: as in `load_scene`.
+      division: processes that call this together; None: one.
 
     Raises:
       FileNotFoundError: if an image or the point file is missing.
       ValueError: if the JSON, a frame, an image or a pose is invalid, or the views make no scene (`assemble_scene`).
     """
     meta = _read_json(file)
-    shots = read_shots(file, meta, downscale, Shelf(room), lens)
+    (shots,) = read_shots([(file, meta)], downscale, Shelf(room), lens, division)
     listed = {key: _names(meta[f"{key}_filenames"]) for key in ("train", "val", "test") if f"{key}_filenames" in meta}
     if listed:
         test_names = listed.get("test") or listed.get("val") or set()
@@ -78,8 +82,9 @@ def load_transforms(
 
 
 def load_blender(
-    folder: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort"
-) -> Scene:
+    folder: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
+    division: Division | None = None,
+) -> Scene:  # fmt: skip
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
     Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
@@ -88,18 +93,15 @@ def load_blender(
     Args:
       folder: the scene folder.
       downscale, test_every, room, lens: as in `load_scene`.
+      division: processes that call this together; None: one.
 
     Raises:
       FileNotFoundError, ValueError: as `load_transforms`.
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
-    shelf = Shelf(room)
-    train = read_shots(train_file, _read_json(train_file), downscale, shelf, lens)
-    test: list[Shot] = []
-    if is_regular(test_file):
-        test = read_shots(test_file, _read_json(test_file), downscale, shelf, lens)
-    else:
-        train, test = every_kth(train, test_every)
+    files = [train_file, test_file] if is_regular(test_file) else [train_file]
+    groups = read_shots([(file, _read_json(file)) for file in files], downscale, Shelf(room), lens, division)
+    train, test = groups if len(groups) == 2 else every_kth(groups[0], test_every)
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
     logger.info("%s: a Blender scene, starting from %s random points", folder, f"{len(cloud.points):,}")
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder))
@@ -141,19 +143,30 @@ def _check_texts(file: Path, values: dict[str, Any]) -> None:
             raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
 
 
-def read_shots(file: Path, meta: dict[str, Any], downscale: int, shelf: Shelf, use: LensUse) -> list[Shot]:
-    """Return the frames of a transforms file, downscaled, in the file's order."""
+def read_shots(
+    files: Sequence[tuple[Path, dict[str, Any]]], downscale: int, shelf: Shelf, use: LensUse,
+    division: Division | None = None,
+) -> list[list[Shot]]:  # fmt: skip
+    """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
-    def shoot(frame: dict[str, Any]) -> Shot:
-        return _shot(file, {**meta, **frame}, downscale, shelf, use)
+    Args:
+      files: with their contents, which `check_meta` has checked.
+      downscale, shelf, use, division: as `load_transforms` has them.
+    """
+    frames = [(file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]]
+    place = files[0][0]
+    photos = map_in_threads(lambda item: _photo(*item, downscale, use), frames, num_readers(place))
+    found = iter(read_photos(photos, shelf, division, place))
+    groups = []
+    for file, meta in files:
+        group = [_shot(file, {**meta, **frame}, next(found)) for frame in meta["frames"]]
+        check_masks(group, str(file))
+        groups.append(group)
+    return groups
 
-    shots = map_in_threads(shoot, meta["frames"], num_readers(file))
-    check_masks(shots, str(file))
-    return shots
 
-
-def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: LensUse) -> Shot:
-    """Return one frame; `frame` also holds the file's global values, which the frame's own override."""
+def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> Photo:
+    """Return the files of one frame; `frame` also holds the file's global values, which the frame's own override."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
     path = _beside(file, frame["file_path"])
@@ -161,18 +174,19 @@ def _shot(file: Path, frame: dict[str, Any], downscale: int, shelf: Shelf, use: 
     # Only a folder of images below the scene has siblings of the form images_k.
     image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
     image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
-    photograph = read_pixels(image_file)
-    lens = _lens(frame, photograph, f"{file}: {name}", use)
-    check_aspect(image_file, photograph, *lens.size)
-    try:
-        pixels, K = lens.view_pixels(photograph, still_to_downscale)
-        rays = lens.rays(*pixels.shape[1::-1])
-    except ValueError as error:
-        raise ValueError(f"{file}: {name}: its camera model {error}") from None
-    mask = load_mask(_find_mask(file, frame, image_folder / image_name, downscale), lens, photograph, pixels)
-    kept = shelf.keep(pixels, image_file, None if pixels is photograph else lens.viewing(still_to_downscale))
-    depth = depth_map(_find_depths(file, frame, image_folder / image_name), lens, photograph, pixels)
-    return Shot(name, _viewmat(frame["transform_matrix"], f"{file}: {name}"), K, kept, mask, rays, depth)
+    return Photo(
+        name, image_file, still_to_downscale, lambda stored: _lens(frame, stored, f"{file}: {name}", use),
+        refused=lambda error: f"{file}: {name}: its camera model {error}",
+        mask=_find_mask(file, frame, image_folder / image_name, downscale),
+        depths=_find_depths(file, frame, image_folder / image_name),
+    )  # fmt: skip
+
+
+def _shot(file: Path, frame: dict[str, Any], read: Reading) -> Shot:
+    """Return one frame whose photograph is read."""
+    name = Path(frame["file_path"]).as_posix()
+    viewmat = _viewmat(frame["transform_matrix"], f"{file}: {name}")
+    return Shot(name, viewmat, read.K, read.picture, read.facts.mask, read.rays, read.depth)
 
 
 def _beside(file: Path, name: str) -> Path:
@@ -209,9 +223,9 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
     return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
-def _lens(frame: dict[str, Any], pixels: np.ndarray, what: str, use: LensUse) -> Lens:
+def _lens(frame: dict[str, Any], stored: tuple[int, int], what: str, use: LensUse) -> Lens:
     """Return the camera of a frame; sizes default to the image's, the principal point to the centre."""
-    width, height = _side(frame, "w", pixels.shape[1], what), _side(frame, "h", pixels.shape[0], what)
+    width, height = _side(frame, "w", stored[0], what), _side(frame, "h", stored[1], what)
     fx, fy = _focal_lengths(frame, width, height, what)
     model, distortion = _distortion(frame, what)
     params = [fx, fy, _number(frame, "cx", width / 2, what), _number(frame, "cy", height / 2, what), *distortion]

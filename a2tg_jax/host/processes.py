@@ -187,6 +187,14 @@ def broadcast(data: bytes) -> bytes:
     return bytes(np.asarray(multihost_utils.broadcast_one_to_all(own), np.uint8)) if size else b""
 
 
+def gather(data: bytes) -> list[bytes]:
+    """Return the bytes of all processes, in the order of their numbers; all call it together."""
+    length = np.frombuffer(len(data).to_bytes(8, "big"), np.uint8)
+    sizes = [int.from_bytes(bytes(own), "big") for own in multihost_utils.process_allgather(length)]
+    padded = np.frombuffer(data.ljust(max(1, *sizes), b"\0"), np.uint8)
+    return [bytes(own[:size]) for own, size in zip(multihost_utils.process_allgather(padded), sizes, strict=True)]
+
+
 def is_of_collectives(error: BaseException) -> bool:
     """Return whether an error was raised because processes could not reach each other. A lack of memory is a process's
     own."""

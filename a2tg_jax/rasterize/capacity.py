@@ -112,7 +112,7 @@ def _travel(
     M, cutoff = _drawn(gaussians, camera, rule, num_live)
     assert settings.exchange is not None
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    return travel(settings.exchange, M, cutoff, settings.near_plane, grid)
+    return travel(settings.exchange, M, cutoff, settings.near_plane, grid, camera.rays)
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:

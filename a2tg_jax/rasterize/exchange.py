@@ -29,7 +29,8 @@ from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.packing import pack_splats, unpack_splats
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
-from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
+from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels
+from a2tg_jax.rasterize.tiles import TileGrid, TileLists, tile_lists, tile_rectangles
 
 AXIS = "rows"
 """Axis of the mesh along which rows of splats, and bands of pixels, lie on devices."""
@@ -133,7 +134,7 @@ def exchange_among(devices: Any) -> Exchange:
 
 def composite_in_bands(
     settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, rule: AppearanceRule,
-    cutoff: Array, jacobian: Array, probe: Array,
+    cutoff: Array, jacobian: Array, probe: Array, rays: Array | None,
 ) -> Composited:  # fmt: skip
     """Composite G views, the leading axis of all arrays, as `compositor.composite` does one: each device a band.
 
@@ -144,6 +145,7 @@ def composite_in_bands(
       exchange: the D devices; G divides D.
       capacity: number of pairs of a whole image.
       splats, cutoff, jacobian, probe: as for `composite`, [G, ...].
+      rays: [H, W, 2] of the lens that the views share (`Camera.rays`); None of a pinhole.
     """
     num_views = cutoff.shape[0]
     num_bands = exchange.num // num_views
@@ -162,10 +164,10 @@ def composite_in_bands(
     channels, transmittance, num_pairs, overflow = jax.shard_map(
         on_device,
         mesh=exchange.mesh,
-        in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere),
+        in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere, everywhere),
         out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
-    )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian)
+    )(splats, regions, jax.lax.stop_gradient(cutoff), probe, rule.texels, jacobian, bands.pixels(rays))
     height, width = settings.grid.height, settings.grid.width
     channels = channels.reshape(channels.shape[0], num_views, -1, width)[:, :, :height]
     transmittance = transmittance.reshape(num_views, -1, width)[:, :height]
@@ -184,17 +186,20 @@ class Travel(NamedTuple):
     """Rows of pixels by which they move down."""
 
 
-def travel(exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid) -> Travel:
+def travel(
+    exchange: Exchange, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, rays: Array | None = None
+) -> Travel:
     """Return the room that a view needs.
 
     Args:
       exchange: the D devices.
       M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
       grid: tiles of the image.
+      rays: of the lens, as for `composite_in_bands`.
     """
     M, cutoff = exchange.filled_up(M), exchange.filled_up(cutoff, -1.0)
     bands = Bands.of(grid, exchange.num // exchange.views_at_once)
-    boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), grid)
+    boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), grid, bands.pixels(rays))
     borders = bands.borders(bands.pairs_of_rows(boxes))
     reached = bands.reached(boxes, borders).reshape(bands.num, exchange.num, -1)
     return Travel(jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32)), *bands.room_for(borders))
@@ -216,9 +221,10 @@ class _Room(NamedTuple):
 def _composite_band(
     settings: CompositingSettings, bands: Bands, room: _Room, rule: AppearanceRule, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
+    pixels: TilePixels | None,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return channels [C, h, W] and transmittance [h, W] of this device's pixels, the capacity needed, the overflow."""
-    borders, reached = _cut(settings, bands, jax.lax.stop_gradient(splats.M), cutoff)
+    borders, reached = _cut(settings, bands, jax.lax.stop_gradient(splats.M), cutoff, pixels)
     num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
     chosen, chosen_of_views = _chosen_rows(reached, room.rows)
     send = functools.partial(_send, chosen_of_views)
@@ -233,11 +239,13 @@ def _composite_band(
     index = jax.lax.axis_index(AXIS)
     view, band = index // bands.num, index % bands.num
     top, end = bands.pixels_of(borders[view], band)
-    M, jacobian = _shifted(splats.M, top), _shifted(jacobian[view][None], top)[0]
-    splats = splats._replace(M=M)
-    list_tiles = native.tile_lists if settings.compositor == "native" else tile_lists
-    near_plane = settings.near_plane
-    lists = list_tiles(jax.lax.stop_gradient(M), cutoff, near_plane, bands.own, room.pairs, height=end - top)
+    jacobian = jacobian[view]
+    if pixels is None:  # Else pixels keep their places in the image plane, from which M leads to them.
+        splats, jacobian = splats._replace(M=_shifted(splats.M, top)), _shifted(jacobian[None], top)[0]
+    else:
+        first, last = (own * bands.own.columns for own in (borders[view, band], borders[view, band + 1]))
+        pixels = band_pixels(pixels, first, bands.own.num, last - first)
+    lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels, end - top)
     own = settings._replace(grid=bands.own, tile_batch=min(settings.tile_batch, bands.own.num))
     channels, transmittance = composite_arrays(own, rule, splats, texels, regions, cutoff, lists, jacobian, probe)
     if bands.num > 1:
@@ -251,16 +259,31 @@ def _composite_band(
     return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
 
 
-def _cut(settings: CompositingSettings, bands: Bands, M: Array, cutoff: Array) -> tuple[Array, Array]:
+def _lists_of_band(
+    settings: CompositingSettings, bands: Bands, room: _Room, M: Array, cutoff: Array, pixels: TilePixels | None,
+    height: Array,
+) -> TileLists:  # fmt: skip
+    """Return the splats of each tile of a band of so many rows of pixels, given the pixels of its tiles if they have
+    rays of their own."""
+    if pixels is not None:
+        return tile_lists(M, cutoff, settings.near_plane, bands.own, room.pairs, pixels)
+    list_tiles = native.tile_lists if settings.compositor == "native" else tile_lists
+    return list_tiles(M, cutoff, settings.near_plane, bands.own, room.pairs, height=height)
+
+
+def _cut(
+    settings: CompositingSettings, bands: Bands, M: Array, cutoff: Array, pixels: TilePixels | None
+) -> tuple[Array, Array]:
     """Return the borders [G, D/G + 1] of the bands, the same on all devices, and [G, D/G, n] which bands are reached by
     each of this device's n splats.
 
     Args:
       settings, bands: static.
       M, cutoff: [G, n, ...] of this device's splats, as for `core.geometry.screen_bounds`.
+      pixels: of all tiles, if they have rays of their own.
     """
     boxes = jax.vmap(
-        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.near_plane), settings.grid)
+        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.near_plane), settings.grid, pixels)
     )(M, cutoff)  # fmt: skip
     num_devices = bands.num * cutoff.shape[0]
     most = jnp.int32((2**31 - 1) // num_devices)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.rasterize.tile_pixels import TilePixels, tile_pixels
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid
 
 EMPTY_TILES = 10
@@ -69,6 +70,11 @@ class Bands(NamedTuple):
         size = self.whole.tile_size
         rows = -(-(self.even_height + self.room.above + self.room.below) // size)
         return self.whole._replace(height=min(rows * size, self.whole.height))
+
+    def pixels(self, rays: Array | None) -> TilePixels | None:
+        """Return the pixels of all tiles, and of so many below the image that any band has its own grid of them; None
+        of a pinhole camera."""
+        return None if rays is None else tile_pixels(rays, self.whole.tile_size, self.whole.rows + self.own.rows)
 
     def pairs_of_rows(self, boxes: Rectangles) -> Array:
         """Return the number of pairs in each row of tiles, [rows] int32."""

@@ -52,15 +52,16 @@ def pixels_of(camera: Camera, tile_size: int) -> TilePixels | None:
     return None if camera.rays is None else tile_pixels(camera.rays, tile_size)
 
 
-def tile_pixels(rays: Array, tile_size: int) -> TilePixels:
+def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> TilePixels:
     """Return the pixels of all tiles.
 
     Args:
       rays: [H, W, 2] places of the pixels' rays in the image plane; not finite where a pixel has none.
       tile_size: side of a tile.
+      num_rows: number of rows of tiles; pixels below the image have no ray. None: those of the image.
     """
     height, width = rays.shape[:2]
-    num_rows, num_columns = -(-height // tile_size), -(-width // tile_size)
+    num_rows, num_columns = -(-height // tile_size) if num_rows is None else num_rows, -(-width // tile_size)
     margins = (0, num_rows * tile_size - height), (0, num_columns * tile_size - width), (0, 0)
     padded = jnp.pad(jax.lax.stop_gradient(rays), margins, constant_values=jnp.nan)
     blocks = padded.reshape(num_rows, tile_size, num_columns, tile_size, 2).transpose(0, 2, 4, 1, 3)
@@ -78,6 +79,14 @@ def tile_pixels(rays: Array, tile_size: int) -> TilePixels:
         boxes=boxes,
         magnifications=jnp.sqrt(jnp.sum(jacobians**2, axis=(1, 2))),
     )
+
+
+def band_pixels(pixels: TilePixels, first: Array, num: int, num_shown: Array) -> TilePixels:
+    """Return the pixels of so many tiles in a row, from tile `first` on, of which the last ones may not be shown."""
+    band: TilePixels = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, num), pixels)
+    is_shown = (jnp.arange(num, dtype=jnp.int32) < num_shown)[:, None]
+    nowhere = jnp.asarray([[jnp.inf, jnp.inf, -jnp.inf, -jnp.inf]], band.boxes.dtype)
+    return band._replace(is_seen=band.is_seen & is_shown, boxes=jnp.where(is_shown, band.boxes, nowhere))
 
 
 def _boxes(places: Array, is_seen: Array) -> Array:

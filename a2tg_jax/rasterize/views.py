@@ -20,7 +20,7 @@ from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import IMAGES, RenderOutput, RenderSettings
 from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, Splats, project_gaussians
 from a2tg_jax.rasterize.supersampling import box_mean, finer
-from a2tg_jax.rasterize.tile_pixels import TilePixels, pixels_of
+from a2tg_jax.rasterize.tile_pixels import pixels_of
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists
 
 BATCH_ON_ACCELERATOR = 4096
@@ -69,8 +69,9 @@ def render_traced(
     }  # fmt: skip
     if settings.exchange is None:
         return _rendered(_alone, gaussians, camera, rule, background, settings, probe=probe, **options)
-    gaussians, camera, background, probe = jax.tree.map(lambda x: x[None], (gaussians, camera, background, probe))
-    views = render_together(gaussians, camera, rule, background, settings, probe=probe, **options)
+    cameras = dataclasses.replace(camera, viewmat=camera.viewmat[None], K=camera.K[None])
+    gaussians, background, probe = jax.tree.map(lambda x: x[None], (gaussians, background, probe))
+    views = render_together(gaussians, cameras, rule, background, settings, probe=probe, **options)
     only: tuple[RenderOutput, Array] = jax.tree.map(lambda x: x[0], views)
     return only
 
@@ -92,7 +93,7 @@ def render_together(
 
     Args:
       gaussians, cameras, backgrounds, probe: as for `render_traced`, [G, ...]: each view has its own copy of the
-        Gaussians, so that gradients are of each view.
+        Gaussians, so that gradients are of each view. The rays of the cameras, [H, W, 2], are shared.
       rule: shared by the views.
       settings: with a capacity and an exchange, whose number of devices G divides; without supersampling.
       has_geometry, sh_degree, num_live, statistic: as for `render_traced`.
@@ -124,8 +125,8 @@ def _rendered(
 ) -> tuple[RenderOutput, Array]:  # fmt: skip
     """Return the output of one view, or of several if `each` is `jax.vmap`; other arguments as of `render_traced`."""
     compositor = choose(settings.compositor, settings.tile_size)
-    if camera.rays is not None:
-        compositor = _for_rays(settings, compositor)
+    if camera.rays is not None and compositor == "cuda":
+        compositor = _for_rays(settings)
     compositing = _compositing_settings(
         camera, settings, compositor, has_geometry, None if probe is None else statistic, rule.num_colors
     )
@@ -134,11 +135,12 @@ def _rendered(
         return each(functools.partial(_empty_view, compositing))(background), jnp.zeros(views, jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
 
-    def projected(gaussians: Gaussians, camera: Camera) -> tuple[Splats, Array, Array]:
-        splats, cutoff = project_gaussians(gaussians, camera, rule, settings.near_plane, degree, num_live)
-        return splats, cutoff, jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
+    def projected(gaussians: Gaussians, viewmat: Array, K: Array) -> tuple[Splats, Array, Array]:
+        seen = dataclasses.replace(camera, viewmat=viewmat, K=K)
+        splats, cutoff = project_gaussians(gaussians, seen, rule, settings.near_plane, degree, num_live)
+        return splats, cutoff, jax.lax.stop_gradient(K @ viewmat[:3, :3])
 
-    splats, cutoff, jacobian = each(projected)(gaussians, camera)
+    splats, cutoff, jacobian = each(projected)(gaussians, camera.viewmat, camera.K)
     of_one = splats if each is _alone else jax.tree.map(lambda x: x[0], splats)
     if reason := refusal(compositing, rule, of_one):
         settings = dataclasses.replace(settings, compositor=instead_of(settings.compositor, type(rule), reason))
@@ -147,8 +149,7 @@ def _rendered(
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
     probe = jnp.zeros((*views, num, 4), splats.M.dtype) if probe is None else probe
-    pixels = pixels_of(camera, settings.tile_size)
-    shown = _composited(compositing, settings, splats, rule, cutoff, jacobian, probe, pixels)
+    shown = _composited(compositing, settings, splats, rule, cutoff, jacobian, probe, camera)
 
     def shaded(shown: Composited, cutoff: Array, background: Array) -> RenderOutput:
         taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
@@ -160,12 +161,14 @@ def _rendered(
 
 def _composited(
     compositing: CompositingSettings, settings: RenderSettings, splats: Splats, rule: AppearanceRule, cutoff: Array,
-    jacobian: Array, probe: Array, pixels: TilePixels | None,
+    jacobian: Array, probe: Array, camera: Camera,
 ) -> Composited:  # fmt: skip
     """Return the image without background, of one device; or those of several views, of several devices."""
     capacity = settings.capacity or 0
     if settings.exchange is not None:
-        return composite_in_bands(compositing, settings.exchange, capacity, splats, rule, cutoff, jacobian, probe)
+        arrays = splats, rule, cutoff, jacobian, probe, camera.rays
+        return composite_in_bands(compositing, settings.exchange, capacity, *arrays)
+    pixels = pixels_of(camera, settings.tile_size)
     M, near_plane, grid = jax.lax.stop_gradient(splats.M), compositing.near_plane, compositing.grid
     if pixels is None and compositing.compositor == "native":
         lists = native.tile_lists(M, cutoff, near_plane, grid, capacity)
@@ -175,12 +178,8 @@ def _composited(
     return Composited(channels, transmittance, lists.num_pairs, lists.overflow)
 
 
-def _for_rays(settings: RenderSettings, compositor: Compositor) -> Compositor:
-    """Return the compositor for a camera with a ray for each pixel."""
-    if settings.exchange is not None:
-        raise ValueError("cameras with rays are rendered on one device: leave out settings.exchange (--devices)")
-    if compositor != "cuda":
-        return compositor
+def _for_rays(settings: RenderSettings) -> Compositor:
+    """Return the compositor in place of CUDA kernels for a camera with a ray for each pixel."""
     if settings.compositor != "auto":
         raise ValueError("compositor='cuda' cannot render cameras with rays: say 'xla', or 'auto'")
     return "xla"

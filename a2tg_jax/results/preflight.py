@@ -8,6 +8,7 @@ from pathlib import Path
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
+from a2tg_jax.host.processes import team
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import format_of
@@ -20,7 +21,6 @@ from a2tg_jax.results.output import check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training import System
-from a2tg_jax.training.batches import check_lenses
 from a2tg_jax.training.start import check_start, initial_number, num_rows
 
 STATE_SIZE = 3
@@ -58,8 +58,7 @@ def check_new_run(
         check_init(given, out, record.system)
     num_given = None if given is None else given.splats.num
     check_output(out)
-    scene = record.scene.load(room_for_photographs(max_memory))
-    check_lenses(scene.train, num_devices)
+    scene = record.scene.load(room_for_photographs(max_memory), is_divided=team() is not None)
     for system in record.systems.values():
         check_start(scene, system, num_given if system is record.system else None)
     check_room(record, scene, out, num_given)

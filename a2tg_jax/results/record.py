@@ -21,6 +21,7 @@ from typing import Any, Literal
 import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
+from a2tg_jax.data.division import among_processes
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.data.scene import scene_name, with_validation_views
@@ -77,22 +78,27 @@ class SceneSource:
         folder = os.path.dirname(self.path) if Path(self.path).suffix == ".json" else self.path
         return scene_name(folder if is_url(folder) else Path(folder))
 
-    def load(self, room: int | None = None) -> Scene:
+    def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:
         """Return the scene in its normalised world.
 
         Args:
           room: bytes of memory for photographs that are read from files, as in `load_scene`.
+          is_divided: whether the processes of a training call this together, as in `load_scene`.
 
         Raises:
           FileNotFoundError, ValueError: as `load_scene` does.
         """
+        division = among_processes() if is_divided else None
+        if division is not None:  # All of them must load in the same way.
+            told = dataclasses.replace(self, path=SYNTHETIC if self.path == SYNTHETIC else "")
+            division.check_same(repr(told), "options of the scene (--downscale, --test-every, --alpha, --lens)")
         every = self.test_every
         if self.path == SYNTHETIC:
             width, height = SYNTHETIC_SIZE
             scene = synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=every)
         else:
             given: Any = {"downscale": self.downscale, "alpha": self.alpha, "lens": self.lens}
-            scene = load_scene(self.path, test_every=every, room=room, **given)
+            scene = load_scene(self.path, test_every=every, room=room, is_divided=is_divided, **given)
         return with_validation_views(scene) if self.validation else scene
 
 

@@ -95,7 +95,9 @@ class BatchPlan(NamedTuple):
     """Place of the photographs during training."""
 
     is_resident: bool
-    """All of them stay there."""
+    """All of them stay on the device, with the rays of their lenses."""
+    keeps_rays: bool
+    """The rays of all lenses stay on the device. Otherwise those of a batch come with it."""
     batch_bytes: int
     """Bytes of the largest batch."""
     num_ahead: int
@@ -106,11 +108,12 @@ def plan_batches(
     views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
 ) -> BatchPlan:
     """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
-    sizes = [view_bytes(view, has_depths) for view in views]
-    fits = sum(sizes) + ray_bytes(views) <= (device_room() if room is None else room)
+    sizes, of_rays = [view_bytes(view, has_depths) for view in views], ray_bytes(views)
+    room = device_room() if room is None else room
     batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
-    return BatchPlan(fits and all(view.picture.is_held for view in views), batch_bytes, num_ahead)
+    is_resident = sum(sizes) + of_rays <= room and all(view.picture.is_held for view in views)
+    return BatchPlan(is_resident, of_rays <= room, batch_bytes, num_ahead)
 
 
 def view_bytes(view: View, has_depths: bool = False) -> int:
@@ -144,6 +147,8 @@ class PhotoStore:
         self._has_depths = has_depths
         plan = plan_batches(views, len(order.indices(1)), room, has_depths)
         self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
+        self._keeps_rays = plan.keeps_rays
+        self._rays: dict[tuple[int, int, int], Array] = {}
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
         is_waiting = any(view.picture.is_remote for view in views)
         self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
@@ -156,22 +161,38 @@ class PhotoStore:
           ValueError, OSError: if a photograph that was left where it lies has gone, has changed or cannot be read.
         """
         indices = self._order.indices(iteration)
+        kind = self._order.kinds[indices[0]]
         if not self.is_resident:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             batch = self._ahead.first({key: self._order.indices(key) for key in following})
+            batch = batch._replace(rays=self._rays_of(kind, batch.rays))
             return on_devices(batch, self._exchange, spread_views), None
-        stack, places = self._stack(self._order.kinds[indices[0]])
+        stack, places = self._stack(kind)
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
     def _stack(self, kind: tuple[int, int, int]) -> tuple[Photographs, dict[int, int]]:
         """Return all photographs of a kind on the device, and the place of each view's."""
         if kind not in self._stacks:
             found = [index for index, own in enumerate(self._order.kinds) if own == kind]
-            stack = on_devices(self._stacked(found), self._exchange, spread_pixels)
+            stack = self._stacked(found)
+            stack = on_devices(stack._replace(rays=self._rays_of(kind, stack.rays)), self._exchange, spread_pixels)
             if self._exchange is None:
                 stack = jax.device_put(stack)
             self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[kind]
+
+    def _rays_of(self, kind: tuple[int, int, int], rays: Array | None) -> Array | None:
+        """Return the rays of a lens on every device, which keeps them if those of all lenses fit; None of a
+        pinhole."""
+        if rays is None:
+            return None
+        if kind not in self._rays:
+            exchange = self._exchange
+            placed = jax.device_put(rays) if exchange is None else everywhere(exchange, rays)
+            if not self._keeps_rays:
+                return placed
+            self._rays[kind] = placed
+        return self._rays[kind]
 
     def _read(self, indices: Sequence[int]) -> Photographs:
         """Return the photographs of an iteration, without those that other processes' devices draw."""
@@ -190,7 +211,8 @@ class PhotoStore:
 def on_devices(
     photographs: Photographs, exchange: Exchange | None, spread: Callable[[Exchange, Array], Array]
 ) -> Photographs:
-    """Return photographs with their pictures spread over the devices by a function; without an exchange they stay."""
+    """Return photographs with their pictures spread over the devices by a function; without an exchange they stay. The
+    rays of their lens stay in any case."""
     if exchange is None:
         return photographs
     on_all, in_parts = (functools.partial(place, exchange) for place in (everywhere, spread))
@@ -239,16 +261,6 @@ def check_depths(views: tuple[View, ...]) -> None:
         raise ValueError(
             "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
             "into the folder depths beside images, or set it to 0"
-        )
-
-
-def check_lenses(views: tuple[View, ...], num_devices: int) -> None:
-    """Raise ValueError if photographs behind a lens are to be trained on by several devices."""
-    view = next((view for view in views if view.camera.rays is not None), None)
-    if view is not None and num_devices > 1:
-        raise ValueError(
-            f"view {view.name} keeps its lens, which one device trains: leave out --devices and --coordinator, or say "
-            "--lens undistort"
         )
 
 

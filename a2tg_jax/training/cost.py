@@ -174,8 +174,9 @@ def fed_bytes(views: Sequence[View], batch_size: int, has_depths: bool = False) 
     if plan.is_resident:
         return sum(view_bytes(view, has_depths) for view in views) + ray_bytes(views)
     is_read = any(not view.picture.is_held for view in views)
+    of_rays = ray_bytes(views) if plan.keeps_rays else 0
     readers = min(plan.num_ahead, num_threads()) * is_read
-    return (2 * plan.num_ahead + 1) * plan.batch_bytes + readers * DECODER_PER_PIXEL * largest_view(views)
+    return of_rays + (2 * plan.num_ahead + 1) * plan.batch_bytes + readers * DECODER_PER_PIXEL * largest_view(views)
 
 
 def largest_view(views: Sequence[View]) -> int:

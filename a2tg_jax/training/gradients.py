@@ -137,8 +137,10 @@ class View(NamedTuple):
         return self._replace(camera=corrected_camera(self.corrections, self.rows, self.camera))
 
 
-AXES_OF_VIEWS = View(camera=0, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
-"""Axes of several views in one, of which the corrections are shared, for `jax.vmap`."""
+def _axes_of(views: View) -> View:
+    """Return the axes of several views in one, for `jax.vmap`: they share the corrections, and the rays of the lens."""
+    cameras = dataclasses.replace(views.camera, viewmat=0, K=0, rays=None)  # type: ignore[arg-type]
+    return View(cameras, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
 
 
 class Differentiated(NamedTuple):
@@ -217,16 +219,14 @@ def differentiate_together(
 
     Args:
       loss, model, settings, has_geometry, sh_degree, statistic, has_probe: as for `differentiate`.
-      views: with a leading axis G, but for the corrections.
+      views: with a leading axis G, but for the corrections and the camera's rays.
     """
-    num_views = views.background.shape[0]
+    num_views, axes = views.background.shape[0], _axes_of(views)
 
     def of_parameters(
         gaussians: Gaussians, params: Any, rows: tuple[Array, ...], probe: Array | None
     ) -> tuple[Array, tuple[Any, ...]]:
-        seen = jax.vmap(lambda view: view.corrected, in_axes=(AXES_OF_VIEWS,), out_axes=AXES_OF_VIEWS)(
-            views._replace(rows=rows)
-        )
+        seen: View = jax.vmap(lambda view: view.corrected, in_axes=(axes,), out_axes=axes)(views._replace(rows=rows))
         outputs, num_pairs = render_together(
             gaussians, seen.camera, dataclasses.replace(model, params=params).rule, views.background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
@@ -235,7 +235,7 @@ def differentiate_together(
         def of_view(gaussians: Gaussians, view: View, output: RenderOutput) -> tuple[Array, Any]:
             return loss(dataclasses.replace(model, gaussians=gaussians, params=params), view, output)
 
-        values, told = jax.vmap(of_view, in_axes=(0, AXES_OF_VIEWS, 0))(gaussians, seen, outputs)
+        values, told = jax.vmap(of_view, in_axes=(0, axes, 0))(gaussians, seen, outputs)
         return jnp.sum(values), (values, told, num_pairs)
 
     copies: Gaussians = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_views, *x.shape)), model.gaussians)

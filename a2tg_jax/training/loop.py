@@ -26,7 +26,7 @@ from a2tg_jax.rasterize.exchange import Exchange, spread
 from a2tg_jax.rasterize.image_bands import BorderRoom
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.training.batches import BatchOrder, PhotoStore, check_lenses
+from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
@@ -121,7 +121,6 @@ class StageRun:
         exchange = self.session.exchange
         self.exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
-        check_lenses(self.views, self.num_devices)
         self.stage = system.stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
         self._logged, self.earlier_seconds = HistoryLog(resume.history if resume else History.empty()), 0.0

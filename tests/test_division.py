@@ -1,0 +1,212 @@
+"""Scenes that several processes read together: threads, each with a folder of its own, in place of processes."""
+
+import collections
+import functools
+import json
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_data_colmap import write_scene as write_colmap
+from test_masks import left_half, write_mask
+from test_pictures import KINDS, write_scene
+from test_rays import write_fisheye
+
+from a2tg_jax import load_scene
+from a2tg_jax.data import decoding, load, photo_reading, photo_store
+from a2tg_jax.data.division import Division
+from a2tg_jax.results import record
+from a2tg_jax.results.record import SYNTHETIC, SceneSource
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*random points")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """Number of decodings by folder of the scene."""
+    num = collections.Counter()
+
+    def counted(file):
+        num[next(part for part in file.parts if part.startswith("scene"))] += 1
+        return decoding.read_pixels(file)
+
+    for module in (photo_reading, photo_store):
+        monkeypatch.setattr(module, "read_pixels", counted)
+    return num
+
+
+@pytest.fixture
+def together(monkeypatch):
+    """Function that calls others, one in each process, and returns their results or errors."""
+    own = threading.local()
+    for module in (load, record):
+        monkeypatch.setattr(module, "among_processes", lambda: own.division)
+
+    def call(*functions, seconds=60):
+        barrier, told, found = threading.Barrier(len(functions), timeout=seconds), {}, {}
+
+        def run(index, function):
+            def gather(data):
+                told[index] = data
+                barrier.wait()
+                parts = [told[number] for number in range(len(functions))]
+                barrier.wait()
+                return parts
+
+            own.division = Division(index, len(functions), gather)
+            try:
+                found[index] = function()
+            except (ValueError, OSError, threading.BrokenBarrierError) as error:
+                found[index] = error
+
+        threads = [threading.Thread(target=run, args=item) for item in enumerate(functions)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return [found[index] for index in range(len(functions))]
+
+    return call
+
+
+def copies(folder, count):
+    """Copies of a scene, as processes have it on disks of their own."""
+    return [shutil.copytree(folder, folder.parent / f"scene{index}") for index in range(count)]
+
+
+def loading(folders, **options):
+    return [lambda folder=folder: load_scene(folder, is_divided=True, **options) for folder in folders]
+
+
+def assert_same_views(found, expected):
+    for one, other in zip((*found.train, *found.test), (*expected.train, *expected.test), strict=True):
+        assert one.name == other.name and one.picture.shape == other.picture.shape
+        np.testing.assert_array_equal(one.camera.K, other.camera.K)
+        np.testing.assert_array_equal(one.camera.viewmat, other.camera.viewmat)
+        assert one.mask == other.mask
+        for _ in range(2):
+            np.testing.assert_array_equal(one.picture.read(), other.picture.read())
+
+
+@pytest.mark.parametrize(("kind", "count"), [*((kind, 2) for kind in KINDS), ("as in their files", 4)])
+def test_each_process_decodes_its_share_of_the_photographs(tmp_path, together, decoded, kind, count):
+    changes = dict(KINDS[kind])
+    options = {"downscale": changes.pop("downscale", 1), "room": 0}
+    folder = write_scene(tmp_path / "scene", **changes)
+    alone = load_scene(folder, **options)
+    assert decoded["scene"] == 6, "one process decodes all"
+    scenes = together(*loading(copies(folder, count), **options))
+    assert [decoded[f"scene{index}"] for index in range(count)] == ([3, 3] if count == 2 else [2, 2, 1, 1])
+    for scene in scenes:
+        assert not any(view.picture.is_held for view in scene.train)
+        assert_same_views(scene, alone)
+
+
+@pytest.mark.parametrize(("room", "num"), [(2 * 40 * 32 * 3, 3), (4 * 40 * 32 * 3, 4), (None, 6)])
+def test_each_process_reads_what_it_holds_in_memory(tmp_path, together, decoded, room, num):
+    folder = write_scene(tmp_path / "scene")
+    alone = load_scene(folder)
+    for index, scene in enumerate(together(*loading(copies(folder, 2), room=room))):
+        held = sum(view.picture.is_held for view in (*scene.train, *scene.test))
+        assert held == (6 if room is None else room // (40 * 32 * 3)) and decoded[f"scene{index}"] == num
+        assert_same_views(scene, alone)
+
+
+def share(folder, index, count=2):
+    """Image files that a process reads at the start."""
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    return [folder / frame["file_path"] for frame in frames][index::count]
+
+
+def test_a_photograph_of_another_process_is_compared_with_its_first_reading(tmp_path, together):
+    folders = copies(write_scene(tmp_path / "scene", alpha=True), 2)
+    _, scene = together(*loading(folders, room=0))
+    views = {folders[1] / view.name: view for view in (*scene.train, *scene.test)}
+    changed, broken, opaque = (file for file in share(folders[1], 0))
+    pixels = np.asarray(Image.open(changed))
+    views[changed].picture.read()
+    Image.fromarray(255 - pixels).save(changed)
+    with pytest.raises(ValueError, match=rf"{changed.name}: has changed since the scene was loaded"):
+        views[changed].picture.read()
+    broken.write_bytes(b"no image")
+    with pytest.raises(ValueError, match=rf"{broken.name}: cannot be read as an image"):
+        views[broken].picture.read()
+    Image.fromarray(pixels[..., :3]).save(opaque)
+    with pytest.raises(ValueError, match=rf"{opaque.name}: has pixels \[32, 40, 3\], but \[32, 40, 4\] where another"):
+        views[opaque].picture.read()
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_every_process_is_told_of_a_photograph_that_one_cannot_read(tmp_path, together, index):
+    folders = copies(write_scene(tmp_path / "scene"), 2)
+    broken = share(folders[index], index)[1]
+    broken.write_bytes(broken.read_bytes()[:-60])
+    errors = together(*loading(folders, room=0))
+    assert all(isinstance(error, ValueError) for error in errors) and str(errors[0]) == str(errors[1])
+    assert str(errors[0]).startswith(f"{broken}: cannot be read as an image")
+
+
+def test_a_photograph_of_another_size_than_elsewhere_is_told(tmp_path, together):
+    folders = copies(write_scene(tmp_path / "scene"), 2)
+    Image.fromarray(np.zeros((64, 80, 3), np.uint8)).save(share(folders[1], 0)[0])
+    first, error = together(*loading(folders, room=0))
+    assert len(first.train) and "is 80x64, but 40x32 where another process reads it" in str(error)
+
+
+def test_masks_are_told_to_all(tmp_path, together, decoded):
+    write_colmap(tmp_path / "scene")
+    for view in load_scene(tmp_path / "scene").train[::2]:
+        write_mask(tmp_path / "scene" / "masks" / f"{view.name}.png", left_half())
+    folders = copies(tmp_path / "scene", 2)
+    with pytest.warns(UserWarning, match="photographs have no mask"):
+        alone = load_scene(tmp_path / "scene")
+        decoded.clear()
+        scenes = together(*loading(folders, room=0))
+    assert decoded["scene0"] + decoded["scene1"] == 9
+    for scene in scenes:
+        assert_same_views(scene, alone)
+
+
+def test_masks_of_opacity_are_made_by_one_process_each(tmp_path, together, decoded):
+    folder = write_scene(tmp_path / "scene", alpha=True)
+    for name in sorted((folder / "images").iterdir())[::2]:
+        pixels = np.array(Image.open(name))
+        pixels[4:20, 5:30, 3] = 255
+        Image.fromarray(pixels).save(name)
+    for name in sorted((folder / "images").iterdir())[1::2]:
+        Image.open(name).convert("RGB").save(name)
+    alone = load_scene(folder, alpha="mask")
+    decoded.clear()
+    scenes = together(*loading(copies(folder, 2), alpha="mask", room=0))
+    assert decoded["scene0"] + decoded["scene1"] <= 6 + 3, "those with opacity are decoded once more"
+    assert any(view.mask is not None for view in alone.train)
+    for scene in scenes:
+        assert_same_views(scene, alone)
+
+
+def test_rays_of_kept_lenses_need_no_pixels(tmp_path, together, decoded):
+    (tmp_path / "scene").mkdir()
+    folder = write_fisheye(tmp_path / "scene", focal=11.0)
+    alone = load_scene(folder, lens="keep")
+    decoded.clear()
+    for scene in together(*loading(copies(folder, 2), lens="keep", room=0)):
+        assert_same_views(scene, alone)
+        np.testing.assert_array_equal(scene.train[0].camera.rays, alone.train[0].camera.rays)
+
+
+def test_processes_must_load_the_same_scene_in_the_same_way(tmp_path, together):
+    first, second = copies(write_scene(tmp_path / "scene"), 2)
+    meta = json.loads((second / "transforms.json").read_text())
+    meta["frames"].pop()
+    (second / "transforms.json").write_text(json.dumps(meta))
+    assert "has other photographs than the first" in str(together(*loading([first, second]), seconds=5)[1])
+    for other in (SceneSource(str(first), alpha="mask"), SceneSource(SYNTHETIC)):
+        calls = [functools.partial(source.load, is_divided=True) for source in (SceneSource(str(first)), other)]
+        assert "has other options of the scene (--downscale" in str(together(*calls, seconds=5)[1])
