@@ -343,13 +343,13 @@ class TestFloaters:
         assert 0 < event.iterations(stage.iterations)[-1] < growth.last_time, "others grow in their place"
 
     def test_they_are_pruned_while_others_grow(self):
-        system, late = a2tg.Gaussians2d(), a2tg.training.FloaterConfig(near_share=0.7, at=(0.5, 0.8))
+        system, late = a2tg.Gaussians2d(), a2tg.training.FloaterConfig(near=0.2, at=(0.5, 0.8))
         floaters = dataclasses.replace(late, at=(0.3, 0.4, 0.5))
         (stage,) = dataclasses.replace(system, floaters=floaters).stages()
         assert stage.events[-1].at == (0.3, 0.4)
         with pytest.raises(ValueError, match=r"floaters\.at must hold a fraction before the last growth, which is at"):
             dataclasses.replace(system, floaters=late).check()
-        (stage,) = small(floaters={"near_share": 0.7, "at": [0.5, 1.0]}).stages()
+        (stage,) = small(floaters={"near": 0.2, "at": [0.5, 1.0]}).stages()
         assert stage.events[-1].at == (0.5, 1.0), "nothing grows"
 
     def test_what_cannot_be_is_refused(self):
@@ -361,11 +361,12 @@ class TestFloaters:
     @pytest.mark.parametrize(
         "options, message",
         [
+            ({"near": -1.0}, r"floaters\.near must be at least 0; got -1"),
             ({"near_share": -0.1}, r"floaters\.near_share must lie in \[0, 1\); got -0\.1"),
             ({"near_share": 1.0}, r"floaters\.near_share must lie in \[0, 1\); got 1\.0"),
             ({"min_views": 1}, r"floaters\.min_views must be at least 2 views, or 0 for off; got 1"),
             ({"min_views": -2}, r"floaters\.min_views must be at least 2 views, or 0 for off; got -2"),
-            ({"near_share": 0.7, "at": []}, r"floaters\.at must hold at least one fraction of the stage; got none"),
+            ({"near": 0.2, "at": []}, r"floaters\.at must hold at least one fraction of the stage; got none"),
         ],
     )
     def test_numbers_out_of_range_are_refused(self, options, message):
@@ -376,9 +377,7 @@ class TestFloaters:
         system = small()
         model = initial_model(scene, system)
         moments = adam_init((model.gaussians, model.params))
-        with pytest.warns(
-            UserWarning, match=r"no floaters are pruned, for 0 of 150 .* --floaters\.min-views"
-        ):
+        with pytest.warns(UserWarning, match=r"no floaters are pruned, for 0 of 150 .* --floaters\.min-views"):
             change = a2tg.PruneFloaters(min_views=2, least=1e9).apply(Due(views=scene.train), model, moments, ())
         assert change.model.num == model.num
 

@@ -29,8 +29,10 @@ class PruneFloaters(HostEvent):
 
     min_views: int = static(default=2)
     """Least number of views in which a Gaussian must show, by Σ α·T of `least`, at least 2; 0: none."""
-    near_share: float = static(default=0.0)
-    """Least depth before every camera that sees it, as a share of `nearest_depths`; 0: none."""
+    near: float = static(default=0.0)
+    """Least depth before every camera that sees it, in units of the normalised world; 0: none."""
+    near_share: float = static(default=0.0, is_addition=True)
+    """The same as a share of the depth of what stands nearest in its picture (`nearest_depths`), below 1; 0: none."""
     least: float = static(default=1.0)
     """Least Σ α·T in a view, in pixels."""
     at: tuple[float, ...] = static(default=(0.4, 0.6, 0.8))
@@ -39,6 +41,8 @@ class PruneFloaters(HostEvent):
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         if self.min_views < 0 or self.min_views == 1:
             raise FieldError(self, f"{{min_views}} must be at least 2 views, or 0 for off; got {self.min_views}")
+        if self.near < 0:
+            raise FieldError(self, f"{{near}} must be at least 0; got {self.near}")
         if not 0 <= self.near_share < 1:
             raise FieldError(self, f"{{near_share}} must lie in [0, 1); got {self.near_share}")
         if not self.at:
@@ -49,17 +53,18 @@ class PruneFloaters(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
-        num, most = model.num, len(due.views)
-        means = np.asarray(model.gaussians.means)[:num]
-        num_views = due.agreed(shown_in(model, due.views, self.least).num_views)[:num]
-        is_kept = num_views >= min(self.min_views, most)
-        if self.near_share:
-            nearest = nearest_depths(means[num_views >= min(SURE_VIEWS, most)], due.views)
-            is_kept &= ~are_near(means, due.views, self.near_share * nearest)
+        num, means = model.num, np.asarray(model.gaussians.means)[: model.num]
+        is_kept, limits = np.ones(num, bool), np.full(len(due.views), self.near)
+        if self.min_views or self.near_share:
+            num_views = due.agreed(shown_in(model, due.views, self.least).num_views)[:num]
+            is_kept = num_views >= min(self.min_views, len(due.views))
+            surely = num_views >= min(SURE_VIEWS, len(due.views))
+            limits = np.maximum(limits, self.near_share * nearest_depths(means[surely], due.views))
+        is_kept &= ~are_near(means, due.views, limits)
         if is_kept.sum() < 2:
             warnings.warn(
                 f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "
-                "2: lower --floaters.near-share or --floaters.min-views",
+                "2: lower --floaters.near, --floaters.near-share or --floaters.min-views",
                 stacklevel=2,
             )
             is_kept[:] = True
