@@ -147,7 +147,10 @@ def depth_weight(weight: float) -> dict[str, Any]:
 
 
 ROBUST = {"loss": {"robust_share": 0.3}}
-FLOATERS = {"min_views 2": {"floaters": {"min_views": 2}}, "near_share 0.7": {"floaters": {"near_share": 0.7}}}
+FLOATERS: dict[str, dict[str, Any]] = {
+    f"{name} {value}": {"floaters": {name: value}}
+    for name, value in {"min_views": 2, "near": 0.3, "near_share": 0.7}.items()
+}
 GRID = {"exposure": True, "corrections": {"exposure_kind": "grid"}}
 CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
     "whole": (whole, {"plain": {}, "robust": ROBUST, "grid": GRID, **FLOATERS}),
