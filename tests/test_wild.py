@@ -16,7 +16,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.data.depth_files import find_depths, read_depths
 from a2tg_jax.data.synthetic import exact_depths
-from a2tg_jax.densify.floaters import are_near
+from a2tg_jax.densify.floaters import are_near, nearest_depths
 from a2tg_jax.densify.pruning import blending_weights, shown_in
 from a2tg_jax.events import Due
 from a2tg_jax.training import SYSTEMS
@@ -61,7 +61,7 @@ def trained(scene):
     )
     system = small(
         exposure=True, corrections={"exposure_kind": "grid", "grid_size": [4, 4, 2]},
-        floaters={"near": 0.2, "at": [1.0]},
+        floaters={"near_share": 0.7, "at": [1.0]},
         loss={"depth_weight": 1.0, "robust_share": 0.2, "ssim_weight": 0.0},
     )  # fmt: skip
     return a2tg.fit(found, system, progress=False)
@@ -295,7 +295,7 @@ class TestFloaters:
         points = np.stack(
             [center + 0.1 * forward, center + 0.5 * forward, center - 0.1 * forward, center + 0.1 * right]
         )
-        np.testing.assert_array_equal(are_near(points, scene.train[:1], 0.2), [True, False, False, False])
+        np.testing.assert_array_equal(are_near(points, scene.train[:1], np.asarray([0.2])), [True, False, False, False])
 
     def test_what_stands_close_before_a_fisheye(self, scene):
         """Its rays lie far outside the picture in the plane of K; some of its pixels have none."""
@@ -308,16 +308,30 @@ class TestFloaters:
         pixels = np.asarray([[-1.5, 0.5], [2.5, 1.5], [3.5, 0.5], [0.5, -1.5]]) * (width, height)
         K, viewmat = np.asarray(view.camera.K), np.asarray(view.camera.viewmat)
         seen = 0.1 * np.concatenate([pixels, np.ones((4, 1))], axis=1) @ np.linalg.inv(K).T
-        points = (seen - viewmat[:3, 3]) @ viewmat[:3, :3]
-        np.testing.assert_array_equal(are_near(points, [wide], 0.2), [True, True, False, False])
-        np.testing.assert_array_equal(are_near(points, [view], 0.2), False)
+        points, near = (seen - viewmat[:3, 3]) @ viewmat[:3, :3], np.asarray([0.2])
+        np.testing.assert_array_equal(are_near(points, [wide], near), [True, True, False, False])
+        np.testing.assert_array_equal(are_near(points, [view], near), False)
         unseen = dataclasses.replace(wide, camera=dataclasses.replace(wide.camera, rays=jnp.full_like(rays, np.nan)))
-        assert not are_near(points, [unseen], 0.2).any()
+        assert not are_near(points, [unseen], near).any()
+
+    def test_the_nearest_surface_of_a_view(self, scene):
+        """A wall at depth 2 with a floater before it, and points behind the camera and beside its picture."""
+        view = scene.train[0]
+        viewmat, K = np.asarray(view.camera.viewmat, np.float64), np.asarray(view.camera.K, np.float64)
+
+        def at(depth, column, row):
+            seen = depth * np.linalg.inv(K) @ np.asarray([column * view.camera.width, row * view.camera.height, 1.0])
+            return (seen - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+        wall = [at(2.0, column, row) for column in np.linspace(0.1, 0.9, 10) for row in np.linspace(0.1, 0.9, 10)]
+        others = [at(0.1, 0.5, 0.5), at(-1.0, 0.5, 0.5), at(0.2, 1.5, 0.5), at(0.2, 0.5, -0.5)]
+        np.testing.assert_allclose(nearest_depths(np.stack(wall + others), [view]), [2.0])
+        np.testing.assert_array_equal(nearest_depths(np.stack(others[1:]), [view]), [0.0])
 
     def test_a_training_without_them(self, scene, trained):
         model = trained.model
         assert len(scene.points) / 2 < model.num <= len(scene.points)
-        assert not are_near(np.asarray(model.gaussians.means), scene.train, 0.2).any()
+        assert not are_near(np.asarray(model.gaussians.means), scene.train, np.full(len(scene.train), 0.2)).any()
 
     @pytest.mark.parametrize("name", SYSTEMS)
     def test_every_system_prunes_them_if_asked(self, name):
@@ -348,6 +362,8 @@ class TestFloaters:
         "options, message",
         [
             ({"near": -1.0}, r"floaters\.near must be at least 0; got -1"),
+            ({"near_share": -0.1}, r"floaters\.near_share must lie in \[0, 1\); got -0\.1"),
+            ({"near_share": 1.0}, r"floaters\.near_share must lie in \[0, 1\); got 1\.0"),
             ({"min_views": 1}, r"floaters\.min_views must be at least 2 views, or 0 for off; got 1"),
             ({"min_views": -2}, r"floaters\.min_views must be at least 2 views, or 0 for off; got -2"),
             ({"near": 0.2, "at": []}, r"floaters\.at must hold at least one fraction of the stage; got none"),
@@ -361,8 +377,8 @@ class TestFloaters:
         system = small()
         model = initial_model(scene, system)
         moments = adam_init((model.gaussians, model.params))
-        with pytest.warns(UserWarning, match=r"no floaters are pruned, for 0 of 150 Gaussians .* --floaters\.near"):
-            change = a2tg.PruneFloaters(min_views=0, near=100.0).apply(Due(views=scene.train), model, moments, ())
+        with pytest.warns(UserWarning, match=r"no floaters are pruned, for 0 of 150 .* --floaters\.min-views"):
+            change = a2tg.PruneFloaters(min_views=2, least=1e9).apply(Due(views=scene.train), model, moments, ())
         assert change.model.num == model.num
 
 

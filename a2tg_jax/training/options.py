@@ -104,13 +104,16 @@ class FloaterConfig:
     near: float = 0.0
     """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
     about 1 from what they see, such as 0.2. 0: off."""
+    near_share: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
+    """The same as a share, below 1, of the depth of what stands nearest in the camera's picture and shows in three
+    training views, such as 0.7. 0: off."""
     at: tuple[float, ...] = PruneFloaters.at
     """Fractions of the first stage at which floaters are pruned. Those after the last growth are left out."""
 
     @property
     def is_asked(self) -> bool:
         """Whether floaters are to be pruned."""
-        return bool(self.min_views or self.near)
+        return bool(self.min_views or self.near or self.near_share)
 
     def events(self, num_iterations: int, others: Sequence[Event] = ()) -> tuple[Event, ...]:
         """Return the event; none if nothing is asked for.
@@ -423,7 +426,7 @@ class System:
             raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
 
 
-SHARED_OPTIONS = {f"PruneFloaters.{name}": f"floaters.{name}" for name in ("min_views", "near", "at")}
+SHARED_OPTIONS = {f"PruneFloaters.{name}": f"floaters.{name}" for name in ("min_views", "near", "near_share", "at")}
 """Options of every system that set a field of an event."""
 BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
 """Options whose place a memory budget takes."""
