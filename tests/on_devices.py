@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.sharding import PartitionSpec as P
 from scenes_random import fisheye
 
@@ -20,6 +21,7 @@ from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.exchange import AXIS, ROOM_OF_A_BAND, exchange_among, spread
 from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
+from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
@@ -122,6 +124,38 @@ def balance(folder):
     )
     assert np.isclose(largest, found.num_pairs * ROOM_OF_A_BAND / exchange.num), "what the program itself has counted"
     assert largest_even > 2.8 * pairs / exchange.num and largest < 1.2 * pairs / exchange.num
+    borders_without_room_overflow(exchange, camera)
+    eager_renders_have_room(exchange)
+
+
+def borders_without_room_overflow(exchange, camera):
+    """The lists of a band whose borders moved too far stay within its tiles, and the overflow is told."""
+    heights, listed = [], native.tile_lists
+
+    def watched(M, cutoff, near_plane, grid, capacity, height):
+        jax.debug.callback(lambda own: heights.append((int(own), grid.height)), height)
+        return listed(M, cutoff, near_plane, grid, capacity, height=height)
+
+    own = dataclasses.replace(exchange, border_room=BorderRoom(0, 0))
+    settings = dataclasses.replace(a2tg.plan_render(plain(), [camera]), compositor="native", exchange=own)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native, "tile_lists", watched)
+        draw = jax.jit(lambda gaussians: a2tg.render_image(gaussians, camera, settings=settings))
+        output = draw(spread(own, plain().gaussians))
+        jax.effects_barrier()
+    assert bool(output.overflow)
+    assert len(heights) == exchange.num and all(0 <= height <= most for height, most in heights), heights
+
+
+def eager_renders_have_room(exchange):
+    """A render without a capacity draws all splats, also if few rows of tiles show all of them."""
+    camera = scene().train[0].camera
+    flat = dataclasses.replace(camera, K=jnp.asarray(camera.K).at[1, 1].multiply(0.05))
+    gaussians = plain().gaussians
+    expected = a2tg.render_image(gaussians, flat)
+    found = a2tg.render_image(spread(exchange, gaussians), flat, settings=a2tg.RenderSettings(exchange=exchange))
+    assert not bool(found.overflow)
+    close(expected.color, found.color)
 
 
 def boxes_of(model, camera):

@@ -281,7 +281,7 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
         raise RuntimeError("the second stage")
 
     monkeypatch.setattr(first_stage, "load_splats", lambda file: read.append(file) or load(file))
-    monkeypatch.setattr(SceneSource, "load", lambda self, room: scene)
+    monkeypatch.setattr(SceneSource, "load", lambda self, room, **options: scene)
     monkeypatch.setattr(preflight, "tell_forecast", lambda *args: told.append(args))
     monkeypatch.setattr(run_training, "fit_stage", trained)
     save_ply(tmp_path / "a.ply", some_gaussians(40))
@@ -300,7 +300,7 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
         first_stage.number_given(run, record, given)
     run.model("a2tg-gaussians").unlink()
     monkeypatch.setattr(train, "tell_forecast", lambda *args: told.append(args))
-    monkeypatch.setattr(SceneSource, "load", lambda self, room=None: scene)
+    monkeypatch.setattr(SceneSource, "load", lambda self, room=None, **options: scene)
     with pytest.raises(RuntimeError, match="the second stage"):
         main(["train", "--out", str(run.path), "--resume", "--quiet"])
     assert told[1][-1] == 40 and len(read) == 2, "a resumed run without that model reads the file once"

@@ -63,6 +63,17 @@ def test_an_even_image_needs_no_room_and_room_bounds_bands():
     assert [hop.bands for hop in Bands.of(bands.whole, 4, BorderRoom(0, 0)).hops()] == [0]
 
 
+@pytest.mark.parametrize("tile, height, num", [(8, 3, 2), (8, 9, 3), (8, 17, 16), (8, 65, 64), (16, 17, 3), (8, 64, 4)])
+def test_the_largest_room_is_for_any_borders(tile, height, num):
+    """Also if the devices' rows, or the tiles, end below the image."""
+    bands = Bands.of(TileGrid(40, height, tile), num)
+    rows = bands.whole.rows
+    for pairs in (np.zeros(rows), *(1000 * np.eye(rows))):
+        borders = bands.borders(jnp.asarray(pairs, jnp.int32))
+        assert (np.asarray(bands.room_for(borders)) <= np.asarray(bands.room)).all()
+        np.testing.assert_array_equal(bands.sums(jnp.asarray(pairs, jnp.int32), borders).sum(), pairs.sum())
+
+
 def test_rows_of_tiles_have_the_pairs_of_the_lists():
     scene = draw_scene(3, num=200, width=64, height=45)
     M, _ = homographies(as_gaussians(scene, "float32"), as_camera(scene, "float32"))

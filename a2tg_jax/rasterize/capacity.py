@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import Jitted
-from a2tg_jax.rasterize.exchange import Travel, travel
+from a2tg_jax.rasterize.exchange import Travel, share_of_a_band, travel
 from a2tg_jax.rasterize.image_bands import BorderRoom
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.supersampling import finer
@@ -49,6 +50,8 @@ def with_capacity(
             "settings = plan_render(model, cameras) outside, then pass settings=settings"
         )
     pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
+    if settings.exchange is not None:
+        pairs = max(pairs, room_of_view(gaussians, camera, rule, settings, num_live).pairs)
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
@@ -77,14 +80,26 @@ def pairs_of_view(
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
 
-def travel_of_view(
+class RoomOfView(NamedTuple):
+    """Room that devices need to draw a view together."""
+
+    rows: int
+    """Rows that a device must be able to send to another one."""
+    borders: BorderRoom
+    """Room for the borders between bands."""
+    pairs: int
+    """Capacity of which every band's share holds its pairs."""
+
+
+def room_of_view(
     gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
-) -> tuple[int, BorderRoom]:
-    """Return the rows that a device of `settings.exchange` must be able to send to another one in a view, and the room
-    for the borders between bands (host)."""
+) -> RoomOfView:
+    """Return the room that the devices of `settings.exchange` need in a view (host)."""
+    assert settings.exchange is not None
     camera = finer(camera, settings.supersample)
-    rows, above, below = map(int, _jitted_travel()(gaussians, camera, rule, settings, num_live))
-    return rows, BorderRoom(above, below)
+    rows, above, below, pairs = map(int, _jitted_travel()(gaussians, camera, rule, settings, num_live))
+    share = share_of_a_band(settings.exchange.num // settings.exchange.views_at_once)
+    return RoomOfView(rows, BorderRoom(above, below), math.ceil(pairs / share))
 
 
 @functools.cache

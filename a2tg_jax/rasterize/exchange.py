@@ -152,7 +152,7 @@ def composite_in_bands(
     splats, probe = jax.tree.map(jax.vmap(exchange.filled_up), (splats, probe))
     cutoff = jax.vmap(functools.partial(exchange.filled_up, value=-1.0))(cutoff)
     regions = jax.tree.map(exchange.filled_up, rule.regions)
-    share = min(1.0, ROOM_OF_A_BAND / num_bands)
+    share = share_of_a_band(num_bands)
     room = _Room(
         pairs=math.ceil(capacity * share), pairs_share=share,
         rows=min(cutoff.shape[1] // exchange.num, max(1, math.ceil(capacity * exchange.rows_per_pair))),
@@ -184,6 +184,13 @@ class Travel(NamedTuple):
     """Rows of pixels by which borders move up."""
     below: Array
     """Rows of pixels by which they move down."""
+    pairs: Array
+    """Largest number of pairs of a band."""
+
+
+def share_of_a_band(num_bands: int) -> float:
+    """Return the share of the capacity for pairs that each of so many bands of a view has."""
+    return min(1.0, ROOM_OF_A_BAND / num_bands)
 
 
 def travel(
@@ -200,9 +207,12 @@ def travel(
     M, cutoff = exchange.filled_up(M), exchange.filled_up(cutoff, -1.0)
     bands = Bands.of(grid, exchange.num // exchange.views_at_once)
     boxes = tile_rectangles(screen_bounds(M, cutoff, near_plane), grid, bands.pixels(rays))
-    borders = bands.borders(bands.pairs_of_rows(boxes))
+    pairs = bands.pairs_of_rows(boxes)
+    borders = bands.borders(pairs)
     reached = bands.reached(boxes, borders).reshape(bands.num, exchange.num, -1)
-    return Travel(jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32)), *bands.room_for(borders))
+    above, below = bands.room_for(borders)
+    most_rows = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
+    return Travel(most_rows, above, below, jnp.max(bands.sums(pairs, borders)))
 
 
 class _Room(NamedTuple):
@@ -244,8 +254,10 @@ def _composite_band(
         splats, jacobian = splats._replace(M=_shifted(splats.M, top)), _shifted(jacobian[None], top)[0]
     else:
         first, last = (own * bands.own.columns for own in (borders[view, band], borders[view, band + 1]))
-        pixels = band_pixels(pixels, first, bands.own.num, last - first)
-    lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels, end - top)
+        pixels = band_pixels(pixels, first, bands.own.num, jnp.minimum(last - first, bands.own.num))
+    # A band that moved too far overflows; until then it must not reach beyond the memory of its grid.
+    height = jnp.minimum(end - top, bands.own.height)
+    lists = _lists_of_band(settings, bands, room, jax.lax.stop_gradient(splats.M), cutoff, pixels, height)
     own = settings._replace(grid=bands.own, tile_batch=min(settings.tile_batch, bands.own.num))
     channels, transmittance = composite_arrays(own, rule, splats, texels, regions, cutoff, lists, jacobian, probe)
     if bands.num > 1:

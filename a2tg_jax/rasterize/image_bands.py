@@ -16,8 +16,8 @@ from a2tg_jax.rasterize.tile_pixels import TilePixels, tile_pixels
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid
 
 EMPTY_TILES = 10
-"""So many rows of tiles without pairs cost as much as a mean row. It keeps borders from moving far in an image that is
-mostly empty, and no band has more than a tenth more pairs than the mean for it."""
+"""Rows of tiles without pairs that together cost as much as a mean row. Their cost keeps borders near an even cut in an
+image that is mostly empty; in return the fullest band may have a tenth more pairs."""
 COST_BITS = 29
 """Bits of the cost of an image."""
 
@@ -56,7 +56,8 @@ class Bands(NamedTuple):
     @staticmethod
     def of(grid: TileGrid, num: int, room: BorderRoom | None = None) -> "Bands":
         """Return the bands of a view; without a room, that for any borders."""
-        most = grid.height if num > 1 else 0
+        # A border lies at most at the end of the tiles, and in an even cut at most at the end of the devices' rows.
+        most = max(grid.rows * grid.tile_size, num * -(-grid.height // num)) if num > 1 else 0
         return Bands(grid, num, BorderRoom(*(min(most, own) for own in room or (most, most))))
 
     @property
@@ -102,6 +103,11 @@ class Bands(NamedTuple):
         after = jnp.searchsorted(ends, wanted, method="compare_all").astype(jnp.int32)
         before = jnp.maximum(after - 1, 0)
         return jnp.where(wanted - ends[before] < ends[after] - wanted, before, after)
+
+    def sums(self, pairs: Array, borders: Array) -> Array:
+        """Return the number of pairs in each band, [B] int32, of those in each row of tiles [rows]."""
+        ends = jnp.concatenate([jnp.zeros(1, pairs.dtype), jnp.cumsum(pairs)])
+        return jnp.diff(ends[borders])
 
     def even_borders(self) -> Array:
         """Return the borders of bands that are equally high, as `borders` does."""

@@ -21,7 +21,7 @@ from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, travel_of_view
+from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, room_of_view
 from a2tg_jax.rasterize.exchange import Exchange, spread
 from a2tg_jax.rasterize.image_bands import BorderRoom
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
@@ -329,7 +329,9 @@ class StageRun:
         if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
             self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
         else:
-            self.exchanges[size] = dataclasses.replace(exchange, border_room=exchange.border_room.wider())
+            room = exchange.border_room.wider()
+            covers_image = min(room) >= size[1] + self.system.tile_size
+            self.exchanges[size] = dataclasses.replace(exchange, border_room=None if covers_image else room)
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
         """Return the error that names the values that are not finite or too large."""
@@ -414,10 +416,10 @@ class StageRun:
         between bands."""
         model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
         settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
-        found = [travel_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras]
-        most = max(own for own, _ in found)
+        found = [room_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras]
+        most = max(own.rows for own in found)
         share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
-        above, below = (max(own) for own in zip(*(room for _, room in found), strict=True))
+        above, below = (max(own) for own in zip(*(each.borders for each in found), strict=True))
         room = BorderRoom(*(int(GROWTH_ROOM * own) + settings.tile_size for own in (above, below)))
         return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity, border_room=room)
 
