@@ -7,13 +7,13 @@ than 30 are cut into five folds: every fifth view is scored. Test views are not 
 0.6 MB, the photographs are downscaled by 2; --small has photographs downscaled by 4 and 0.15 MB.
 
 Each training is kept in OUT/few_views.json as soon as it is measured, so that a second call goes on. The table is
-OUT/few_views.md.
+OUT/few_views.md. With --small both are called few_views_small.
 """
 
 import dataclasses
 import functools
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +38,13 @@ REFERENCE = "MCMC, degree 0"
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE: ("gaussians-2d-mcmc", {"sh_degree": 0, "stage2_iterations": 1_000}),
     "bytewise": ("bytewise", {}),
-    "bytewise, floaters pruned": ("bytewise", {"floaters": {"near_share": 0.7}}),
     "bytewise, Gaussian kernels": ("bytewise", GAUSSIAN_KERNELS),
     "bytewise without details": ("bytewise", WITHOUT_DETAILS),
     "the same without pruning": ("bytewise", {**WITHOUT_DETAILS, "prune": {"share": 0.0}}),
+}
+SMALL_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    **{label: METHODS[label] for label in (REFERENCE, "bytewise")},
+    "floaters pruned": ("bytewise", {"floaters": {"near_share": 0.7}}),
 }
 
 
@@ -66,11 +69,13 @@ def _split(scene: a2tg.Scene, scored: list[int], kept: list[int] | None) -> a2tg
     return dataclasses.replace(scene, train=train, test=test)
 
 
-def measured(scene: a2tg.Scene, name: str, label: str, budget: float = BUDGET) -> dict[str, float]:
-    """Return the figures of one training."""
-    known, options = METHODS[label]
+def measured(
+    scene: a2tg.Scene, name: str, method: tuple[str, dict[str, Any]], budget: float = BUDGET
+) -> dict[str, float]:
+    """Return the figures of one training by a system with some options."""
+    known, options = method
     own = {"memory_budget": budget, **({"background": "white"} if name in WHITE_BEHIND else {})}
-    system = with_changes(find_system(known).preset("quick"), {**options, **own}, label)
+    system = with_changes(find_system(known).preset("quick"), {**options, **own}, name)
     start = time.perf_counter()
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     psnr, train_psnr = (a2tg.evaluate(views, model).psnr for views in (scene.test, scene.train))
@@ -80,16 +85,15 @@ def measured(scene: a2tg.Scene, name: str, label: str, budget: float = BUDGET) -
     }  # fmt: skip
 
 
-def table(found: Mapping[str, Mapping[str, float]]) -> str:
+def table(methods: Iterable[str], found: Mapping[str, Mapping[str, float]]) -> str:
     """Return a row for each capture: PSNR of the reference, and what the others gain, on left-out / training views."""
-    rows = []
+    rows, others = [], [label for label in methods if label != REFERENCE]
     for name in dict.fromkeys(key.partition(" | ")[0] for key in found):
         base = found.get(key_of(name, REFERENCE))
         if base is None:
             continue
-        gains = [_told(found.get(key_of(name, label)), base) for label in METHODS if label != REFERENCE]
+        gains = [_told(found.get(key_of(name, label)), base) for label in others]
         rows.append([name, f"{base['views']:g}", f"{base['psnr']:.2f} / {base['train_psnr']:.2f}", *gains])
-    others = [label for label in METHODS if label != REFERENCE]
     return tables.markdown(["capture", "training views", REFERENCE, *others], rows)
 
 
@@ -109,12 +113,13 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="small photographs and few bytes")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
-    kept = KeptFigures(arguments.out, "few_views", table)
+    methods = SMALL_METHODS if arguments.small else METHODS
     downscale, budget = (SMALL_DOWNSCALE, SMALL_BUDGET) if arguments.small else (DOWNSCALE, BUDGET)
+    file = "few_views_small" if arguments.small else "few_views"
+    kept = KeptFigures(arguments.out, file, functools.partial(table, methods))
     for name, scene in captures(arguments.scenes, downscale):
-        shown = f"{name}, {budget:g} MB" if arguments.small else name
-        for label in METHODS:
-            kept.measure(key_of(shown, label), functools.partial(measured, scene, name, label, budget))
+        for label, method in methods.items():
+            kept.measure(key_of(name, label), functools.partial(measured, scene, name, method, budget))
     print(kept.table())
 
 

@@ -327,6 +327,10 @@ class TestFloaters:
         others = [at(0.1, 0.5, 0.5), at(-1.0, 0.5, 0.5), at(0.2, 1.5, 0.5), at(0.2, 0.5, -0.5)]
         np.testing.assert_allclose(nearest_depths(np.stack(wall + others), [view]), [2.0])
         np.testing.assert_array_equal(nearest_depths(np.stack(others[1:]), [view]), [0.0])
+        post = at(1.0, 0.3, 0.3)
+        limit = 0.7 * nearest_depths(np.stack([*wall, post]), [view])
+        assert are_near(post[None], [view], limit), "a thin foreground goes, too (docs/wild.md)"
+        assert not are_near(np.stack(wall), [view], limit).any()
 
     def test_a_training_without_them(self, scene, trained):
         model = trained.model

@@ -54,12 +54,13 @@ class PruneFloaters(HostEvent):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         num, means = model.num, np.asarray(model.gaussians.means)[: model.num]
-        is_kept, limits = np.ones(num, bool), np.full(len(due.views), self.near)
+        is_kept, limits, most = np.ones(num, bool), np.full(len(due.views), self.near), len(due.views)
         if self.min_views or self.near_share:
             num_views = due.agreed(shown_in(model, due.views, self.least).num_views)[:num]
-            is_kept = num_views >= min(self.min_views, len(due.views))
-            surely = num_views >= min(SURE_VIEWS, len(due.views))
-            limits = np.maximum(limits, self.near_share * nearest_depths(means[surely], due.views))
+            is_kept = num_views >= min(self.min_views, most)
+        if self.near_share:
+            nearest = nearest_depths(means[num_views >= min(SURE_VIEWS, most)], due.views)
+            limits = np.maximum(limits, self.near_share * nearest)
         is_kept &= ~are_near(means, due.views, limits)
         if is_kept.sum() < 2:
             warnings.warn(

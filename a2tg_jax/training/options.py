@@ -105,8 +105,8 @@ class FloaterConfig:
     """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
     about 1 from what they see, such as 0.2. 0: off."""
     near_share: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
-    """The same as a share, below 1, of the depth of what stands nearest in the camera's picture and shows in three
-    training views, such as 0.7. 0: off."""
+    """Least depth of a Gaussian before each camera that sees it, as a share, below 1, of the depth of the nearest 2 %
+    in its picture, such as 0.7. A small foreground that is nearer goes, too. 0: off."""
     at: tuple[float, ...] = PruneFloaters.at
     """Fractions of the first stage at which floaters are pruned. Those after the last growth are left out."""
 
