@@ -12,7 +12,7 @@ from a2tg_jax.cli.main import main
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training.corrections import exposed
-from a2tg_jax.training.options import CorrectionConfig
+from a2tg_jax.training.option_groups import CorrectionConfig
 
 TWIST = np.array([0.018, -0.012, 0.009, 0.012, -0.009, 0.015])
 

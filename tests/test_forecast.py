@@ -38,7 +38,7 @@ from a2tg_jax.training import SYSTEMS, progress
 from a2tg_jax.training.bilateral import sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.options import CorrectionConfig
+from a2tg_jax.training.option_groups import CorrectionConfig
 from a2tg_jax.training.progress import Pace
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step

@@ -7,7 +7,8 @@ from typing import ClassVar, Self
 from a2tg_jax.appearance import Billboards
 from a2tg_jax.mcmc import FillingMcmc, Mcmc
 from a2tg_jax.systems.stage1 import ANY_RATE, FLOATS_PER_TEXEL, MCMC_OPTIONS, QUICK, SMOKE, continued, growing_stage
-from a2tg_jax.training.options import LossConfig, Ranges, System
+from a2tg_jax.training.option_groups import LossConfig
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.stage import Stage
 

@@ -20,7 +20,8 @@ from a2tg_jax.systems.stage1 import (
     continued,
     growing_stage,
 )
-from a2tg_jax.training.options import LossConfig, Ranges, System
+from a2tg_jax.training.option_groups import LossConfig
+from a2tg_jax.training.options import Ranges, System
 from a2tg_jax.training.stage import Stage
 
 SURFACES = LossConfig(normal_weight=0.2)
