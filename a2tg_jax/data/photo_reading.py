@@ -109,7 +109,11 @@ def read_photos(photos: Sequence[PhotoFiles], shelf: Shelf, division: Division |
     fitting = shelf.fitting([math.prod(facts[number].shape) for number in others])
 
     def of_another(number: int, fits: bool) -> Reading:
-        return _read(photos[number], shelf) if fits else _unread(photos[number], shelf, facts[number])
+        if not fits:
+            return _unread(photos[number], shelf, facts[number])
+        reading = _read(photos[number], shelf)
+        _check_size(photos[number], reading.facts.stored, facts[number].stored)
+        return reading
 
     found = map_in_threads(lambda item: of_another(*item), zip(others, fitting, strict=True), threads)
     read.update(zip(others, found, strict=True))
@@ -138,18 +142,23 @@ def _unread(photo: PhotoFiles, shelf: Shelf, facts: Facts) -> Reading:
     Raises:
       ValueError: if the file is of another size; that of object storage is not looked at.
     """
-    if not is_remote(photo.file) and (size := picture_size(photo.file)) != facts.stored:
-        width, height = size
-        raise ValueError(
-            f"{photo.file}: is {width}x{height}, but {facts.stored[0]}x{facts.stored[1]} where another process reads "
-            "it; give all processes the same photographs"
-        )
+    if not is_remote(photo.file):
+        _check_size(photo, picture_size(photo.file), facts.stored)
     lens = photo.lens_of(facts.stored)
     with _named(photo):
         size, K = lens.view_of(facts.stored, photo.downscale)
         rays = lens.rays(*size)
     picture = shelf.read_later(facts.shape, photo.file, None if facts.is_stored else lens.viewing(photo.downscale))
     return Reading(facts, K, rays, picture, depth_map(photo.depths, lens, facts.stored, size))
+
+
+def _check_size(photo: PhotoFiles, size: tuple[int, int], stored: tuple[int, int]) -> None:
+    """Raise ValueError unless a photograph has the size (width, height) that another process has read."""
+    if size != stored:
+        raise ValueError(
+            f"{photo.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; give "
+            "all processes the same photographs"
+        )
 
 
 @contextlib.contextmanager
