@@ -3,12 +3,14 @@
 import collections
 import functools
 import json
+import re
 import shutil
 import threading
 
 import numpy as np
 import pytest
 from PIL import Image
+from test_captures import write_polycam
 from test_data_colmap import write_scene as write_colmap
 from test_masks import left_half, write_mask
 from test_pictures import KINDS, write_scene
@@ -16,7 +18,7 @@ from test_rays import write_fisheye
 
 from a2tg_jax import load_scene
 from a2tg_jax.data import decoding, load, photo_reading, photo_store
-from a2tg_jax.data.division import Division
+from a2tg_jax.data.division import Division, sharing_errors
 from a2tg_jax.results import record
 from a2tg_jax.results.record import SYNTHETIC, SceneSource
 
@@ -44,7 +46,8 @@ def decoded(monkeypatch):
 
 @pytest.fixture
 def together(monkeypatch):
-    """Function that calls others, one in each process, and returns their results or errors."""
+    """Function that calls others, one in each process, and returns their results or errors. A process that waits for
+    another in vain gets a BrokenBarrierError."""
     own = threading.local()
     for module in (load, record):
         monkeypatch.setattr(module, "among_processes", lambda: own.division)
@@ -83,6 +86,12 @@ def copies(folder, count):
 
 def loading(folders, **options):
     return [lambda folder=folder: load_scene(folder, is_divided=True, **options) for folder in folders]
+
+
+def error_of_all(found, kind=ValueError):
+    """Text of the error that all processes raise."""
+    assert {(type(error), str(error)) for error in found} == {(kind, str(found[0]))}
+    return str(found[0])
 
 
 def assert_same_views(found, expected):
@@ -148,16 +157,29 @@ def test_every_process_is_told_of_a_photograph_that_one_cannot_read(tmp_path, to
     folders = copies(write_scene(tmp_path / "scene"), 2)
     broken = share(folders[index], index)[1]
     broken.write_bytes(broken.read_bytes()[:-60])
-    errors = together(*loading(folders, room=0))
-    assert all(isinstance(error, ValueError) for error in errors) and str(errors[0]) == str(errors[1])
-    assert str(errors[0]).startswith(f"{broken}: cannot be read as an image")
+    told = error_of_all(together(*loading(folders, room=0), seconds=20))
+    assert told.startswith(f"{broken}: cannot be read as an image")
 
 
-def test_a_photograph_of_another_size_than_elsewhere_is_told(tmp_path, together):
+@pytest.mark.parametrize(("alpha", "room"), [("transparency", 0), ("mask", 0), ("transparency", None)])
+def test_a_photograph_of_another_size_than_elsewhere_is_told_to_all(tmp_path, together, alpha, room):
+    """The size is compared after the common reading. The other process waits at the end, or for masks."""
+    folders = copies(write_scene(tmp_path / "scene", alpha=True), 2)
+    Image.fromarray(np.zeros((64, 80, 4), np.uint8)).save(share(folders[1], 0)[0])
+    told = error_of_all(together(*loading(folders, room=room, alpha=alpha), seconds=20))
+    assert "is 80x64, but 40x32 where another process reads it" in told
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_file_missing_in_one_copy_is_told_to_all(tmp_path, together, index):
     folders = copies(write_scene(tmp_path / "scene"), 2)
-    Image.fromarray(np.zeros((64, 80, 3), np.uint8)).save(share(folders[1], 0)[0])
-    first, error = together(*loading(folders, room=0))
-    assert len(first.train) and "is 80x64, but 40x32 where another process reads it" in str(error)
+    missing = share(folders[index], 0)[1]
+    missing.unlink()
+    told = error_of_all(together(*loading(folders), seconds=20), FileNotFoundError)
+    assert told.startswith(f"{missing}: no such image")
+    (folders[index] / "transforms.json").unlink()
+    told = error_of_all(together(*loading(folders), seconds=20), FileNotFoundError)
+    assert told.startswith(f"{folders[index]}: has no sparse model")
 
 
 def test_masks_are_told_to_all(tmp_path, together, decoded):
@@ -174,6 +196,22 @@ def test_masks_are_told_to_all(tmp_path, together, decoded):
         assert_same_views(scene, alone)
 
 
+def test_masks_of_another_programs_pixels_are_made_by_one_process_each(tmp_path, together, decoded):
+    write_polycam(tmp_path / "scene")
+    for file in sorted((tmp_path / "scene" / "keyframes" / "corrected_images").iterdir())[::2]:
+        pixels = np.full_like(Image.open(file), 200)
+        pixels[:, :10] = 0
+        Image.fromarray(pixels).save(file)
+    alone = load_scene(tmp_path / "scene")
+    masks = [view.mask for view in (*alone.train, *alone.test)]
+    assert len({mask for mask in masks if mask is not None}) > 1, "borders of two kinds"
+    decoded.clear()
+    scenes = together(*loading(copies(tmp_path / "scene", 2), room=0))
+    assert decoded["scene0"] + decoded["scene1"] == 4 + 4, "once for the size, and once for the mask"
+    for scene in scenes:
+        assert_same_views(scene, alone)
+
+
 def test_masks_of_opacity_are_made_by_one_process_each(tmp_path, together, decoded):
     folder = write_scene(tmp_path / "scene", alpha=True)
     for name in sorted((folder / "images").iterdir())[::2]:
@@ -182,10 +220,12 @@ def test_masks_of_opacity_are_made_by_one_process_each(tmp_path, together, decod
         Image.fromarray(pixels).save(name)
     for name in sorted((folder / "images").iterdir())[1::2]:
         Image.open(name).convert("RGB").save(name)
-    alone = load_scene(folder, alpha="mask")
+    alone, stored = load_scene(folder, alpha="mask"), load_scene(folder)
+    num = sum(view.has_alpha for view in (*stored.train, *stored.test))
+    assert num == 2, "three files have an alpha channel; that of one is opaque, and is dropped"
     decoded.clear()
     scenes = together(*loading(copies(folder, 2), alpha="mask", room=0))
-    assert decoded["scene0"] + decoded["scene1"] <= 6 + 3, "those with opacity are decoded once more"
+    assert decoded["scene0"] + decoded["scene1"] == 6 + num, "those with opacity are decoded once more"
     assert any(view.mask is not None for view in alone.train)
     for scene in scenes:
         assert_same_views(scene, alone)
@@ -201,12 +241,63 @@ def test_rays_of_kept_lenses_need_no_pixels(tmp_path, together, decoded):
         np.testing.assert_array_equal(scene.train[0].camera.rays, alone.train[0].camera.rays)
 
 
-def test_processes_must_load_the_same_scene_in_the_same_way(tmp_path, together):
-    first, second = copies(write_scene(tmp_path / "scene"), 2)
-    meta = json.loads((second / "transforms.json").read_text())
-    meta["frames"].pop()
-    (second / "transforms.json").write_text(json.dumps(meta))
-    assert "has other photographs than the first" in str(together(*loading([first, second]), seconds=5)[1])
-    for other in (SceneSource(str(first), alpha="mask"), SceneSource(SYNTHETIC)):
-        calls = [functools.partial(source.load, is_divided=True) for source in (SceneSource(str(first)), other)]
-        assert "has other options of the scene (--downscale" in str(together(*calls, seconds=5)[1])
+def test_processes_must_have_the_same_photographs(tmp_path, together):
+    folders = copies(write_scene(tmp_path / "scene"), 3)
+    (folders[1] / "images_2").mkdir()
+    for name in (folders[1] / "images").iterdir():
+        Image.open(name).resize((20, 16)).save(folders[1] / "images_2" / name.name)
+    told = error_of_all(together(*loading(folders, downscale=2), seconds=20))
+    first = share(folders[1], 0)[0].relative_to(folders[1])
+    names = rf"{first} downscaled by 1, not {first} downscaled by 2; give all processes .* such as images_2"
+    assert re.fullmatch(f"process 1 has other photographs than process 0: {names}", told)
+    meta = json.loads((folders[2] / "transforms.json").read_text())
+    last = meta["frames"].pop()["file_path"]
+    (folders[2] / "transforms.json").write_text(json.dumps(meta))
+    told = error_of_all(together(*loading(folders), seconds=20))
+    assert told.startswith(f"process 2 has other photographs than process 0: none, not {last} downscaled by 1; ")
+
+
+@pytest.mark.parametrize(
+    ("option", "values"),
+    [("downscale", (1, 2)), ("test_every", (8, 4)), ("alpha", ("transparency", "mask")), ("lens", ("undistort", "x"))],
+)
+def test_processes_must_have_the_same_options(tmp_path, together, option, values):
+    folder = write_scene(tmp_path / "scene")
+    calls = [functools.partial(load_scene, folder, is_divided=True, **{option: value}) for value in values]
+    difference = f"{option}={values[1]}, not {option}={values[0]}; "
+    told = error_of_all(together(*calls, seconds=20))
+    assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}")
+
+
+@pytest.mark.parametrize(
+    ("path", "changes", "difference"),
+    [
+        (SYNTHETIC, {}, "scene=synthetic, not scene=from files"),
+        ("", {"validation": True}, "validation=True, not validation=False"),
+        ("", {"alpha": "mask"}, "alpha=mask, not alpha=transparency"),
+    ],
+)
+def test_processes_of_a_run_must_have_the_same_options(tmp_path, together, path, changes, difference):
+    folder = str(write_scene(tmp_path / "scene"))
+    sources = SceneSource(folder), SceneSource(path or folder, **changes)
+    told = error_of_all(together(*(functools.partial(one.load, is_divided=True) for one in sources), seconds=20))
+    assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}; ")
+
+
+def test_processes_at_different_steps_end(together):
+    def at(step):
+        with sharing_errors(load.among_processes()):
+            load.among_processes().exchange(step)
+
+    told = error_of_all(together(*(functools.partial(at, step) for step in ("masks", "photographs")), seconds=20))
+    assert told.startswith("process 1 has other steps of loading than process 0: photographs, not masks; ")
+
+
+def test_an_error_of_the_connection_is_not_told(together):
+    """The others cannot be reached, so that telling them would only wait."""
+
+    def fail():
+        with sharing_errors(load.among_processes()):
+            raise ValueError("Gloo AllGather failed")
+
+    assert str(together(fail, lambda: None, seconds=5)[0]) == "Gloo AllGather failed"

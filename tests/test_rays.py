@@ -19,7 +19,9 @@ from a2tg_jax.data.scene import kinds_of, ray_bytes
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.systems.stage1 import PruneConfig
+from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
+from a2tg_jax.training.cost import fed_bytes
 from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.start import initial_model
 
@@ -248,6 +250,15 @@ def test_rays_stay_on_the_device_if_those_of_all_lenses_fit(kept, lacking):
     photographs.close()
     assert (first is second) == (not lacking) and isinstance(first, jax.Array)
     np.testing.assert_array_equal(second, kept.train[0].camera.rays)
+
+
+def test_rays_that_come_with_batches_count_twice(kept, monkeypatch):
+    """Those of the step's batch and of the next; rays that stay on the device count once."""
+    of_rays, counted = ray_bytes(kept.train), []
+    for room in (of_rays, of_rays - 1):
+        monkeypatch.setattr(batches, "device_room", lambda room=room: room)
+        counted.append(fed_bytes(kept.train, 1))
+    assert counted[1] - counted[0] == of_rays > 0
 
 
 @pytest.mark.filterwarnings("ignore:training does not learn")

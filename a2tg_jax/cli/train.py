@@ -210,7 +210,7 @@ class Train:
         check_weights(weights)
         with opened(self.out) as run:
             record = self._resumed(run)
-            scene = record.scene.load(room_for_photographs(most), is_divided=self.coordinator is not None)
+            scene = record.scene.load(room_for_photographs(most), is_divided=True)
             given = given_splats(record)
             tell_forecast(scene, record.plan, most, session.num_devices, number_given(run, record, given))
             result = go_on(

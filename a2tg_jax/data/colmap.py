@@ -20,7 +20,7 @@ from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
-from a2tg_jax.data.photo_reading import Photo, Reading, read_photos
+from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat, scene_name
@@ -79,7 +79,7 @@ def load_colmap(
     _log_unregistered(images_folder, len(registered))
     reach = SAME_PLACE * spacing(registered)
 
-    def photo(image: Any) -> Photo:
+    def photo(image: Any) -> PhotoFiles:
         return _photo(image, lenses[image.camera_id], images_folder, downscale)
 
     photos = map_in_threads(photo, registered, num_readers(path))
@@ -130,17 +130,17 @@ def viewmat_of(image: Any) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo:
+def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> PhotoFiles:
     """Return the files and the lens of one registered image."""
     file, still_to_downscale = locate_image(images_folder, image.name, downscale)
 
-    def refused(error: Exception) -> str:
+    def error_message(error: Exception) -> str:
         if isinstance(lens, KeptLens):
             return f"{file}: its camera model {error}"
         return f"{file}: its camera model {error}; undistort the scene with COLMAP first"
 
-    return Photo(
-        image.name, file, still_to_downscale, lambda _: lens, refused,
+    return PhotoFiles(
+        image.name, file, still_to_downscale, lambda _: lens, error_message,
         mask=find_mask(images_folder, image.name, downscale),
         depths=find_depths(images_folder, image.name),
     )  # fmt: skip

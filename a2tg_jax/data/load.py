@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from a2tg_jax.data.colmap import find_model, load_colmap
-from a2tg_jax.data.division import Division, among_processes
+from a2tg_jax.data.division import Division, among_processes, sharing_errors
 from a2tg_jax.data.frames import Frames, load_frames
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
@@ -65,7 +65,7 @@ def load_scene(
       lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
         with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
       is_divided: whether the processes of `jax.distributed` call this together. Each then reads an equal share of the
-        photographs, and of the others those that have room in its memory.
+        photographs, and of the others those that have room in its memory. An error of one is raised in all.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the input's.
@@ -73,19 +73,24 @@ def load_scene(
     Raises:
       FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
       OSError: if a store does not answer.
-      ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
+      ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left,
+        or processes that load it together have other options or photographs than the first.
     """
-    if alpha not in get_args(AlphaMeaning):
-        raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
-    if lens not in get_args(LensUse):
-        raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
     division = among_processes() if is_divided else None
-    try:
-        scene = _load(located(path), downscale, test_every, room, lens, division)
-    finally:
-        forget_rays()
-    warn_of_lenses(scene)
-    return alpha_as_mask(scene, str(path), division) if alpha == "mask" else scene
+    with sharing_errors(division):
+        if division is not None:
+            options = {"downscale": downscale, "test_every": test_every, "alpha": alpha, "lens": lens}
+            division.check_same([f"{name}={value}" for name, value in options.items()], "options of the scene")
+        if alpha not in get_args(AlphaMeaning):
+            raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
+        if lens not in get_args(LensUse):
+            raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
+        try:
+            scene = _load(located(path), downscale, test_every, room, lens, division)
+        finally:
+            forget_rays()
+        warn_of_lenses(scene)
+        return alpha_as_mask(scene, str(path), division) if alpha == "mask" else scene
 
 
 def is_scene(folder: Path) -> bool:

@@ -33,14 +33,14 @@ class Mask:
         height, width = counts.shape
         return Mask((height, width), int(counts.sum()), zlib.compress(np.packbits(counts).tobytes(), 1))
 
-    def told(self) -> list[Any]:
-        """Return what `of_told` reads, for JSON."""
+    def to_json(self) -> list[Any]:
+        """Return values that can be written as JSON."""
         return [*self.shape, self.num, base64.b64encode(self.data).decode()]
 
     @staticmethod
-    def of_told(told: list[Any]) -> "Mask":
-        """Return the mask that `told` was made of."""
-        height, width, num, data = told
+    def from_json(values: list[Any]) -> "Mask":
+        """Return the mask whose `to_json` gave these values."""
+        height, width, num, data = values
         return Mask((height, width), num, base64.b64decode(data))
 
     @property

@@ -24,7 +24,7 @@ from a2tg_jax.data.photo_store import Picture, Shelf
 from a2tg_jax.host.remote_files import is_remote
 
 
-class Photo(NamedTuple):
+class PhotoFiles(NamedTuple):
     """Files and camera of a photograph, none of which is read yet."""
 
     name: str
@@ -34,7 +34,7 @@ class Photo(NamedTuple):
     """Factor by which the file's pixels are downscaled."""
     lens_of: Callable[[tuple[int, int]], Lens]
     """Function from the file's (width, height) to the lens."""
-    refused: Callable[[Exception], str]
+    error_message: Callable[[Exception], str]
     """Function from an error of the lens to a message that names the photograph."""
     mask: tuple[Path, int] | None
     """File of the mask, and the factor by which it is downscaled."""
@@ -58,14 +58,15 @@ class Facts(NamedTuple):
         """(width, height) of the view."""
         return self.shape[1], self.shape[0]
 
-    def told(self) -> list[Any]:
-        """Return what `of_told` reads, for JSON."""
-        return [self.stored, self.shape, self.is_stored, None if self.mask is None else self.mask.told()]
+    def to_json(self) -> list[Any]:
+        """Return values that can be written as JSON."""
+        return [self.stored, self.shape, self.is_stored, None if self.mask is None else self.mask.to_json()]
 
     @staticmethod
-    def of_told(told: list[Any]) -> "Facts":
-        stored, shape, is_stored, mask = told
-        return Facts(tuple(stored), tuple(shape), is_stored, None if mask is None else Mask.of_told(mask))
+    def from_json(values: list[Any]) -> "Facts":
+        """Return the facts whose `to_json` gave these values."""
+        stored, shape, is_stored, mask = values
+        return Facts(tuple(stored), tuple(shape), is_stored, None if mask is None else Mask.from_json(mask))
 
 
 class Reading(NamedTuple):
@@ -80,17 +81,18 @@ class Reading(NamedTuple):
     depth: DepthMap | None
 
 
-def read_photos(photos: Sequence[Photo], shelf: Shelf, division: Division | None, place: Path) -> list[Reading]:
+def read_photos(photos: Sequence[PhotoFiles], shelf: Shelf, division: Division | None, place: Path) -> list[Reading]:
     """Return the photographs of a scene.
 
     Args:
       photos: in an order that is the same in all processes.
       shelf: where their pixels go.
-      division: processes that call this together; None: one.
+      division: processes that call this together, within `sharing_errors`; None: one.
       place: path of the scene.
 
     Raises:
-      FileNotFoundError, ValueError, OSError: if a photograph or a mask cannot be used, in every process.
+      FileNotFoundError, ValueError, OSError: if a photograph or a mask cannot be used. `sharing_errors` raises it in
+        every process.
     """
     threads = num_readers(place)
     if division is None:
@@ -99,22 +101,26 @@ def read_photos(photos: Sequence[Photo], shelf: Shelf, division: Division | None
 
     def facts_of(number: int) -> list[Any]:
         read[number] = _read(photos[number], shelf)
-        return read[number].facts.told()
+        return read[number].facts.to_json()
 
-    names = [f"{photo.name} 1/{photo.downscale}" for photo in photos]
-    facts = [Facts.of_told(told) for told in division.results(names, facts_of, threads)]
+    names = [f"{photo.name} downscaled by {photo.downscale}" for photo in photos]
+    facts = [Facts.from_json(values) for values in division.results(names, facts_of, "photographs", threads)]
     others = [number for number in range(len(photos)) if number not in read]
     fitting = shelf.fitting([math.prod(facts[number].shape) for number in others])
 
     def of_another(number: int, fits: bool) -> Reading:
-        return _read(photos[number], shelf) if fits else _unread(photos[number], shelf, facts[number])
+        if not fits:
+            return _unread(photos[number], shelf, facts[number])
+        reading = _read(photos[number], shelf)
+        _check_size(photos[number], reading.facts.stored, facts[number].stored)
+        return reading
 
     found = map_in_threads(lambda item: of_another(*item), zip(others, fitting, strict=True), threads)
     read.update(zip(others, found, strict=True))
     return [read[number] for number in range(len(photos))]
 
 
-def _read(photo: Photo, shelf: Shelf) -> Reading:
+def _read(photo: PhotoFiles, shelf: Shelf) -> Reading:
     """Read a photograph, and undistort and downscale it."""
     photograph = read_pixels(photo.file)
     stored = photograph.shape[1], photograph.shape[0]
@@ -130,30 +136,35 @@ def _read(photo: Photo, shelf: Shelf) -> Reading:
     return Reading(Facts(stored, pixels.shape, is_stored, mask), K, rays, picture, depth)
 
 
-def _unread(photo: Photo, shelf: Shelf, facts: Facts) -> Reading:
+def _unread(photo: PhotoFiles, shelf: Shelf, facts: Facts) -> Reading:
     """Return a photograph that another process has read. Its own file is read when it is first needed.
 
     Raises:
       ValueError: if the file is of another size; that of object storage is not looked at.
     """
-    if not is_remote(photo.file) and (size := picture_size(photo.file)) != facts.stored:
-        width, height = size
-        raise ValueError(
-            f"{photo.file}: is {width}x{height}, but {facts.stored[0]}x{facts.stored[1]} where another process reads "
-            "it; give all processes the same photographs"
-        )
+    if not is_remote(photo.file):
+        _check_size(photo, picture_size(photo.file), facts.stored)
     lens = photo.lens_of(facts.stored)
     with _named(photo):
         size, K = lens.view_of(facts.stored, photo.downscale)
         rays = lens.rays(*size)
-    picture = shelf.later(facts.shape, photo.file, None if facts.is_stored else lens.viewing(photo.downscale))
+    picture = shelf.read_later(facts.shape, photo.file, None if facts.is_stored else lens.viewing(photo.downscale))
     return Reading(facts, K, rays, picture, depth_map(photo.depths, lens, facts.stored, size))
 
 
+def _check_size(photo: PhotoFiles, size: tuple[int, int], stored: tuple[int, int]) -> None:
+    """Raise ValueError unless a photograph has the size (width, height) that another process has read."""
+    if size != stored:
+        raise ValueError(
+            f"{photo.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; give "
+            "all processes the same photographs"
+        )
+
+
 @contextlib.contextmanager
-def _named(photo: Photo) -> Iterator[None]:
+def _named(photo: PhotoFiles) -> Iterator[None]:
     """Name the photograph in errors of its lens."""
     try:
         yield
     except ValueError as error:
-        raise ValueError(photo.refused(error)) from None
+        raise ValueError(photo.error_message(error)) from None

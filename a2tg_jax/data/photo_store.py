@@ -110,7 +110,7 @@ class Shelf:
             room -= size if fitting[-1] else 0
         return fitting
 
-    def later(self, shape: tuple[int, ...], source: Path, view: Processing | None) -> Picture:
+    def read_later(self, shape: tuple[int, ...], source: Path, view: Processing | None) -> Picture:
         """Return the picture in an image file that is not read before it is needed, and not kept in memory then.
 
         Args:

@@ -19,7 +19,7 @@ from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import check_inside, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, named_mask
-from a2tg_jax.data.photo_reading import Photo, Reading, read_photos
+from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import (
@@ -165,7 +165,7 @@ def read_shots(
     return groups
 
 
-def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> Photo:
+def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> PhotoFiles:
     """Return the files of one frame; `frame` also holds the file's global values, which the frame's own override."""
     if "file_path" not in frame or "transform_matrix" not in frame:
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
@@ -174,9 +174,9 @@ def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> P
     # Only a folder of images below the scene has siblings of the form images_k.
     image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
     image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
-    return Photo(
+    return PhotoFiles(
         name, image_file, still_to_downscale, lambda stored: _lens(frame, stored, f"{file}: {name}", use),
-        refused=lambda error: f"{file}: {name}: its camera model {error}",
+        error_message=lambda error: f"{file}: {name}: its camera model {error}",
         mask=_find_mask(file, frame, image_folder / image_name, downscale),
         depths=_find_depths(file, frame, image_folder / image_name),
     )  # fmt: skip

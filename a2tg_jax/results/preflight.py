@@ -8,7 +8,6 @@ from pathlib import Path
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
-from a2tg_jax.host.processes import team
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import format_of
@@ -58,7 +57,7 @@ def check_new_run(
         check_init(given, out, record.system)
     num_given = None if given is None else given.splats.num
     check_output(out)
-    scene = record.scene.load(room_for_photographs(max_memory), is_divided=team() is not None)
+    scene = record.scene.load(room_for_photographs(max_memory), is_divided=True)
     for system in record.systems.values():
         check_start(scene, system, num_given if system is record.system else None)
     check_room(record, scene, out, num_given)

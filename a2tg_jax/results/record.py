@@ -21,7 +21,7 @@ from typing import Any, Literal
 import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
-from a2tg_jax.data.division import among_processes
+from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.data.scene import scene_name, with_validation_views
@@ -89,9 +89,10 @@ class SceneSource:
           FileNotFoundError, ValueError: as `load_scene` does.
         """
         division = among_processes() if is_divided else None
-        if division is not None:  # All of them must load in the same way.
-            told = dataclasses.replace(self, path=SYNTHETIC if self.path == SYNTHETIC else "")
-            division.check_same(repr(told), "options of the scene (--downscale, --test-every, --alpha, --lens)")
+        if division is not None:  # `load_scene` compares the other options.
+            kind = SYNTHETIC if self.path == SYNTHETIC else "from files"
+            with sharing_errors(division):
+                division.check_same([f"scene={kind}", f"validation={self.validation}"], "options of the scene")
         every = self.test_every
         if self.path == SYNTHETIC:
             width, height = SYNTHETIC_SIZE

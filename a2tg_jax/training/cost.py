@@ -174,7 +174,8 @@ def fed_bytes(views: Sequence[View], batch_size: int, has_depths: bool = False) 
     if plan.is_resident:
         return sum(view_bytes(view, has_depths) for view in views) + ray_bytes(views)
     is_read = any(not view.picture.is_held for view in views)
-    of_rays = ray_bytes(views) if plan.keeps_rays else 0
+    # Rays that do not stay on the device come with each batch: with the step's own and with the next.
+    of_rays = ray_bytes(views) if plan.keeps_rays else 2 * max(ray_bytes([view]) for view in views)
     readers = min(plan.num_ahead, num_threads()) * is_read
     return of_rays + (2 * plan.num_ahead + 1) * plan.batch_bytes + readers * DECODER_PER_PIXEL * largest_view(views)
 
