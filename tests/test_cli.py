@@ -22,8 +22,9 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
+from a2tg_jax.finish.compaction import Trial
 from a2tg_jax.host import startup
-from a2tg_jax.io.compact import load_compact
+from a2tg_jax.io.compact import CompactChoices, grids_of, half_turned, load_compact
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
@@ -34,7 +35,7 @@ from a2tg_jax.results.history import read_history
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.record import SceneSource, read_record, write_record
 from a2tg_jax.results.viewing import open_source, routes_of
-from a2tg_jax.training import SYSTEMS, find_system
+from a2tg_jax.training import SYSTEMS, DivergedError, find_system
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -626,11 +627,69 @@ def test_compress_with_tuning(tiny_run, tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
     told, scene = capsys.readouterr().out, read_record(run).scene.load()
-    assert "then training up to" in told and "\ntuned " in told
+    assert "then training up to" in told and "\ntuned 1 " in told and "\ntuned 1: means " in told
     before, after = (
         evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
     )
     assert before - after <= 0.02 and tuned.stat().st_size <= plain.stat().st_size
+
+
+COARSE = dict(means=5, log_scales=3, quats=3, opacities=2, sh_0=3, sh_rest=2, texels=2)
+
+
+def tuned_so(path, choices, *, adds=0):
+    """A search of tuned files that has found the model of a file in some bits, told to be larger than it is."""
+    model = half_turned(load_model(path))
+    tuned = tuning.Tuned(model, choices, grids_of(model, choices))
+    trial = Trial(choices, len(tuned.data) + adds, (0.0, 0.0))
+    return tuning.TunedFiles([trial], trial, tuned)
+
+
+@pytest.mark.parametrize(("adds", "is_kept"), [(0, True), (10**9, False)])
+def test_compress_writes_the_smaller_file(adds, is_kept, tiny_run, tmp_path, monkeypatch, capsys):
+    run, *_ = tiny_run
+    found = tuned_so(run.model("a2tg-textures"), CompactChoices(**COARSE), adds=adds)
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
+    monkeypatch.setattr(compression, "smallest_tuned", lambda *a: found)
+    out = tmp_path / "tuned.a2tgz"
+    assert cli.main([*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
+    assert (out.read_bytes() == found.tuned.data) is is_kept
+    assert ("chosen: means 5" in capsys.readouterr().out) is is_kept
+
+
+def test_a_tuned_file_may_be_the_only_one_within_the_loss(tiny_run, tmp_path, monkeypatch, capsys):
+    run, *_ = tiny_run
+    found = tuned_so(run.model("a2tg-textures"), CompactChoices(**COARSE))
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (3, 4)})
+    out = tmp_path / "tuned.a2tgz"
+    command = [*TUNE, str(run.path), "--out", str(out), "--max-loss", "0"]
+    with monkeypatch.context() as patch:
+        patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
+        assert "--max-loss must be larger: no file, tuned or not, is within it; got 0.0" in fails(capsys, *command)
+    assert not out.exists()
+    monkeypatch.setattr(compression, "smallest_tuned", lambda *a: found)
+    assert cli.main(command) == 0 and out.read_bytes() == found.tuned.data
+
+
+def test_a_diverged_tuning_keeps_what_was_found(tiny_run, tmp_path, monkeypatch, capsys):
+    def diverge(*arguments, title, **options):
+        raise DivergedError(f"{title}: the loss has exploded", None)
+
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
+    monkeypatch.setattr(compression, "tune_compact", diverge)
+    run, *_ = tiny_run
+    out = tmp_path / "a.a2tgz"
+    assert cli.main([*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
+    told = "tuning ended early, what was found before is kept: tuning 1 of up to 4: the loss has exploded\n"
+    assert told in capsys.readouterr().out and load_compact(out).num == 60
+
+
+@pytest.mark.parametrize(("name", "told"), [("plain.a2tgz", ", which is compressed already"), ("scene.ply", "")])
+def test_compress_tells_what_it_reads(name, told, tmp_path, capsys):
+    path = tmp_path / name
+    path.write_bytes(b"")
+    wanted = f"a2tg compress reads a run folder or *.npz; got {path}{told}\n"
+    assert wanted in fails(capsys, "compress", str(path))
 
 
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (ValueError("the loss has exploded"), 2)])
