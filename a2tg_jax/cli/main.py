@@ -130,7 +130,7 @@ class Compress:
         suffix = self.source.suffix.lower()
         if not self.source.is_dir() and FORMATS.get(suffix, "model") != "model":
             told = ", which is compressed already" if suffix == SUFFIX else ""
-            raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(self.source)}{told}")
+            raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(self.source))}{told}")
         tell = functools.partial(print, flush=True)
         found = compress(
             self.source, self.out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell
