@@ -100,8 +100,8 @@ class Eval:
 class Compress:
     """Write the smallest file of a model within a given loss of PSNR.
 
-    The loss is measured on the training views. If the photographs are missing, it is estimated from renders, for a
-    model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU. With
+    The loss is measured on at most 16 training views. If the photographs are missing, it is estimated from renders, for
+    a model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU. With
     --tune-iterations the model is trained further while its numbers are rounded, so that fewer bits suffice.
 
     Examples:
