@@ -1,5 +1,7 @@
 """The command `a2tg compress`, with and without tuning, on a tiny run."""
 
+import re
+
 import pytest
 from test_cli import TINY, fails
 
@@ -12,7 +14,7 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.results import compression
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import SceneSource, read_record
-from a2tg_jax.training import DivergedError
+from a2tg_jax.training import DivergedError, progress
 
 TUNE = ["compress", "--tune-iterations", "30"]
 COARSE = CompactChoices(means=5, log_scales=3, quats=3, opacities=2, sh_0=3, sh_rest=2, texels=2)
@@ -60,6 +62,7 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     ladder = {"means": (3, 5, 8, 14), "log_scales": (1, 2, 4, 10), "sh_0": (1, 2, 4, 10), "opacities": (1, 2, 4, 10)}
     monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
     monkeypatch.setattr(tuning, "MOST_TUNINGS", 1)
+    monkeypatch.setattr(progress, "TIMED_SECONDS", 0.0)
     plain, tuned = tmp_path / "plain.a2tgz", tmp_path / "tuned.a2tgz"
     with monkeypatch.context() as patch:
         patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
@@ -67,6 +70,7 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
     told, scene = capsys.readouterr().out, read_record(run).scene.load()
+    assert re.search(r"\ntuning 1 of up to 4: .* for the other \d+, without compiling\n", told)  # Nothing grows.
     assert "then training up to" in told and "\ntuned 1 " in told and "\ntuned 1: means " in told
     before, after = (
         evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
