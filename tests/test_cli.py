@@ -21,14 +21,11 @@ from a2tg_jax.cli import doctor
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.finish import tuning
 from a2tg_jax.host import startup
-from a2tg_jax.io.compact import load_compact
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.measure.evaluation import evaluate
-from a2tg_jax.results import compression, finishing, frames, run_training
+from a2tg_jax.results import finishing, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.kept_lpips import sha256_of
@@ -48,9 +45,6 @@ TENSORBOARD = ("--tensorboard",) if importlib.util.find_spec("tensorboardX") els
 def untouched_jax(monkeypatch):
     """The tests' process keeps its flags, and runs have no terminal to draw a progress bar on."""
     monkeypatch.setattr(cli, "configure_cpu", lambda: None)
-
-
-TUNE = ["compress", "--tune-iterations", "30"]
 
 
 @pytest.fixture(scope="module")
@@ -588,61 +582,6 @@ def test_what_polishing_spoils_is_left_out():
     assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 20.1))) == "polished"
     assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 19.8))) == "shrunk"
     assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9))) == "shrunk"
-
-
-def test_compress(tiny_run, tmp_path, monkeypatch, capsys):
-    """By the run's photographs; and without them, by renders."""
-    ladder = {"means": (8, 14), "sh_rest": (3, 8)}
-    monkeypatch.setattr(compression, "LADDER", ladder)
-    run, *_ = tiny_run
-    assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
-    text = capsys.readouterr().out
-    path = run.model("a2tg-textures").with_suffix(".a2tgz")
-    assert "dB lost, training views  dB lost, test views" in text and f"\n{path}: " in text
-    assert load_compact(path).num_bytes == load_model(run.model("a2tg-textures")).num_bytes > 2 * path.stat().st_size
-    assert path.relative_to(run.path).as_posix() in run.written()
-
-    def gone(self):
-        raise FileNotFoundError("no photographs")
-
-    monkeypatch.setattr(SceneSource, "load", gone)
-    out = tmp_path / "other.a2tgz"
-    assert cli.main(["compress", str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
-    assert "dB lost, if 30 dB" in capsys.readouterr().out and load_compact(out).num == 60
-    assert "--tune-iterations needs the photographs of" in fails(capsys, *TUNE, str(run.path), "--out", tmp_path / "no")
-    assert not (tmp_path / "no").exists()
-
-
-def test_compress_with_tuning(tiny_run, tmp_path, monkeypatch, capsys):
-    """Tuned files are measured as any others, and are kept only if they are smaller and lose no more."""
-    ladder = {"means": (3, 5, 8, 14), "log_scales": (1, 2, 4, 10), "sh_0": (1, 2, 4, 10), "opacities": (1, 2, 4, 10)}
-    monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
-    monkeypatch.setattr(tuning, "MOST_TUNINGS", 1)
-    run, *_ = tiny_run
-    plain, tuned = tmp_path / "plain.a2tgz", tmp_path / "tuned.a2tgz"
-    with monkeypatch.context() as patch:
-        patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
-        assert cli.main([*TUNE, str(run.path), "--out", str(plain), "--max-loss", "0.02"]) == 0
-    capsys.readouterr()
-    assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
-    told, scene = capsys.readouterr().out, read_record(run).scene.load()
-    assert "then training up to" in told and "\ntuned " in told
-    before, after = (
-        evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
-    )
-    assert before - after <= 0.02 and tuned.stat().st_size <= plain.stat().st_size
-
-
-@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (ValueError("the loss has exploded"), 2)])
-def test_a_stopped_tuning_writes_no_file(error, code, tiny_run, tmp_path, monkeypatch, capsys):
-    def stop(*arguments, **options):
-        raise error
-
-    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
-    monkeypatch.setattr(compression, "tune_compact", stop)
-    run, *_ = tiny_run
-    assert cli.main([*TUNE, str(run.path), "--out", str(tmp_path / "a.a2tgz"), "--max-loss", "0.5"]) == code
-    assert not list(tmp_path.iterdir())
 
 
 def test_render_without_ffmpeg_says_so(tiny_run, tmp_path, monkeypatch, capsys):

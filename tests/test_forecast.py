@@ -339,6 +339,14 @@ def test_the_pace_is_told_once_when_enough_was_timed():
     assert told(600, num_compiled=2) == "22 ms an iteration, about 0:00:09 for the other 400, without compiling"
 
 
+def test_the_pace_does_not_speak_of_growth_where_there_is_none():
+    seconds = iter([0.0, 5.0])
+    pace = Pace(0, 100, lambda: next(seconds), may_grow=False)
+    pace.time(10, 1)
+    pace.time(20, 1)
+    assert pace.told(20) == "500 ms an iteration, about 0:00:40 for the other 80, without compiling"
+
+
 @pytest.mark.parametrize("is_shown", [True, False])
 def test_the_pace_stands_above_the_bar(capsys, monkeypatch, is_shown):
     monkeypatch.setattr(progress, "TIMED_SECONDS", 0.0)

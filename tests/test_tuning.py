@@ -13,13 +13,20 @@ from test_compaction import SCENE, a_model
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Shaped
+from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.data import Scene
+from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.events import event
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import Trial, loss_on_views
 from a2tg_jax.finish.rounding import GradualRounding, GridRounding, partly_rounded
-from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, smallest_tuned, tune_compact
+from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, TunedFiles, smallest_tuned, tune_compact
 from a2tg_jax.io.compact import GROUPS, CompactChoices, decode_model, encode_model, grids_of, half_turned
+from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.training import DivergedError
+from a2tg_jax.results.corrected import refined_views
+from a2tg_jax.training import DivergedError, Stage
+from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement, exposed
 
 COARSE = CompactChoices(
     means=14, log_scales=4, quats=4, opacities=3, sh_0=4, sh_rest=3, texels=3, shapes=3, coder="none"
@@ -155,6 +162,92 @@ def test_what_cannot_be_tuned_is_refused(model, iterations, words):
         tune_compact(model, SCENE, SYSTEM, COARSE, iterations=iterations)
 
 
+# Corrections
+
+TWISTS = 0.03 * np.random.default_rng(5).normal(size=(len(SCENE.train), 6))
+SHIFTS = np.linspace(-0.1, 0.1, len(SCENE.train))
+EXPOSURES = np.eye(3, 4) + SHIFTS[:, None, None] * np.array([[3.0, 0, 0, 0.2], [0, 2, 0, 0.2], [0, 0, 3, -0.2]])
+CORRECTED = dataclasses.replace(SYSTEM, exposure=True, refine_poses=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class CorrectedStage(a2tg.training.System):
+    """A system of one stage."""
+
+    stage: Stage = dataclasses.field(default_factory=lambda: CORRECTED.stages()[-1])
+
+    def stages(self):
+        return (self.stage,)
+
+
+@event
+class OwnExposure(Correction):
+    """An exposure whose rate is no field."""
+
+    name = "exposure"
+    neutral = np.eye(3, 4)
+
+    def learning_rate(self, progress):
+        return 0.1 + 0 * progress
+
+    def color(self, row, color):
+        return exposed(row, color)
+
+
+def misplaced(view, exposure, twist):
+    """The view as a camera took it that is exposed so, and whose pose is off by a twist."""
+    viewmat = moved_viewmat(jnp.asarray([*-twist[:3], 0, 0, 0]), view.camera.viewmat.at[:3, 3].add(-twist[3:]))
+    pixels = np.clip(exposed(jnp.asarray(exposure), jnp.asarray(view.image / 255)), 0, 1)
+    camera = dataclasses.replace(view.camera, viewmat=viewmat.astype(np.float32))
+    return dataclasses.replace(view, camera=camera, picture=np.round(255 * pixels).astype(np.uint8))
+
+
+@functools.cache
+def corrected() -> tuple[Scene, Model]:
+    """A scene of misplaced views, and a model that has learned how they are."""
+    views = tuple(map(misplaced, SCENE.train, EXPOSURES, TWISTS))
+    origin, num_test = origin_of_scene(SCENE), len(SCENE.test)
+    learned = {
+        "exposure": np.concatenate([EXPOSURES, np.tile(np.eye(3, 4), (num_test, 1, 1))]),
+        "pose": np.concatenate([TWISTS, np.zeros((num_test, 6))]),
+    }
+    origin = dataclasses.replace(origin, corrections=learned)
+    return dataclasses.replace(SCENE, train=views), dataclasses.replace(trained_model(), origin=origin)
+
+
+def corrected_psnr(scene: Scene, model: Model) -> float:
+    return evaluate(refined_views(scene.train, model), model, fit_colors=True).psnr
+
+
+def test_tuning_keeps_what_was_learned_of_the_photographs():
+    """A second tuning too, which starts from the first."""
+    scene, model = corrected()
+    assert evaluate(scene.train, model).psnr < corrected_psnr(scene, model) - 3
+    for _ in range(2):
+        tuned = tune_compact(model, scene, CORRECTED, FINE, iterations=100).model
+        assert corrected_psnr(scene, tuned) > corrected_psnr(scene, model) - 0.02
+        assert tuned.origin == corrected()[1].origin and sorted(tuned.origin.corrections) == ["exposure", "pose"]
+        model = tuned
+
+
+@pytest.mark.parametrize("kind", [OwnExposure, Exposure])
+def test_corrections_stay_as_they_are(monkeypatch, kind):
+    """Those of a user's own class too, whose rate is no field."""
+    found, fit_stage = [], tuning.fit_stage
+
+    def fit_and_keep(*arguments, **options):
+        found.append(fit_stage(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(tuning, "fit_stage", fit_and_keep)
+    scene, model = corrected()
+    stage = dataclasses.replace(CORRECTED.stages()[-1], corrections=(PoseRefinement(), kind()))
+    tune_compact(model, scene, CorrectedStage(stage=stage), FINE, iterations=5)
+    (result,) = found
+    for name, rows in model.origin.corrections.items():
+        np.testing.assert_array_equal(result.model.origin.corrections[name], rows.astype(np.float32))
+
+
 # The search
 
 
@@ -166,7 +259,8 @@ def search(monkeypatch, loss_after, max_loss=0.05):
         tolerances.append(tolerance)
         return Trial(CompactChoices(means=max(16 - len(tolerances), 1)), 0, (tolerance,))
 
-    def tune(model, choices):
+    def tune(model, choices, number):
+        assert number == len(tolerances)
         started.append(model)
         return Tuned(f"after {tolerances[-1]:.2f}", choices, {})
 
@@ -208,6 +302,30 @@ def test_a_search_in_which_nothing_stays_within_keeps_nothing(monkeypatch):
     tolerances, found, _ = search(monkeypatch, lambda before: 0.401, max_loss=0.4)
     np.testing.assert_allclose(tolerances, [0.8, 0.8 * 0.5**0.5, 0.4, 0.4])
     assert found.chosen is None and found.tuned is None and len(found.tried) == MOST_TUNINGS
+
+
+def diverged_in(number):
+    """A tuning function for the search that diverges in one of its tunings."""
+
+    def tune(model, choices, now):
+        if now == number:
+            raise DivergedError("the loss has exploded", None)
+        return Tuned(f"after {now}", choices, {})
+
+    return tune
+
+
+def test_a_tuning_that_diverges_ends_the_search(monkeypatch):
+    bits = iter([9, 8, 7])
+    monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(CompactChoices(means=next(bits)), 0, (0.0,)))
+    monkeypatch.setattr(tuning, "_measured", lambda found, _: Trial(found.choices, found.choices.means, (0.0,)))
+    found = smallest_tuned("model", [], 0.05, [], diverged_in(3))
+    assert found.diverged == "the loss has exploded" and len(found.tried) == 2
+    assert found.tuned.model == "after 2" and found.chosen.num_bytes == 8
+
+
+def test_a_search_without_choices_to_start_from_is_empty():
+    assert smallest_tuned(a_model(), [lambda _: 1.0], 0.05, [], diverged_in(1)) == TunedFiles([])
 
 
 def test_the_search_ends_at_the_coarsest_choices(monkeypatch):

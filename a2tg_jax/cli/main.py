@@ -28,7 +28,8 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
-from a2tg_jax.results.compression import compress, compression_text
+from a2tg_jax.io.suffixes import FORMATS
+from a2tg_jax.results.compression import SUFFIX, compress, compression_text
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.lock import opened
@@ -99,8 +100,8 @@ class Eval:
 class Compress:
     """Write the smallest file of a model within a given loss of PSNR.
 
-    The loss is measured on the training views. If the photographs are missing, it is estimated from renders, for a
-    model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU. With
+    The loss is measured on at most 16 training views. If the photographs are missing, it is estimated from renders, for
+    a model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU. With
     --tune-iterations the model is trained further while its numbers are rounded, so that fewer bits suffice.
 
     Examples:
@@ -117,7 +118,8 @@ class Compress:
     """Largest loss of PSNR in dB."""
     tune_iterations: int = 0
     """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. It happens up to 4
-    times, for other bits each time. 0: numbers are only rounded."""
+    times, for other bits each time: first those that lose 0.5 dB, or twice --max-loss if that is more. 0: numbers are
+    only rounded."""
     overwrite: bool = False
     """Replace the file that --out names."""
 
@@ -125,6 +127,10 @@ class Compress:
         if self.out is not None:
             check_output(self.out)
             check_new(self.out, "--out", overwrite=self.overwrite)
+        suffix = self.source.suffix.lower()
+        if not self.source.is_dir() and FORMATS.get(suffix, "model") != "model":
+            told = ", which is compressed already" if suffix == SUFFIX else ""
+            raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(self.source))}{told}")
         tell = functools.partial(print, flush=True)
         found = compress(
             self.source, self.out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell

@@ -164,6 +164,10 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
     return trials
 
 
+class TooMuchLostError(ValueError):
+    """No file loses as little as is asked for."""
+
+
 def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial]) -> Trial:
     """Return the smallest file within a loss by the first measure, found greedily (host).
 
@@ -177,7 +181,7 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
       trials: what `measure_choices` found.
 
     Raises:
-      ValueError: if the finest choices lose more.
+      TooMuchLostError: if the finest choices lose more.
     """
     by_group: dict[str, list[Trial]] = {}
     for trial in trials:
@@ -188,7 +192,8 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
         found = try_choices(model, finest_choices().keeping(chosen), losses)
         if found.losses[0] <= max_loss:
             return _with_single_steps(model, losses, max_loss, by_size, found)
-    raise ValueError(f"max_loss must be {found.losses[0]:.4f} dB or more: the finest choices lose that; got {max_loss}")
+    least = f"{found.losses[0]:.4f} dB or more"
+    raise TooMuchLostError(f"max_loss must be {least}: the finest choices lose that; got {max_loss}")
 
 
 def _with_single_steps(

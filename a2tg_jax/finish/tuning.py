@@ -1,22 +1,29 @@
 """Training of a finished model while its numbers are rounded to the grids of a compact file: fewer bits then suffice.
 
 Gradually more numbers are rounded, and the others make up for it (`finish.rounding`). The file keeps the grids that
-training knew: it holds the tuned model to the last bit.
+training knew: it holds the tuned model up to the last digit of a float32.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, Trial, smallest_within
+from a2tg_jax.events import event
+from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, TooMuchLostError, Trial, smallest_within
 from a2tg_jax.finish.rounding import GradualRounding, GridRounding
 from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.io.rows import check_encodable
 from a2tg_jax.model import Model
-from a2tg_jax.training import Stage, System, fit_stage
+from a2tg_jax.training import DivergedError, Stage, System, fit_stage
+from a2tg_jax.training.corrections import Correction
 
 ITERATIONS = 1000
 RATE_OF_MEANS = 0.3
@@ -54,7 +61,8 @@ class Tuned:
         return encode_model(self.model, self.choices, self.grids)
 
 
-Tune = Callable[[Model, CompactChoices], Tuned]
+Tune = Callable[[Model, CompactChoices, int], Tuned]
+"""Tunes a model for choices, given the number of the tuning, from 1."""
 
 
 def tune_compact(
@@ -65,6 +73,7 @@ def tune_compact(
     *,
     iterations: int = ITERATIONS,
     progress: bool = False,
+    title: str | None = None,
 ) -> Tuned:
     """Train a finished model further while its numbers are rounded to the grids of a compact file.
 
@@ -75,12 +84,13 @@ def tune_compact(
     corrections stay as they are. Groups kept as floats are trained without rounding.
 
     Args:
-      model: result of the system's last stage.
+      model: result of the system's last stage, with the corrections that it learned, which a compact file drops.
       scene: its training views are trained on.
       system: which trained the model.
       choices: bits of each group.
       iterations: at least 1; 19 of 20 go by before all numbers are rounded.
       progress: show a progress bar.
+      title: of the progress bar; None: "tuning".
 
     Raises:
       ValueError: if the model shows something else than that stage, or what a compact file cannot hold.
@@ -88,11 +98,11 @@ def tune_compact(
     """
     stage = system.stages()[-1]
     _check(model, stage, iterations)
-    start = half_turned(model)
+    start = dataclasses.replace(half_turned(model), origin=model.origin)
     grids = grids_of(start, choices)
     rounding = GradualRounding(GridRounding.to(grids, choices))
     tuning = _tuning(system, dataclasses.replace(stage, events=(rounding,), iterations=iterations))
-    found = fit_stage(scene, tuning, 0, start, progress=progress).model
+    found = fit_stage(scene, tuning, 0, start, progress=progress, title=title).model
     return Tuned(dataclasses.replace(found, origin=start.origin), choices, grids)
 
 
@@ -112,15 +122,38 @@ class _Tuning(System):
 def _tuning(system: System, stage: Stage) -> _Tuning:
     """Return the options of a system with a stage whose rates fall, and whose corrections stay."""
     rates = dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means, cooldown=1.0)
-    corrections = tuple(_constant(correction) for correction in stage.corrections)
+    corrections = tuple(map(_Constant, stage.corrections))
     stage = dataclasses.replace(stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False)
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
     return _Tuning(**shared | {"memory_budget": None}, stage=stage)
 
 
-def _constant(correction: Any) -> Any:
-    """Return a correction that no longer learns, if it has a rate."""
-    return dataclasses.replace(correction, rate=0.0) if hasattr(correction, "rate") else correction
+@event
+class _Constant(Correction):
+    """A correction that no longer learns."""
+
+    learned: Correction
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.learned.name
+
+    @property
+    def bytes_per_pixel(self) -> float:  # type: ignore[override]
+        return self.learned.bytes_per_pixel
+
+    @property
+    def neutral(self) -> np.ndarray:
+        return self.learned.neutral
+
+    def learning_rate(self, progress: Array) -> Array:
+        return jnp.zeros_like(progress)
+
+    def camera(self, row: Array, camera: Camera) -> Camera:
+        return self.learned.camera(row, camera)
+
+    def color(self, row: Array, color: Array) -> Array:
+        return self.learned.color(row, color)
 
 
 def _check(model: Model, stage: Stage, iterations: int) -> None:
@@ -143,6 +176,8 @@ class TunedFiles(NamedTuple):
     """The smallest one within the loss; None if there is none."""
     tuned: Tuned | None = None
     """The model of that file."""
+    diverged: str | None = None
+    """Error that ended the search; None: it came to its end."""
 
 
 def smallest_tuned(
@@ -152,7 +187,8 @@ def smallest_tuned(
 
     Choices that lose more before tuning are tuned for, `MOST_TUNINGS` times. That loss is doubled as long as the tuned
     model stays within `max_loss`; from the first time on that it does not, the loss falls or grows by a factor of √2.
-    Each tuning goes on from the one before, so that what was too much once may be tried again.
+    Each tuning goes on from the one before, so that what was too much once may be tried again. The search ends early if
+    a tuning diverges or even the finest choices lose more, and keeps what was found before.
 
     Args:
       model: the model.
@@ -163,11 +199,17 @@ def smallest_tuned(
     """
     found, latest = TunedFiles([]), model
     tolerance, factor = max(FIRST_TOLERANCE, 2 * max_loss), 2.0
-    for _ in range(MOST_TUNINGS):
-        choices = smallest_within(model, losses, tolerance, trials).choices
+    for number in range(1, MOST_TUNINGS + 1):
+        try:
+            choices = smallest_within(model, losses, tolerance, trials).choices
+        except TooMuchLostError:
+            break
         if found.chosen is not None and choices == found.chosen.choices:
             break
-        tuned = tune(latest, choices)
+        try:
+            tuned = tune(latest, choices, number)
+        except DivergedError as error:
+            return found._replace(diverged=str(error))
         trial, latest = _measured(tuned, losses), tuned.model
         found.tried.append(trial)
         if trial.losses[0] > max_loss:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from a2tg_jax.core.display import in_bytes
@@ -12,6 +12,7 @@ from a2tg_jax.finish.compaction import (
     LADDER,
     Ladder,
     Loss,
+    TooMuchLostError,
     Trial,
     loss_beside_renders,
     loss_on_views,
@@ -57,6 +58,8 @@ class Compressed:
     """Names of the loss measures of the trials."""
     tuned: Sequence[Trial] = ()
     """Files of tuned models, in the order of trial."""
+    diverged: str | None = None
+    """Error that ended the search for tuned files; None: there was none."""
 
 
 def compress(
@@ -84,7 +87,6 @@ def compress(
       FileNotFoundError: if there is no such model, or no photographs to tune it with.
       ValueError: if a compact file cannot hold it, nothing loses so little, `out` is a folder or the model, or a
         model's file is to be tuned.
-      DivergedError: if tuning diverges; no file is written.
     """
     run = open_run(source) if source.is_dir() else None
     path, settings = (source, RenderSettings()) if run is None else _last_model(run)
@@ -101,16 +103,41 @@ def compress(
     ladder, measures = LADDER if tune is None else TUNED_LADDER, list(losses.values())
     on_start(_plan_told(ladder, tune_iterations))
     trials = measure_choices(model, measures, ladder)
-    chosen = smallest_within(model, measures, max_loss, trials)
-    data = encode_model(model, chosen.choices)
+    untuned = _untuned(model, measures, max_loss, trials, may_fail=tune is not None)
     found = TunedFiles([]) if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
-    if found.tuned is not None and found.chosen is not None and found.chosen.num_bytes < chosen.num_bytes:
-        data, chosen = found.tuned.data, found.chosen
+    chosen, data = _smaller(model, untuned, found, max_loss)
     if run is not None and out == path.with_suffix(SUFFIX):
         run.own(out)
     with replacing(out) as temporary:
         temporary.write_bytes(data)
-    return Compressed(out, model, trials, chosen, tuple(losses), found.tried)
+    return Compressed(out, model, trials, chosen, tuple(losses), found.tried, found.diverged)
+
+
+def _untuned(
+    model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial], *, may_fail: bool
+) -> Trial | None:
+    """Return the smallest file without tuning; None if there is none within the loss, and that may be."""
+    try:
+        return smallest_within(model, losses, max_loss, trials)
+    except TooMuchLostError:
+        if may_fail:
+            return None
+        raise
+
+
+def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:
+    """Return the smaller of two files, the one without tuning and the tuned one, either of which may be missing.
+
+    Raises:
+      TooMuchLostError: if both are missing.
+    """
+    tuned = found.chosen
+    if found.tuned is not None and tuned is not None and (untuned is None or tuned.num_bytes < untuned.num_bytes):
+        return tuned, found.tuned.data
+    if untuned is not None:
+        return untuned, encode_model(model, untuned.choices)
+    ended = f"; tuning ended early: {found.diverged}" if found.diverged else ""
+    raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{ended}")
 
 
 def _plan_told(ladder: Ladder, tune_iterations: int) -> str:
@@ -136,8 +163,9 @@ def _tune(source: Path, run: RunFolder | None, scene: Scene | None, iterations: 
     plan = read_record(run).plan
     system = plan[plan.main[-1]].system
 
-    def tune(model: Model, choices: CompactChoices) -> Tuned:
-        return tune_compact(model, scene, system, choices, iterations=iterations, progress=True)
+    def tune(model: Model, choices: CompactChoices, number: int) -> Tuned:
+        title = f"tuning {number} of up to {MOST_TUNINGS}"
+        return tune_compact(model, scene, system, choices, iterations=iterations, progress=True, title=title)
 
     return tune
 
@@ -177,21 +205,27 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
 
 
 def compression_text(result: Compressed) -> str:
-    """Return a table of all choices tried, and at the end a line about the file."""
+    """Return a table of all choices tried, the bits of the tuned files, and at the end a line about the file."""
     chosen, model = result.chosen, result.model
     groups = dict.fromkeys(trial.group for trial in result.trials)
     rows = [[f"{trial.group} {trial.precision}", *_figures(trial)] for trial in result.trials]
     columns = zip(
         ["kept as", "bytes", *(f"dB lost, {measure}" for measure in result.measures)],
         *rows,
-        *(["tuned", *_figures(trial)] for trial in result.tuned),
+        *([f"tuned {number}", *_figures(trial)] for number, trial in enumerate(result.tuned, 1)),
         ["chosen", *_figures(chosen)],
         strict=True,
     )
-    kept = ", ".join(f"{group} {getattr(chosen.choices, group)}" for group in GROUPS if group in groups)
+    bits = [f"tuned {number}: {_kept(trial, groups)}" for number, trial in enumerate(result.tuned, 1)]
+    ended = [f"tuning ended early, what was found before is kept: {result.diverged}"] if result.diverged else []
     share = f"{part_told(model.num_bytes / chosen.num_bytes)} of the model's numbers"
     told = f"{result.path}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_told(chosen.losses[0])}"
-    return "\n".join([*aligned(list(columns)), f"chosen: {kept}", told])
+    return "\n".join([*aligned(list(columns)), *bits, *ended, f"chosen: {_kept(chosen, groups)}", told])
+
+
+def _kept(trial: Trial, groups: Collection[str]) -> str:
+    """Return the bits of those of the groups that a model has."""
+    return ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
 
 
 def part_told(ratio: float) -> str:

@@ -213,7 +213,8 @@ class StageRun:
         watch: Watch,
     ) -> None:
         iteration, end = int(self.state.iteration), self.stage.iterations
-        with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress) as bar:
+        may_grow = any(event.most_gaussians is not None for event in self.stage.events)
+        with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress, may_grow=may_grow) as bar:
             while iteration < end:
                 stop = self._next_stop(iteration, checkpoint_every)
                 for info in self.steps(iteration + 1, stop, is_stopped):

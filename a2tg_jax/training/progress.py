@@ -22,13 +22,14 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}
 class Pace:
     """Time of an iteration without compilation, and forecasts of a stage's duration: early, and at a half."""
 
-    def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter):
+    def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True):
         """Args:
         first: iterations done before.
         total: the last iteration.
         now: a clock in seconds.
+        may_grow: whether Gaussians may be added.
         """
-        self._total, self._now = total, now
+        self._total, self._now, self._may_grow = total, now, may_grow
         self._due = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
         self._steps, self._seconds = 0, 0.0
@@ -52,7 +53,7 @@ class Pace:
         is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
         if left is None or not is_due or done >= self._total:
             return None
-        growing = "; more if Gaussians are added" if len(self._due) > 1 else ""
+        growing = "; more if Gaussians are added" if self._may_grow and len(self._due) > 1 else ""
         told = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration, about {left} for the other "
         self._due = [due for due in self._due[1:] if due > done]
         self._steps, self._seconds = 0, 0.0
@@ -68,13 +69,14 @@ class Pace:
 class ProgressBar:
     """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
 
-    def __init__(self, title: str, done: int, total: int, *, is_shown: bool):
+    def __init__(self, title: str, done: int, total: int, *, is_shown: bool, may_grow: bool = True):
         is_bar = is_shown and has_terminal()
         self._bar = tqdm(
             desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
             dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
         )  # fmt: skip
-        self._title, self._done, self._total, self._pace = title, done, total, Pace(done, total)
+        self._title, self._done, self._total = title, done, total
+        self._pace = Pace(done, total, may_grow=may_grow)
         self._is_shown, self._is_plain = is_shown, is_shown and not is_bar
         self._last_line = done, time.perf_counter()
         self._loss: float | None = None

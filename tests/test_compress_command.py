@@ -1,0 +1,141 @@
+"""The command `a2tg compress`, with and without tuning, on a tiny run."""
+
+import re
+
+import pytest
+from test_cli import TINY, fails
+
+from a2tg_jax.cli import main as cli
+from a2tg_jax.finish import tuning
+from a2tg_jax.finish.compaction import Trial
+from a2tg_jax.io.compact import CompactChoices, grids_of, half_turned, load_compact
+from a2tg_jax.io.model_file import load_model
+from a2tg_jax.measure.evaluation import evaluate
+from a2tg_jax.results import compression
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.record import SceneSource, read_record
+from a2tg_jax.training import DivergedError, progress
+
+TUNE = ["compress", "--tune-iterations", "30"]
+COARSE = CompactChoices(means=5, log_scales=3, quats=3, opacities=2, sh_0=3, sh_rest=2, texels=2)
+
+
+@pytest.fixture(autouse=True)
+def untouched_jax(monkeypatch):
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("compress") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "configure_cpu", lambda: None)
+        options = [option for option in TINY if option != "--baseline"]
+        assert cli.main(["train", "synthetic", "--out", str(out), *options]) == 0
+    return RunFolder(out)
+
+
+def test_compress(run, tmp_path, monkeypatch, capsys):
+    """By the run's photographs; and without them, by renders."""
+    ladder = {"means": (8, 14), "sh_rest": (3, 8)}
+    monkeypatch.setattr(compression, "LADDER", ladder)
+    assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0
+    text = capsys.readouterr().out
+    path = run.model("a2tg-textures").with_suffix(".a2tgz")
+    assert "dB lost, training views  dB lost, test views" in text and f"\n{path}: " in text
+    assert load_compact(path).num_bytes == load_model(run.model("a2tg-textures")).num_bytes > 2 * path.stat().st_size
+    assert path.relative_to(run.path).as_posix() in run.written()
+
+    def gone(self):
+        raise FileNotFoundError("no photographs")
+
+    monkeypatch.setattr(SceneSource, "load", gone)
+    out = tmp_path / "other.a2tgz"
+    assert cli.main(["compress", str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
+    assert "dB lost, if 30 dB" in capsys.readouterr().out and load_compact(out).num == 60
+    assert "--tune-iterations needs the photographs of" in fails(capsys, *TUNE, str(run.path), "--out", tmp_path / "no")
+    assert not (tmp_path / "no").exists()
+
+
+def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
+    """Tuned files are measured as any others, and are kept only if they are smaller and lose no more."""
+    ladder = {"means": (3, 5, 8, 14), "log_scales": (1, 2, 4, 10), "sh_0": (1, 2, 4, 10), "opacities": (1, 2, 4, 10)}
+    monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
+    monkeypatch.setattr(tuning, "MOST_TUNINGS", 1)
+    monkeypatch.setattr(progress, "TIMED_SECONDS", 0.0)
+    plain, tuned = tmp_path / "plain.a2tgz", tmp_path / "tuned.a2tgz"
+    with monkeypatch.context() as patch:
+        patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
+        assert cli.main([*TUNE, str(run.path), "--out", str(plain), "--max-loss", "0.02"]) == 0
+    capsys.readouterr()
+    assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
+    told, scene = capsys.readouterr().out, read_record(run).scene.load()
+    assert re.search(r"\ntuning 1 of up to 4: .* for the other \d+, without compiling\n", told)  # Nothing grows.
+    assert "then training up to" in told and "\ntuned 1 " in told and "\ntuned 1: means " in told
+    before, after = (
+        evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
+    )
+    assert before - after <= 0.02 and tuned.stat().st_size <= plain.stat().st_size
+
+
+def tuned_so(path, choices, *, adds=0, losses=2):
+    """A search of tuned files that has found the model of a file in some bits, told to be larger than it is."""
+    model = half_turned(load_model(path))
+    tuned = tuning.Tuned(model, choices, grids_of(model, choices))
+    trial = Trial(choices, len(tuned.data) + adds, (0.0,) * losses)
+    return tuning.TunedFiles([trial], trial, tuned)
+
+
+@pytest.mark.parametrize(("adds", "is_kept"), [(0, True), (10**9, False)])
+def test_compress_writes_the_smaller_file(adds, is_kept, run, tmp_path, monkeypatch, capsys):
+    found = tuned_so(run.model("a2tg-textures"), COARSE, adds=adds)
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
+    monkeypatch.setattr(compression, "smallest_tuned", lambda *a: found)
+    out = tmp_path / "tuned.a2tgz"
+    assert cli.main([*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
+    assert (out.read_bytes() == found.tuned.data) is is_kept
+    assert ("chosen: means 5" in capsys.readouterr().out) is is_kept
+
+
+def test_a_tuned_file_may_be_the_only_one_within_the_loss(run, tmp_path, monkeypatch, capsys):
+    found = tuned_so(run.model("a2tg-textures"), COARSE, losses=1)
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (3, 4)})
+    monkeypatch.setattr(compression, "_losses", lambda *a: {"training views": lambda model: 1.0})
+    out = tmp_path / "tuned.a2tgz"
+    command = [*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.2"]
+    with monkeypatch.context() as patch:
+        patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
+        assert "--max-loss must be larger: no file, tuned or not, is within it; got 0.2" in fails(capsys, *command)
+    assert not out.exists()
+    monkeypatch.setattr(compression, "smallest_tuned", lambda *a: found)
+    assert cli.main(command) == 0 and out.read_bytes() == found.tuned.data
+
+
+def test_a_diverged_tuning_keeps_what_was_found(run, tmp_path, monkeypatch, capsys):
+    def diverge(*arguments, title, **options):
+        raise DivergedError(f"{title}: the loss has exploded", None)
+
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
+    monkeypatch.setattr(compression, "tune_compact", diverge)
+    out = tmp_path / "a.a2tgz"
+    assert cli.main([*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
+    told = "tuning ended early, what was found before is kept: tuning 1 of up to 4: the loss has exploded\n"
+    assert told in capsys.readouterr().out and load_compact(out).num == 60
+
+
+@pytest.mark.parametrize(("name", "told"), [("plain.a2tgz", ", which is compressed already"), ("scene.ply", "")])
+def test_compress_tells_what_it_reads(name, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).touch()
+    assert f"a2tg compress reads a run folder or *.npz; got {name}{told}\n" in fails(capsys, "compress", name)
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (ValueError("the loss has exploded"), 2)])
+def test_a_stopped_tuning_writes_no_file(error, code, run, tmp_path, monkeypatch, capsys):
+    def stop(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
+    monkeypatch.setattr(compression, "tune_compact", stop)
+    assert cli.main([*TUNE, str(run.path), "--out", str(tmp_path / "a.a2tgz"), "--max-loss", "0.5"]) == code
+    assert not list(tmp_path.iterdir())
