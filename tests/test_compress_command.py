@@ -36,7 +36,7 @@ def run(tmp_path_factory):
 
 
 def test_compress(run, tmp_path, monkeypatch, capsys):
-    """By the run's photographs; and without them, by renders."""
+    """Choices are measured on the run's photographs or, without them, on renders of the model."""
     ladder = {"means": (8, 14), "sh_rest": (3, 8)}
     monkeypatch.setattr(compression, "LADDER", ladder)
     assert cli.main(["compress", str(run.path), "--max-loss", "0.5"]) == 0

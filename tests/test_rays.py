@@ -253,7 +253,7 @@ def test_rays_stay_on_the_device_if_those_of_all_lenses_fit(kept, lacking):
 
 
 def test_rays_that_come_with_batches_count_twice(kept, monkeypatch):
-    """Those of the step's batch and of the next; rays that stay on the device count once."""
+    """The forecast counts the rays of two batches in flight, and those that stay on the device once."""
     of_rays, counted = ray_bytes(kept.train), []
     for room in (of_rays, of_rays - 1):
         monkeypatch.setattr(batches, "device_room", lambda room=room: room)

@@ -232,7 +232,7 @@ def test_tuning_keeps_what_was_learned_of_the_photographs():
 
 @pytest.mark.parametrize("kind", [OwnExposure, Exposure])
 def test_corrections_stay_as_they_are(monkeypatch, kind):
-    """Those of a user's own class too, whose rate is no field."""
+    """Corrections keep their rows while a model is tuned, also those of a user's class without a field `rate`."""
     found, fit_stage = [], tuning.fit_stage
 
     def fit_and_keep(*arguments, **options):
