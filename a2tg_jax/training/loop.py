@@ -331,7 +331,7 @@ class StageRun:
             self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
         else:
             room = exchange.border_room.wider()
-            covers_image = min(room) >= size[1] + self.system.tile_size
+            covers_image = min(room) >= size[0] + self.system.tile_size
             self.exchanges[size] = dataclasses.replace(exchange, border_room=None if covers_image else room)
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
