@@ -61,7 +61,8 @@ class PruneFloaters(HostEvent):
         if self.near_share:
             nearest = nearest_depths(means[num_views >= min(SURE_VIEWS, most)], due.views)
             limits = np.maximum(limits, self.near_share * nearest)
-        is_kept &= ~are_near(means, due.views, limits)
+        if self.near or self.near_share:
+            is_kept &= ~are_near(means, due.views, limits)
         if is_kept.sum() < 2:
             warnings.warn(
                 f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "

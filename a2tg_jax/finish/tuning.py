@@ -5,6 +5,7 @@ training knew: it holds the tuned model up to the last digit of a float32.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -55,7 +56,7 @@ class Tuned:
     choices: CompactChoices
     grids: Grids
 
-    @property
+    @functools.cached_property
     def data(self) -> bytes:
         """The file, as `save_compact` writes it with these choices and grids."""
         return encode_model(self.model, self.choices, self.grids)
