@@ -81,8 +81,7 @@ def boxes_of(num: int, grid: TileGrid, has_sky: bool) -> Rectangles:
 
 def fullest(bands: Bands, pairs: jax.Array, borders: jax.Array) -> float:
     """Return the pairs of the fullest band, divided by the mean."""
-    ends = np.concatenate([[0], np.cumsum(np.asarray(pairs, np.int64))])
-    own = np.diff(ends[np.asarray(borders)])
+    own = np.asarray(bands.sums(pairs, borders))
     return float(own.max() / own.mean())
 
 

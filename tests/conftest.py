@@ -50,6 +50,14 @@ def fresh_caches():
 
 
 @pytest.fixture
+def untouched_jax(monkeypatch):
+    """Commands leave the flags of the tests' process as they are."""
+    from a2tg_jax.cli import main as cli
+
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+
+
+@pytest.fixture
 def x64():
     """Runs the test with 64-bit floats."""
     with jax.enable_x64(True):

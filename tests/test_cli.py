@@ -41,10 +41,7 @@ TINY = [
 TENSORBOARD = ("--tensorboard",) if importlib.util.find_spec("tensorboardX") else ()
 
 
-@pytest.fixture(autouse=True)
-def untouched_jax(monkeypatch):
-    """The tests' process keeps its flags, and runs have no terminal to draw a progress bar on."""
-    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+pytestmark = pytest.mark.usefixtures("untouched_jax")
 
 
 @pytest.fixture(scope="module")

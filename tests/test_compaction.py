@@ -24,9 +24,7 @@ SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
 SMALL = {"means": (4, 8, 16), "opacities": (2, 10), "sh_0": (3, 8), "sh_rest": (3, 8), "texels": (3, 8)}
 
 
-@pytest.fixture(autouse=True)
-def untouched_jax(monkeypatch):
-    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+pytestmark = pytest.mark.usefixtures("untouched_jax")
 
 
 def a_model() -> Model:

@@ -20,9 +20,7 @@ TUNE = ["compress", "--tune-iterations", "30"]
 COARSE = CompactChoices(means=5, log_scales=3, quats=3, opacities=2, sh_0=3, sh_rest=2, texels=2)
 
 
-@pytest.fixture(autouse=True)
-def untouched_jax(monkeypatch):
-    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+pytestmark = pytest.mark.usefixtures("untouched_jax")
 
 
 @pytest.fixture(scope="module")

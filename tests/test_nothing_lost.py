@@ -61,9 +61,7 @@ def scene():
     return SOURCE.load()
 
 
-@pytest.fixture(autouse=True)
-def untouched_jax(monkeypatch):
-    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+pytestmark = pytest.mark.usefixtures("untouched_jax")
 
 
 def filled(path) -> RunFolder:

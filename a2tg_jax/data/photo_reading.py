@@ -53,11 +53,6 @@ class Facts(NamedTuple):
     """Whether the view's pixels are those of the file, neither undistorted nor downscaled."""
     mask: Mask | None
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the view."""
-        return self.shape[1], self.shape[0]
-
     def to_json(self) -> list[Any]:
         """Return values that can be written as JSON."""
         return [self.stored, self.shape, self.is_stored, None if self.mask is None else self.mask.to_json()]
