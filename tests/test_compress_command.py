@@ -104,6 +104,9 @@ def test_a_tuned_file_may_be_the_only_one_within_the_loss(run, tmp_path, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
         assert "--max-loss must be larger: no file, tuned or not, is within it; got 0.2" in fails(capsys, *command)
+        tried = [tuning.Trial(COARSE, 1, (loss,)) for loss in (0.9, 0.3)]
+        patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles(tried))
+        assert "got 0.2; the best tuned file loses 0.300 dB" in fails(capsys, *command)
     assert not out.exists()
     monkeypatch.setattr(compression, "smallest_tuned", lambda *a: found)
     assert cli.main(command) == 0 and out.read_bytes() == found.tuned.data

@@ -230,6 +230,14 @@ def test_tuning_keeps_what_was_learned_of_the_photographs():
         model = tuned
 
 
+def test_a_model_without_what_was_learned_of_the_photographs_is_refused():
+    """As a compact file gives it back: it would be trained towards photographs as they are, not as they should be."""
+    scene, model = corrected()
+    bare = dataclasses.replace(model, origin=dataclasses.replace(model.origin, corrections={}))
+    with pytest.raises(ValueError, match="corrections that training learned, pose and exposure, which a compact file"):
+        tune_compact(bare, scene, CORRECTED, FINE, iterations=1)
+
+
 @pytest.mark.parametrize("kind", [OwnExposure, Exposure])
 def test_corrections_stay_as_they_are(monkeypatch, kind):
     """Corrections keep their rows while a model is tuned, also those of a user's class without a field `rate`."""

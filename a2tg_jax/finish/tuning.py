@@ -94,7 +94,8 @@ def tune_compact(
       title: of the progress bar; None: "tuning".
 
     Raises:
-      ValueError: if the model shows something else than that stage, or what a compact file cannot hold.
+      ValueError: if the model shows something else than that stage, or what a compact file cannot hold, or has none of
+        the corrections that the stage learned.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes.
     """
     stage = system.stages()[-1]
@@ -165,6 +166,12 @@ def _check(model: Model, stage: Stage, iterations: int) -> None:
         raise ValueError(
             f"model must show what the last stage of the system, {stage.name!r}, trains: {stage.appearance}; it shows "
             f"{model.appearance}"
+        )
+    learned = {} if model.origin is None else model.origin.corrections
+    if missing := [correction.name for correction in stage.corrections if correction.name not in learned]:
+        raise ValueError(
+            f"model must have the corrections that training learned, {' and '.join(missing)}, which a compact file "
+            "drops: give the model that training saved"
         )
 
 

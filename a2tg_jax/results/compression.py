@@ -136,8 +136,10 @@ def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: f
         return tuned, found.tuned.data
     if untuned is not None:
         return untuned, encode_model(model, untuned.choices)
+    least = min((trial.losses[0] for trial in found.tried), default=None)
+    told = "" if least is None else f"; the best tuned file loses {least:.3f} dB"
     ended = f"; tuning ended early: {found.diverged}" if found.diverged else ""
-    raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{ended}")
+    raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{told}{ended}")
 
 
 def _plan_told(ladder: Ladder, tune_iterations: int) -> str:
