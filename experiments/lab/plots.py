@@ -10,10 +10,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 COLORS = {
     "A²TG": "#cc3311", "2DGS*-MCMC": "#4477aa", "Textured Gaussians*": "#228833", "SuperGaussians": "#aa3377",
     "BBSplat": "#ccaa33", "2DGS*": "#66ccee", "A²TG, as quick has it": "#ee7733",
-    "Bytewise": "#000000", "Bytewise, untextured": "#888888", "2DGS*-MCMC, degree 0": "#88ccee",
+    "Bytewise": "#000000", "Bytewise, untextured": "#888888", "2DGS*-MCMC, degree 0": "#332288",
     "2DGS*-MCMC, degree 1": "#44aa99", "2DGS*-MCMC, degree 2": "#ddaa33",
 }  # fmt: skip
 OTHER_COLOR = "#777777"
+STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
+"""Line and marker of the first, second, … curve of one colour."""
 Point = tuple[float, float]
 
 
@@ -24,10 +26,15 @@ def color_of(label: str) -> str:
 
 def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_label: str, title: str) -> None:
     """Draw curves through points sorted by x, with a logarithmic x axis."""
+    used: list[str] = []
     for label, points in curves.items():
+        used.append(color_of(label))
+        line, marker = STYLES[(used.count(used[-1]) - 1) % len(STYLES)]
         if points:
             x, y = np.array(sorted(points)).T
-            axes.plot(x, y, marker="o", markersize=4, linewidth=1.4, label=label, color=color_of(label))
+            axes.plot(
+                x, y, linestyle=line, marker=marker, markersize=4, linewidth=1.4, label=label, color=color_of(label)
+            )
     axes.set_xscale("log")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -38,7 +45,7 @@ def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_lab
     axes.grid(alpha=0.25, which="both")
 
 
-COLUMNS = 3
+COLUMNS, LEGEND_COLUMNS = 3, 4
 
 
 def charts(
@@ -62,7 +69,8 @@ def charts(
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
             axes.yaxis.set_minor_formatter(NullFormatter())
     handles = {label: handle for axes in row for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, max(1, len(handles))))
+    columns = min(LEGEND_COLUMNS, max(1, len(handles)))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8)
     return figure
 
 
