@@ -22,7 +22,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
-from on_devices import scene, system
+from on_devices import events_change_the_same, others_get_all_rows, rows_are_read_and_moved, scene, system
 from test_pictures import write_scene
 
 import a2tg_jax as a2tg
@@ -176,6 +176,15 @@ def read_own_share():
             np.testing.assert_array_equal(one.picture.read(), other.picture.read())
 
 
+def change(place):
+    """Events on the host change what is spread over the processes as they change it on one device."""
+    with joined(place):
+        session = Session(devices=jax.devices())
+        rows_are_read_and_moved(session.exchange)
+        others_get_all_rows(session)
+        events_change_the_same(session)
+
+
 def wait(place, what):
     """Meet the other processes for ever, after reading photographs if that is asked for."""
     with joined(place) as team:
@@ -239,6 +248,8 @@ def main():
         place = Place(args.coordinator, args.num_processes, args.process_id, args.seconds)
         if args.what == "train":
             train(place, args.system, args.length, args.folder)
+        elif args.what == "events":
+            change(place)
         else:
             wait(place, args.what)
     elif args.losses:
