@@ -165,6 +165,8 @@ class Event:
     def init(self, model: Model) -> Any:
         """Return the state that `observe` starts from, a pytree of arrays; () if nothing is gathered.
 
+        Where several devices train together, the rows of the model are spread over them; arrays of
+        `core.spread_arrays.zeros_beside` are so from the start, others are spread afterwards.
         It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
         none does. `gather` follows those that move on the host.
         """

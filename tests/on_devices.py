@@ -1,6 +1,6 @@
 """Renders and trains on one, two and four devices of a CPU and compares; run by `test_devices` in a process of its own.
 
-python tests/on_devices.py rendering|balance|overflowing|batches|lenses|training|textures|events FOLDER
+python tests/on_devices.py rendering|balance|overflowing|batches|lenses|training|textures|events|memory FOLDER
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from scenes_random import fisheye
 import a2tg_jax as a2tg
 from a2tg_jax.core import spread_arrays
 from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.core.jit import classes_of
 from a2tg_jax.core.spread_arrays import on_host, placed_like, rows_moved
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, event
@@ -33,11 +34,13 @@ from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import PhotoStore
+from a2tg_jax.training.cost import stage_bytes
 from a2tg_jax.training.divergence import jitted_attempt
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.start import initial_model, padded
+from a2tg_jax.training.step import jitted_step
 
 ROWS = 96
 """Number of Gaussians that are rendered: divisible by 4."""
@@ -525,6 +528,20 @@ def rows_are_read_and_moved(exchange):
                 assert moved.sharding == x.sharding
         columns = spread(exchange, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)
         np.testing.assert_array_equal(on_host(columns), values_of)
+
+
+def memory(folder):
+    """The forecast of views that are drawn at once is what XLA says of a step."""
+    found = a2tg.synthetic_scene(num_views=5, width=480, height=360, num_points=400)
+    for size in (1, 4):
+        own = system(Gaussians2dMcmc, densify={"cap": 400}, initial_gaussians=400, batch_size=size)
+        run = StageRun(found, own, 0, initial_model(found, own), session=Session(devices=jax.devices()))
+        arguments = run.arguments(1)
+        lowered = jitted_step()._jitted.lower(classes_of((arguments, {})), *arguments)
+        said = jax.device_count() * lowered.compile().memory_analysis().temp_size_in_bytes
+        expected = stage_bytes(found, own, run.stage, 400, run.model.num_bytes, jax.device_count())
+        assert 0.75 < (expected.gradients + expected.pixels) / said < 1.33, (size, expected, said)
+        run.photographs.close()
 
 
 if __name__ == "__main__":

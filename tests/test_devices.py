@@ -14,7 +14,7 @@ SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
 FOUR = "--xla_force_host_platform_device_count=4"
 
 
-LONG = [pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures")]
+LONG = [pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures", "memory")]
 
 
 @pytest.mark.parametrize("what", ["rendering", "balance", "batches", "lenses", "training", "events", *LONG])

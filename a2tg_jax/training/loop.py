@@ -128,11 +128,10 @@ class StageRun:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
             warn_of_uneven_rows(resume, self.num_devices)
-            self.state: TrainState = spread(self.exchange, jax.tree.map(jnp.array, resume.state))
+            self.state: TrainState = spread(self.exchange, self._copied(resume.state))
             self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
-            # Steps take over the buffers they are given: the caller keeps his own.
-            model = padded(jax.tree.map(jnp.array, start.live), self.stage, system, self.num_devices)
+            model = spread(self.exchange, padded(self._copied(start.live), self.stage, system, self.num_devices))
             state = initial_state(self.stage, model, [view.name for view in self.views], start.origin)
             self.state = spread(self.exchange, state)
         else:
@@ -159,6 +158,11 @@ class StageRun:
         """Called with each row of the history."""
         self.started = time.perf_counter()
         self.num_regrown = self.num_refused = self.num_compiled = 0
+
+    def _copied(self, tree: Any) -> Any:
+        """Return copies of arrays, for steps take over the buffers they are given: on the device, or on the host if
+        several devices are to share them."""
+        return jax.tree.map(jnp.array if self.exchange is None else np.array, tree)
 
     @property
     def history(self) -> History:
