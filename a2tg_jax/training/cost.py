@@ -32,9 +32,8 @@ COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
-WHOLE_MODELS, WHOLE_STATES = 2, 2
-"""Copies on one of several devices: of the model when its spare rows are left out at the end of a stage; of the state
-when an event changes it that reads it whole (`HostEvent.reads_whole`)."""
+WHOLE_STATES = 2
+"""States on one of several devices while an event changes them that reads all rows (`HostEvent.reads_whole`)."""
 STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 """Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
 (colours, loss, and the gradients of both) and pair (tile lists)."""
@@ -129,7 +128,7 @@ def forecast_stages(
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         is_read = any(event.reads_whole and event.iterations(stage.iterations) for event in on_host)
-        whole = max(WHOLE_MODELS, WHOLE_STATES * STATES * is_read) * model_bytes
+        whole = max(1, WHOLE_STATES * STATES * is_read) * model_bytes
         seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
         yield StageForecast(needed, model_bytes, num, programs, seconds, whole)

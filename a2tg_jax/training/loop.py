@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
@@ -181,8 +182,10 @@ class StageRun:
     @property
     def model(self) -> Model:
         """The Gaussians that exist, and what they show, on one device."""
-        model: Model = gathered(self.exchange, self.state.model)
-        return model.live
+        if self.exchange is None:
+            return self.state.model.live
+        on_one: Model = gathered(self.exchange, jax.tree.map(on_host, self.state.model).live)
+        return on_one
 
     @property
     def checkpoint(self) -> Checkpoint:
