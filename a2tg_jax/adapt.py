@@ -1,7 +1,7 @@
 """Adaptive textures: the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
 
 The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select` choose who gets them, and calls
-`reallocate`. All but the statistic runs on the host, on whole arrays.
+`reallocate`. All but the statistic runs on the host, on one array at a time.
 """
 
 import dataclasses
@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -18,6 +17,7 @@ from a2tg_jax.core.budget import bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.spread_arrays import on_host, placed_like
 from a2tg_jax.events import Change, Due, HostEvent, Seen, Statistic, event, iterations_at, static
 from a2tg_jax.model import Model
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
@@ -77,6 +77,8 @@ class Upscale(UpscaleChoices, HostEvent):
     """Adam's moments of a texture that has grown: zero, so that its texels part quickly, or copied from its old
     texels."""
 
+    reads_whole = False
+
     @property
     def statistic(self) -> Statistic:
         return self.gradient
@@ -98,7 +100,7 @@ class Upscale(UpscaleChoices, HostEvent):
         return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
     def init(self, model: Model) -> GradientStatistics:
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
     def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
         return state.observe_views(seen.gradients, seen.is_visible)
@@ -108,7 +110,7 @@ class Upscale(UpscaleChoices, HostEvent):
             raise ValueError(f"{type(model.appearance).__name__} has no textures that could grow; Textured has")
         textures, layout = model.textures
         num = model.num
-        new_sizes, scales, averages = layout.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
+        new_sizes, scales, averages = layout.sizes, on_host(model.gaussians.scales), on_host(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
         sizes = new_sizes[:num]
         proposed = next_sizes(
@@ -272,34 +274,25 @@ def reallocate(
     new_sizes = np.asarray(new_sizes)
     check_textures(textures, layout, layout.num)
     check_shape("new_sizes", new_sizes, (layout.num, 2))
-    new_layout, capacities = plan_layout(new_sizes, known)
-    moves = _plan_moves(layout, new_layout)
+    new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket)
+    kept = np.ones(layout.num, bool) if kept is None else np.asarray(kept)
+    check_shape("kept", kept, (layout.num,))
+    texel_moves = _plan_moves(layout, new_layout, np.ones(layout.num, bool))
+    moment_moves = _plan_moves(layout, new_layout, kept)
 
-    def rebuild(tree: Textures, padding: tuple[float, ...]) -> Textures:
-        old = [np.asarray(bucket) for bucket in tree.buckets]
-        return _move_texels(old, new_layout.resolutions, capacities, moves, padding)
+    def rebuild(tree: Textures, moves: list[_Move], padding: tuple[float, ...]) -> Textures:
+        shapes = [(capacity, *size, 4) for capacity, size in zip(capacities, new_layout.resolutions, strict=True)]
+        buckets = (_moved_texels(tree, index, shape, moves, padding) for index, shape in enumerate(shapes))
+        return Textures(tuple(placed_like(bucket, layout.bucket) for bucket in buckets))
 
     def rebuild_moments(leaf: Any) -> Any:
         if not isinstance(leaf, Textures):
             return leaf
         check_textures(leaf, layout, layout.num, "moments")
-        return rebuild(leaf if kept is None else _kept_rows(leaf, layout, kept), (0.0, 0.0, 0.0, 0.0))
+        return rebuild(leaf, moment_moves, (0.0, 0.0, 0.0, 0.0))
 
     moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
-    return ReallocateResult(rebuild(textures, NEUTRAL_TEXEL), new_layout, moments)
-
-
-def _kept_rows(moments: Textures, layout: AtlasLayout, kept: ArrayLike) -> Textures:
-    """Return the moments with 0 in all rows but those of the textures that are kept."""
-    check_shape("kept", kept, (layout.num,))
-    bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
-    buckets = []
-    for index, old in enumerate(moments.buckets):
-        rows = row[(bucket == index) & np.asarray(kept)]
-        new = np.zeros_like(old)
-        new[rows] = np.asarray(old)[rows]
-        buckets.append(jnp.asarray(new))
-    return Textures(tuple(buckets))
+    return ReallocateResult(rebuild(textures, texel_moves, NEUTRAL_TEXEL), new_layout, moments)
 
 
 class _Move(NamedTuple):
@@ -311,13 +304,13 @@ class _Move(NamedTuple):
     new_rows: np.ndarray
 
 
-def _plan_moves(old: AtlasLayout, new: AtlasLayout) -> list[_Move]:
-    """One move per pair of buckets that some Gaussian connects."""
+def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray) -> list[_Move]:
+    """Return one move for each pair of buckets that some of the marked Gaussians [N] connect."""
     num_new = len(new.resolutions)
-    pairs = np.asarray(old.bucket, np.int64) * num_new + np.asarray(new.bucket)
+    pairs = on_host(old.bucket)[is_moved].astype(np.int64) * num_new + on_host(new.bucket)[is_moved]
     order = np.argsort(pairs, kind="stable")
     codes, starts = np.unique(pairs[order], return_index=True)
-    old_rows, new_rows = np.asarray(old.row)[order], np.asarray(new.row)[order]
+    old_rows, new_rows = on_host(old.row)[is_moved][order], on_host(new.row)[is_moved][order]
     stops = [*starts[1:], len(order)]
     return [
         _Move(int(code) // num_new, int(code) % num_new, old_rows[start:stop], new_rows[start:stop])
@@ -325,25 +318,18 @@ def _plan_moves(old: AtlasLayout, new: AtlasLayout) -> list[_Move]:
     ]
 
 
-def _move_texels(
-    old: list[np.ndarray],
-    resolutions: Sequence[tuple[int, int]],
-    capacities: Sequence[int],
-    moves: list[_Move],
-    padding: tuple[float, ...],
-) -> Textures:
-    """New buckets of the given shapes, filled with `padding` and then with the moved texels."""
-    dtype = old[0].dtype if old else np.float32
-    buckets = []
-    for capacity, resolution in zip(capacities, resolutions, strict=True):
-        buckets.append(np.broadcast_to(np.asarray(padding, dtype), (capacity, *resolution, 4)).copy())
+def _moved_texels(
+    old: Textures, index: int, shape: tuple[int, ...], moves: list[_Move], padding: tuple[float, ...]
+) -> np.ndarray:
+    """Return the new bucket of an index and shape, filled with `padding` and then with the moved texels."""
+    dtype = old.buckets[0].dtype if old.buckets else np.float32
+    target = np.broadcast_to(np.asarray(padding, dtype), shape).copy()
     for move in moves:
-        source, target = old[move.old_bucket], buckets[move.new_bucket]
-        if not source.size:
-            continue
-        v, u = (_nearest(source.shape[axis], target.shape[axis]) for axis in (1, 2))
-        target[move.new_rows] = source[move.old_rows][:, v][:, :, u]
-    return Textures(tuple(jnp.asarray(bucket) for bucket in buckets))
+        if move.new_bucket == index and old.buckets[move.old_bucket].size:
+            source = on_host(old.buckets[move.old_bucket])
+            v, u = (_nearest(source.shape[axis], target.shape[axis]) for axis in (1, 2))
+            target[move.new_rows] = source[np.ix_(move.old_rows, v, u)]
+    return target
 
 
 def _nearest(old: int, new: int) -> np.ndarray:

@@ -18,6 +18,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.spread_arrays import rows_moved
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
@@ -164,6 +165,8 @@ class Event:
     def init(self, model: Model) -> Any:
         """Return the state that `observe` starts from, a pytree of arrays; () if nothing is gathered.
 
+        Where several devices train together, the rows of the model are spread over them; arrays of
+        `core.spread_arrays.zeros_beside` are so from the start, others are spread afterwards.
         It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
         none does. `gather` follows those that move on the host.
         """
@@ -182,7 +185,7 @@ class Event:
                     f"{type(self).__name__} has gathered an array {[*leaf.shape]}, without a row for each of the "
                     f"{len(rows):,} Gaussians, and rows have moved: override gather"
                 )
-            return leaf[rows] if leaf.ndim else leaf
+            return rows_moved(leaf, rows) if leaf.ndim else leaf
 
         return jax.tree.map(moved, state)
 
@@ -229,6 +232,11 @@ class StepEvent(Event):
 
 class HostEvent(Event):
     """Event between steps on the host, where values may be read and shapes may change."""
+
+    reads_whole: ClassVar[bool] = True
+    """Whether `apply` wants all arrays on one device, where several train together: that device needs room for the
+    whole state twice. If False, it gets the arrays as they lie, with their rows spread over the devices, reads them by
+    `on_host` and places new ones by `placed_like`, one at a time (`core.spread_arrays`)."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         """Return the iterations of a stage after which it happens, ascending."""
@@ -297,15 +305,20 @@ def from_options(kind: type[T], options: Any, **others: Any) -> T:
     return kind(**{name: getattr(options, name) for name in shared}, **others)
 
 
-def gather_rows(model: Model, rows: Array) -> Model:
-    """Return the model whose row i is the former row rows[i]."""
+def gather_rows(model: Model, rows: Any) -> Model:
+    """Return the model whose row i is the former row rows[i], of all N."""
     params = model.appearance.gather(model.params, model.layout, rows)
-    return dataclasses.replace(model, gaussians=model.gaussians[rows], params=params)
+    return dataclasses.replace(model, gaussians=_moved(model.gaussians, rows), params=params)
 
 
-def gather_moments(model: Model, moments: AdamState, rows: Array) -> AdamState:
-    """Return the moments whose row i is the former row rows[i]."""
-    return _of_pairs(moments, lambda g, p: (g[rows], model.appearance.gather(p, model.layout, rows)))
+def gather_moments(model: Model, moments: AdamState, rows: Any) -> AdamState:
+    """Return the moments whose row i is the former row rows[i], of all N."""
+    return _of_pairs(moments, lambda g, p: (_moved(g, rows), model.appearance.gather(p, model.layout, rows)))
+
+
+def _moved(tree: Any, rows: Any) -> Any:
+    """Return arrays whose row i is the former row rows[i]."""
+    return jax.tree.map(lambda x: rows_moved(x, rows), tree)
 
 
 def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamState:

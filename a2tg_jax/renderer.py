@@ -15,7 +15,7 @@ from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view
+from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import appearance_of, check_background, rule_of
@@ -74,7 +74,7 @@ def plan_render(
         raise ValueError("rule already says what the splats show: give it, or textures and layout")
     for camera in cameras:
         check_camera(camera)
-    most = max(pairs_of_view(gaussians, camera, rule, settings, num_live) for camera in cameras)
+    most = max(pairs_to_draw(gaussians, camera, rule, settings, num_live) for camera in cameras)
     return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 

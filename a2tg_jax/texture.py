@@ -18,6 +18,7 @@ from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_floats, check_shape, short_repr
+from a2tg_jax.core.spread_arrays import on_host, placed_like
 
 MAX_SIDE = 16
 BYTES_PER_TEXEL = 16
@@ -57,7 +58,7 @@ class AtlasLayout:
     @property
     def sizes(self) -> np.ndarray:
         """[N, 2] integers (Tv, Tu) (host)."""
-        sizes: np.ndarray = np.asarray(self.resolutions, np.int64).reshape(-1, 2)[np.asarray(self.bucket)]
+        sizes: np.ndarray = np.asarray(self.resolutions, np.int64).reshape(-1, 2)[on_host(self.bucket)]
         return sizes
 
     @property
@@ -71,7 +72,7 @@ class AtlasLayout:
         The log calls it every few steps, so that it makes no [N, 2].
         """
         areas = np.asarray([height * width for height, width in self.resolutions], np.int64)
-        return int(areas[np.asarray(self.bucket)[:num]].sum())
+        return int(areas[on_host(self.bucket)[:num]].sum())
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -128,13 +129,16 @@ class Shape(NamedTuple):
         return sum(capacity * area for capacity, area in zip(self.capacities, areas, strict=True))
 
 
-def plan_layout(sizes: ArrayLike, known: Sequence[Shape] = ()) -> tuple[AtlasLayout, tuple[int, ...]]:
+def plan_layout(
+    sizes: ArrayLike, known: Sequence[Shape] = (), like: Array | None = None
+) -> tuple[AtlasLayout, tuple[int, ...]]:
     """Return the layout for textures of the given sizes, and the capacity of each bucket (host).
 
     Args:
       sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0 for an empty texture, which takes no bytes.
       known: shapes with compiled programs. One is taken if the textures fit and it has at most `KNOWN_SLACK` times
         the texels.
+      like: array over whose devices the rows of the layout are spread as its own; None: they lie on one.
 
     Raises:
       ValueError: if a size is out of range.
@@ -154,12 +158,8 @@ def plan_layout(sizes: ArrayLike, known: Sequence[Shape] = ()) -> tuple[AtlasLay
     needed = {(int(code) // 64, int(code) % 64): int(count) for code, count in zip(codes, counts, strict=True)}
     shape = _choose_shape(needed, known)
     place = np.asarray([shape.resolutions.index(resolution) for resolution in needed], np.int32)
-    layout = AtlasLayout(
-        bucket=jnp.asarray(place[bucket] if len(place) else bucket, jnp.int32),
-        row=jnp.asarray(row),
-        resolutions=shape.resolutions,
-    )
-    return layout, shape.capacities
+    buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
+    return AtlasLayout(placed_like(buckets, like), placed_like(row, like), shape.resolutions), shape.capacities
 
 
 def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape]) -> Shape:

@@ -1,8 +1,9 @@
 """Renders and trains on one, two and four devices of a CPU and compares; run by `test_devices` in a process of its own.
 
-python tests/on_devices.py rendering|balance|overflowing|batches|lenses|training|textures FOLDER
+python tests/on_devices.py rendering|balance|overflowing|batches|lenses|training|textures|events|memory FOLDER
 """
 
+import contextlib
 import dataclasses
 import functools
 import sys
@@ -17,21 +18,29 @@ from jax.sharding import PartitionSpec as P
 from scenes_random import fisheye
 
 import a2tg_jax as a2tg
+from a2tg_jax.core import spread_arrays
 from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.core.jit import classes_of
+from a2tg_jax.core.spread_arrays import on_host, placed_like, rows_moved
+from a2tg_jax.densify.splitting import SplitByGradient
+from a2tg_jax.events import Change, Due, HostEvent, event
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.exchange import AXIS, ROOM_OF_A_BAND, exchange_among, spread
 from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
 from a2tg_jax.rasterize.kernels.native import composite as native
+from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import PhotoStore
+from a2tg_jax.training.cost import stage_bytes
 from a2tg_jax.training.divergence import jitted_attempt
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.registry import with_changes
-from a2tg_jax.training.start import padded
+from a2tg_jax.training.start import initial_model, padded
+from a2tg_jax.training.step import jitted_step
 
 ROWS = 96
 """Number of Gaussians that are rendered: divisible by 4."""
@@ -381,6 +390,159 @@ def textures(folder):
     assert abs(psnr_of(alone) - psnr_of(together)) < 0.02
     uneven = system(a2tg.A2tg, densify={"cap": 118}, **lengths)
     assert padded(plain(), uneven.stages()[0], uneven, 4).gaussians.num == 120
+
+
+def pruned_and_detailed():
+    """A system whose stages prune twice, raise degrees and let textures grow."""
+    return system(
+        a2tg.Bytewise, densify={"cap": 120}, stage1_iterations=20, stage2_iterations=20,
+        prune={"share": 0.3, "at": (0.2,)}, floaters={"min_views": 3, "at": (0.4,)},
+        view_dependence={"share": 0.2, "at": (0.2, 0.4)}, texture={"share": 0.2, "at": (0.4, 0.6)},
+    )  # fmt: skip
+
+
+def events(folder):
+    """Events on the host."""
+    rows_are_read_and_moved(exchange_among(jax.devices()))
+    others_get_all_rows(Session(devices=jax.devices()))
+    events_change_the_same(Session(devices=jax.devices()))
+
+
+def events_change_the_same(session):
+    """Events of spread arrays lead to the bits of one device, and none of them puts all rows on one."""
+    own, happened = pruned_and_detailed(), []
+    for index in (0, 1):
+        alone, together = (
+            StageRun(scene(), own, index, initial_model(scene(), own), session=each) for each in (None, session)
+        )
+        done = 0
+        for due in sorted(set(together._due_on_host())):
+            while done < due:
+                done += len(together.steps(done + 1, due))
+            alone.state = jax.tree.map(jnp.array, readable(together.state))
+            with no_whole_rows(together.state.model.gaussians.num):
+                together._host_events(due)
+            alone._host_events(due)
+            same_bits(alone.state, readable(together.state))
+            same_bits(alone.model, together.model)
+            assert_spread(together.state)
+            events = [each for each in together._on_host() if due in each.iterations(20)]
+            happened += [(type(each).__name__, together.model.num, together.model.num_bytes) for each in events]
+        alone.photographs.close()
+        together.photographs.close()
+    assert [name for name, *_ in happened] == HAPPENED, happened
+    assert len({(num, num_bytes) for _, num, num_bytes in happened}) > 4, happened
+
+
+HAPPENED = ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "AdaptDegrees", "Upscale", "Upscale"]
+
+
+@contextlib.contextmanager
+def no_whole_rows(num):
+    """Fail if a new array of so many rows or more lies on one device, or on each, while others are read and placed."""
+    known, found = jax.live_arrays(), set()
+    ids = set(map(id, known))
+
+    def look(frame, what, result):
+        if what == "return" and frame.f_code.co_filename == spread_arrays.__file__:
+            new = [x for x in jax.live_arrays() if id(x) not in ids and x.size and x.ndim and len(x) >= num]
+            found.update(x.shape for x in new if x.is_fully_replicated)
+
+    sys.setprofile(look)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+    assert not found, found
+
+
+def assert_spread(state):
+    """All arrays of rows that the devices can share are shared."""
+    for leaf in jax.tree.leaves(state):
+        is_shared = leaf.ndim > 0 and leaf.shape[0] >= jax.device_count() and leaf.shape[0] % jax.device_count() == 0
+        assert len(leaf.sharding.device_set) == jax.device_count()
+        assert not leaf.size or leaf.is_fully_replicated != is_shared, (leaf.shape, leaf.sharding)
+
+
+def same_bits(expected, found):
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        a, b = np.asarray(a), np.asarray(b)
+        assert a.dtype == b.dtype and a.shape == b.shape
+        np.testing.assert_array_equal(a.reshape(-1).view(np.uint8), b.reshape(-1).view(np.uint8))
+
+
+@event
+class Reverse(HostEvent):
+    """An event of somebody else: it turns the order of the rows, of arrays that it can read."""
+
+    def iterations(self, num_iterations):
+        return (2,)
+
+    def apply(self, due, model, moments, state):
+        assert len(model.gaussians.means.devices()) == 1
+        rows = np.arange(model.gaussians.num)[::-1]
+        assert isinstance(due, Due) and np.asarray(model.gaussians.means).shape == (len(rows), 3)
+        gaussians = jax.tree.map(lambda x: x[rows], model.gaussians)
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state, rows=rows)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reversed(a2tg.System):
+    name = "reversed"
+
+    def stages(self):
+        events = SplitByGradient(ROWS), Reverse()
+        return (a2tg.Stage("gaussians", a2tg.Plain(), events, self.loss.terms(), self.rates, 4),)
+
+
+def others_get_all_rows(session):
+    """Events that do not say otherwise get arrays of one device; their results, and statistics, are spread again."""
+    own = Reversed(sh_degree=1, initial_gaussians=ROWS)
+    run = StageRun(scene(), own, 0, plain(), session=session)
+    run.steps(1, 2)
+    means, totals = (on_host(x) for x in (run.state.model.gaussians.means, run.state.events[0].gradients.total))
+    assert len(np.unique(totals)) > 20
+    run._host_events(2)
+    np.testing.assert_array_equal(on_host(run.state.model.gaussians.means), means[::-1])
+    np.testing.assert_array_equal(on_host(run.state.events[0].gradients.total), totals[::-1])
+    assert_spread(run.state)
+    run.photographs.close()
+
+
+def rows_are_read_and_moved(exchange):
+    """In parts, and rows past those that move stay; arrays that cannot be shared evenly are on each device."""
+    rng, num = np.random.default_rng(0), 2 * exchange.num
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spread_arrays, "LARGEST_PART", 48)
+        for shape in ((3 * num, 4, 2), (3 * num,), (3 * num + 1, 2), (0, 2), ()):
+            values = rng.normal(size=shape).astype(np.float32)
+            x = spread(exchange, values)
+            np.testing.assert_array_equal(on_host(x), values)
+            assert x._npy_value is None or not (shape and shape[0] % num == 0 and shape[0])
+            assert placed_like(values, x).sharding == x.sharding
+            if shape and shape[0]:
+                rows = rng.permutation(2 * num)
+                moved = rows_moved(x, rows)
+                expected = np.concatenate([values[rows], values[2 * num :]])
+                np.testing.assert_array_equal(on_host(moved), expected)
+                np.testing.assert_array_equal(rows_moved(jnp.asarray(values), rows), expected)
+                assert moved.sharding == x.sharding
+        columns = spread(exchange, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)
+        np.testing.assert_array_equal(on_host(columns), values_of)
+
+
+def memory(folder):
+    """The forecast of views that are drawn at once is what XLA says of a step."""
+    found = a2tg.synthetic_scene(num_views=5, width=480, height=360, num_points=400)
+    for size in (1, 4):
+        own = system(Gaussians2dMcmc, densify={"cap": 400}, initial_gaussians=400, batch_size=size)
+        run = StageRun(found, own, 0, initial_model(found, own), session=Session(devices=jax.devices()))
+        arguments = run.arguments(1)
+        lowered = jitted_step()._jitted.lower(classes_of((arguments, {})), *arguments)
+        said = jax.device_count() * lowered.compile().memory_analysis().temp_size_in_bytes
+        expected = stage_bytes(found, own, run.stage, 400, run.model.num_bytes, jax.device_count())
+        assert 0.75 < (expected.gradients + expected.pixels) / said < 1.33, (size, expected, said)
+        run.photographs.close()
 
 
 if __name__ == "__main__":

@@ -21,13 +21,16 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 from jax.experimental import multihost_utils
-from on_devices import scene, system
+from on_devices import events_change_the_same, others_get_all_rows, rows_are_read_and_moved, scene, system
 from test_pictures import write_scene
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.spread_arrays import placed_like
 from a2tg_jax.data import decoding, photo_reading, photo_store
 from a2tg_jax.host.processes import LOST, Place, joined
+from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -176,6 +179,17 @@ def read_own_share():
             np.testing.assert_array_equal(one.picture.read(), other.picture.read())
 
 
+def change(place):
+    """Events on the host change what is spread over the processes as they change it on one device."""
+    with joined(place):
+        session = Session(devices=jax.devices())
+        with pytest.raises(ValueError, match="the processes differ after a change of the model"):
+            placed_like(np.full(4, jax.process_index()), spread(session.exchange, np.zeros(4)))
+        rows_are_read_and_moved(session.exchange)
+        others_get_all_rows(session)
+        events_change_the_same(session)
+
+
 def wait(place, what):
     """Meet the other processes for ever, after reading photographs if that is asked for."""
     with joined(place) as team:
@@ -239,6 +253,8 @@ def main():
         place = Place(args.coordinator, args.num_processes, args.process_id, args.seconds)
         if args.what == "train":
             train(place, args.system, args.length, args.folder)
+        elif args.what == "events":
+            change(place)
         else:
             wait(place, args.what)
     elif args.losses:

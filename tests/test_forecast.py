@@ -110,7 +110,7 @@ def test_advice_for_splats_of_a_file_is_a_smaller_file():
         tell_forecast(scene, own, 3 * 10**9, num_given=10**7)
     found = forecast_run(scene, plan_run({"a": system, "b": a2tg.Gaussians2d.preset("smoke")}), 10**7)
     assert found.of_file == {"a-gaussians", "a-textures"}
-    gathered = dataclasses.replace(found, gathered={"a-textures": 2.0, "b-gaussians": 1.0})
+    gathered = dataclasses.replace(found, whole={"a-textures": 2.0, "b-gaussians": 1.0})
     with pytest.raises(ValueError, match="change --sh-degree, or a smaller --init file"):
         gathered.check_one_device(1)
     with pytest.raises(ValueError, match=r"change --densify\.cap, --"):
@@ -268,20 +268,63 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
     assert found.peak[1].program == 0 and found.seconds == 0
 
 
-def test_the_state_must_fit_on_one_of_several_devices_if_events_gather_it(monkeypatch):
+@a2tg.event
+class Read(a2tg.HostEvent):
+    """An event of somebody else, which reads the whole state."""
+
+    def iterations(self, num_iterations):
+        return (1,)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reading(Capped):
+    """A toy that reads the state."""
+
+    def stages(self) -> tuple[a2tg.Stage, ...]:
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(*stage.events, Read())),)
+
+
+def test_the_model_must_fit_on_one_of_several_devices_and_the_state_if_an_event_reads_it(monkeypatch):
     monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
     scene, capped = scene_of(24, 16), a2tg.McmcConfig(cap=10**6)
-    plain, pruned = (a2tg.Gaussians2dMcmc(densify=capped, prune=PruneConfig(share=share)) for share in (0.0, 0.1))
-    assert set(run_of(scene, plain).gathered.values()) == {0}
+    pruned = a2tg.Gaussians2dMcmc(densify=capped, prune=PruneConfig(share=0.1))
     found = run_of(scene, pruned)
-    assert max(found.gathered.values()) == 2 * 3 * 232 * 10**6
-    with pytest.raises(ValueError, match=r"gather the whole state of .* on one device: .* change --densify.cap"):
-        found.check_one_device(1e9)
+    assert max(found.whole.values()) == 232 * 10**6
+    (plain,), (reading,) = (forecast_stages(scene, kind(most=10**6)) for kind in (Capped, Reading))
+    assert plain.whole_bytes == plain.model_bytes and reading.whole_bytes == 6 * plain.model_bytes
+    with pytest.raises(ValueError, match=r"the model of .* must fit on one device: .* change --densify.cap"):
+        found.check_one_device(2e8)
     tell_forecast(scene, plan_run({"a": pruned}), None, 2)
     monkeypatch.setattr(RunForecast, "check", lambda found, limit: None)
-    with pytest.raises(ValueError, match="leave these events out"):
-        tell_forecast(scene, plan_run({"a": pruned}), 10**9, 2)
-    tell_forecast(scene, plan_run({"a": pruned}), 10**9)
+    with pytest.raises(ValueError, match="must fit on one device"):
+        tell_forecast(scene, plan_run({"a": pruned}), 2 * 10**8, 2)
+    tell_forecast(scene, plan_run({"a": pruned}), 2 * 10**8)
+
+
+@pytest.mark.parametrize(("batch_size", "at_once"), [(4, 4), (6, 2), (3, 1)])
+def test_views_that_are_drawn_at_once_take_room_each(monkeypatch, batch_size, at_once):
+    """On CPUs every device has their images whole."""
+    scene = scene_of(480, 360)
+    system = a2tg.Gaussians2dMcmc(batch_size=batch_size, densify=a2tg.McmcConfig(cap=1000))
+
+    def needed(num_devices):
+        return next(forecast_stages(scene, system, num_devices=num_devices)).bytes
+
+    (alone, four), per_pixel = map(needed, (1, 4)), 480 * 360 * 123
+    pairs = (at_once - 1) * 4 * 90 * 480 * 360 / 64
+    assert four.pixels - alone.pixels == pytest.approx((4 * at_once - 1) * per_pixel + pairs)
+    assert four.gradients - alone.gradients == pytest.approx((at_once - 1) * 164 * 1000)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert needed(4).pixels - alone.pixels == pytest.approx((at_once - 1) * per_pixel + pairs)
+
+
+def test_an_event_has_the_new_state_beside_the_old_one():
+    """With many texels that is more than a step needs."""
+    scene = scene_of(24, 16)
+    system = a2tg.A2tg()
+    first, last = (stage_bytes(scene, system, stage, 1000, 10**8).gradients for stage in system.stages())
+    assert last == 3 * 10**8 > first
 
 
 def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):

@@ -43,6 +43,10 @@ def test_two_processes_train_as_one(tmp_path):
     assert load_model(run.model(first)).num_bytes == alone.model.num_bytes
 
 
+def test_events_change_the_same_in_two_processes():
+    ended(pair(["--what", "events"]))
+
+
 def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     first, other = trainings(tmp_path / "run", SHORT, (), ("--seed", "1"))
     told, _ = [process.communicate(timeout=120)[1] for process in (first, other)]

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.core.spread_arrays import rows_moved
 from a2tg_jax.texture import (
     MAX_SIDE,
     AtlasLayout,
@@ -28,7 +29,7 @@ class Bucketed(Appearance):
 
     def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
         (bucket,) = self.only(params)
-        return Textures((bucket.at[: rows.shape[0]].set(bucket[rows]),))
+        return Textures((rows_moved(bucket, rows),))
 
     def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
         (bucket,) = self.only(params)

@@ -9,6 +9,7 @@ from jax import Array
 
 from a2tg_jax.appearance.copies import share
 from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.spread_arrays import rows_moved
 
 
 class MovableRows:
@@ -21,7 +22,7 @@ class MovableRows:
 
     def gather(self, params: Any, layout: Any, rows: Array) -> Any:
         """Return parameters, or moments of them, whose row i is the former row rows[i] of N; traceable."""
-        return jax.tree.map(lambda x: x[rows], params)
+        return jax.tree.map(lambda x: rows_moved(x, rows), params)
 
     def clear(self, params: Any, layout: Any, is_cleared: Array) -> Any:
         """Return moments with the marked rows [N] at zero; traceable."""

@@ -6,7 +6,7 @@ parameters only and is differentiable; `BandLayout` holds the owners of the rows
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -18,6 +18,7 @@ from jax.typing import ArrayLike, DTypeLike
 from a2tg_jax.core.checks import check_shape, short_repr
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.core.spread_arrays import on_host, placed_like
 from a2tg_jax.texture import bucket_capacity
 
 MAX_DEGREE = 3
@@ -60,7 +61,7 @@ class BandLayout:
 
     def count_floats(self, num: int) -> int:
         """Return the floats of the first `num` Gaussians beyond those that all have (host)."""
-        rows = [int(np.count_nonzero(np.asarray(owners) < num)) for owners in self.owners]
+        rows = [int(np.count_nonzero(on_host(owners) < num)) for owners in self.owners]
         return sum(count * floats_of_band(degree) for count, degree in zip(rows, self.bands, strict=True))
 
     @property
@@ -89,16 +90,23 @@ def allocate_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.
       ValueError: if a degree is out of range.
     """
     degrees = np.asarray(degrees)
+    owners = _owners(degrees, base_degree)
+    bands = enumerate(owners, base_degree + 1)
+    tables = tuple(jnp.zeros((len(own), 2 * degree + 1, 3), dtype) for degree, own in bands)
+    return Bands(tables), BandLayout(tuple(map(jnp.asarray, owners)), len(degrees))
+
+
+def _owners(degrees: np.ndarray, base_degree: int) -> list[np.ndarray]:
+    """Return the owners of the rows of each table for Gaussians of the given degrees."""
     if degrees.size and not base_degree <= degrees.min() <= degrees.max() <= MAX_DEGREE:
         raise ValueError(f"degrees must lie in {base_degree}..3; got {degrees.min()}..{degrees.max()}")
-    tables, all_owners = [], []
+    found = []
     for degree in range(base_degree + 1, MAX_DEGREE + 1):
         rows = np.flatnonzero(degrees >= degree)
         owners = np.full(bucket_capacity(len(rows)), len(degrees), np.int32)
         owners[: len(rows)] = rows
-        all_owners.append(jnp.asarray(owners))
-        tables.append(jnp.zeros((len(owners), 2 * degree + 1, 3), dtype))
-    return Bands(tuple(tables)), BandLayout(tuple(all_owners), len(degrees))
+        found.append(owners)
+    return found
 
 
 def reallocate_bands(
@@ -115,7 +123,7 @@ def reallocate_bands(
     check_shape("degrees", degrees, (layout.num,))
 
     def rebuilt(old: Bands) -> tuple[Bands, BandLayout]:
-        return _packed(_dense_tables(old, layout), degrees, layout.base_degree)
+        return _packed(_dense_tables(old, layout), degrees, layout.base_degree, like=layout.owners)
 
     def is_bands(node: Any) -> bool:
         return isinstance(node, Bands)
@@ -209,31 +217,36 @@ def split_sh(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> tuple[
     return _packed([dense[:, NUM_BASES[band - 1] : NUM_BASES[band]] for band in bands], degrees, base_degree)
 
 
-def _dense_tables(bands: Bands, layout: BandLayout) -> list[np.ndarray]:
-    """Return each band as [N, 2l + 1, 3], zeros for Gaussians without it (host)."""
-    tables = []
+def _dense_tables(bands: Bands, layout: BandLayout) -> Iterator[np.ndarray]:
+    """Yield each band as [N, 2l + 1, 3], zeros for Gaussians without it (host)."""
     for table, owners in zip(bands.tables, layout.owners, strict=True):
         rows = _owned(owners, layout.num)
         dense = np.zeros((layout.num, *table.shape[1:]), table.dtype)
-        dense[rows] = np.asarray(table)[: len(rows)]
-        tables.append(dense)
-    return tables
+        dense[rows] = on_host(table)[: len(rows)]
+        yield dense
 
 
-def _packed(dense: Sequence[np.ndarray], degrees: ArrayLike, base_degree: int) -> tuple[Bands, BandLayout]:
-    """Pack dense tables for Gaussians of these degrees; tables of bands without owners may lack columns."""
-    empty, layout = allocate_bands(degrees, base_degree)
-    tables = []
-    for values, fresh, owners in zip(dense, empty.tables, layout.owners, strict=True):
-        rows = _owned(owners, layout.num)
-        filled = np.zeros(fresh.shape, values.dtype)
+def _packed(
+    dense: Iterable[np.ndarray], degrees: ArrayLike, base_degree: int, like: Sequence[Array] | None = None
+) -> tuple[Bands, BandLayout]:
+    """Pack dense tables, one after the other, for Gaussians of these degrees; tables of bands without owners may lack
+    columns. `like` are arrays over whose devices the rows are spread as their own; None: they lie on one."""
+    degrees = np.asarray(degrees)
+    tables, placed_owners = [], []
+    owners = _owners(degrees, base_degree)
+    bands = range(base_degree + 1, MAX_DEGREE + 1)
+    former: Sequence[Array | None] = like or [None] * len(owners)
+    for values, own, degree, old in zip(dense, owners, bands, former, strict=True):
+        rows = _owned(own, len(degrees))
+        filled = np.zeros((len(own), 2 * degree + 1, 3), values.dtype)
         if len(rows):
             filled[: len(rows)] = values[rows]
-        tables.append(jnp.asarray(filled))
-    return Bands(tuple(tables)), layout
+        tables.append(placed_like(filled, old))
+        placed_owners.append(placed_like(own, old))
+    return Bands(tuple(tables)), BandLayout(tuple(placed_owners), len(degrees))
 
 
-def _owned(owners: Array, num: int) -> np.ndarray:
+def _owned(owners: Array | np.ndarray, num: int) -> np.ndarray:
     """Return the owners of the used rows, in the order of the rows."""
-    found = np.asarray(owners)
+    found = on_host(owners)
     return found[found < num]

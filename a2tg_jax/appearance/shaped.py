@@ -25,6 +25,7 @@ from a2tg_jax.appearance.plain import Plain
 from a2tg_jax.appearance.rule import Factor, Residual, RuleAround, has_gaussian_falloff
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.spread_arrays import rows_moved
 
 SHAPES = "shapes"
 """Name of the shapes in files."""
@@ -188,7 +189,7 @@ class Shaped(AppearanceAround):
         return num + self.inner.num_floats(layout.inner, num)
 
     def gather(self, params: ShapedParams, layout: ShapedLayout, rows: Array) -> ShapedParams:
-        gathered: ShapedParams = super().gather(params, layout, rows)._replace(shapes=params.shapes[rows])
+        gathered: ShapedParams = super().gather(params, layout, rows)._replace(shapes=rows_moved(params.shapes, rows))
         return gathered
 
     def clear(self, params: ShapedParams, layout: ShapedLayout, is_cleared: Array) -> ShapedParams:

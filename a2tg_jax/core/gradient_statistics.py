@@ -13,6 +13,7 @@ from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_floats, check_shape
 from a2tg_jax.core.numerics import safe_divide, safe_norm
+from a2tg_jax.core.spread_arrays import zeros_beside
 
 
 def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[Array, Array]:
@@ -45,9 +46,10 @@ class GradientStatistics:
     """[N] int32 number of views in which the Gaussian was composited at one or more pixels."""
 
     @staticmethod
-    def init(num: int, dtype: DTypeLike = jnp.float32) -> "GradientStatistics":
-        """Return empty sums for `num` Gaussians."""
-        return GradientStatistics(jnp.zeros(num, dtype), jnp.zeros(num, jnp.int32))
+    def init(num: int, dtype: DTypeLike = jnp.float32, like: Array | None = None) -> "GradientStatistics":
+        """Return empty sums for `num` Gaussians, whose rows are spread as those of an array `like` (None: on one
+        device)."""
+        return GradientStatistics(zeros_beside(like, (num,), dtype), zeros_beside(like, (num,), jnp.int32))
 
     def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
         """Add one view: `norms` [N] where `is_visible` [N]."""

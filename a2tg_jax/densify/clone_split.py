@@ -88,7 +88,7 @@ class CloneSplitPrune(StepEvent):
         return max(num, self.cap)
 
     def init(self, model: Model) -> GradientStatistics:
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
     def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
         return state.observe_views(seen.gradients, seen.is_visible)

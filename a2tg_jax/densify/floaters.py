@@ -8,6 +8,7 @@ import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View
 from a2tg_jax.densify.pruning import kept_first, pruning_times, shown_in
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, static
@@ -38,6 +39,8 @@ class PruneFloaters(HostEvent):
     at: tuple[float, ...] = static(default=(0.4, 0.6, 0.8))
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
+    reads_whole = False
+
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         if self.min_views < 0 or self.min_views == 1:
             raise FieldError(self, f"{{min_views}} must be at least 2 views, or 0 for off; got {self.min_views}")
@@ -53,7 +56,7 @@ class PruneFloaters(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
-        num, means = model.num, np.asarray(model.gaussians.means)[: model.num]
+        num, means = model.num, on_host(model.gaussians.means)[: model.num]
         is_kept, limits, most = np.ones(num, bool), np.full(len(due.views), self.near), len(due.views)
         if self.min_views or self.near_share:
             num_views = due.agreed(shown_in(model, due.views, self.least).num_views)[:num]

@@ -19,10 +19,14 @@ from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.spread_arrays import on_host, placed_like
 from a2tg_jax.data import View, counted_pixels, views_by_kind
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, Times, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.capacity import room_of_view
+from a2tg_jax.rasterize.exchange import exchange_of, spread
+from a2tg_jax.rasterize.placement import everywhere
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
@@ -41,6 +45,8 @@ class Prune(HostEvent):
     """Largest number of Gaussians left each time."""
     at: tuple[float, ...] = static(default=(1.0,))
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
+
+    reads_whole = False
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return pruning_times(self, self.at, num_iterations)
@@ -109,6 +115,9 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
 def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
     """Return how much each Gaussian shows, and in how many views it shows as much as `least` pixels (host).
 
+    The devices over which the model's rows are spread draw each view together. If they are of several processes, all
+    of these call it and get the same numbers.
+
     Args, Raises: as of `blending_weights`.
     """
     if not views:
@@ -116,20 +125,38 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
     total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
     if not len(total):
         return Shown(total, num_views)
-    settings = plan_render(model, [view.camera for view in views])
-    # Programs are compiled for a capacity: for few of them.
-    settings = dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
-    dtype = model.gaussians.means.dtype
+    settings, dtype = _planned(model, [view.camera for view in views]), model.gaussians.means.dtype
     for own in views_by_kind(views):
         rays = own[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)
         cameras = [dataclasses.replace(view.camera, rays=None) for view in own]
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
         counted = jnp.asarray(counted_pixels(own), dtype)
-        weights, num = _jitted()(model, stacked, rays, counted, jnp.asarray(least, dtype), settings)
-        total += np.asarray(weights, np.float64)
-        num_views += np.asarray(num)
+        arrays: Any = stacked, rays, counted, jnp.asarray(least, dtype)
+        if settings.exchange is not None:
+            arrays = jax.tree.map(functools.partial(everywhere, settings.exchange), arrays)
+        weights, num = _jitted()(model, *arrays, settings)
+        total += on_host(weights).astype(np.float64)
+        num_views += on_host(num)
     return Shown(total, num_views)
+
+
+def _planned(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
+    """Return settings with room for all cameras, rounded up, because programs are compiled for a room: for few of
+    them."""
+    alone = RenderSettings(exchange=exchange_of(model.gaussians.means))
+    capacity = _rounded_up(plan_render(model, cameras, settings=alone).capacity or 1)
+    if alone.exchange is None:
+        return RenderSettings(capacity=capacity)
+    rooms = [room_of_view(model.gaussians, camera, model.rule, alone, model.num_live) for camera in cameras]
+    rows_per_pair = _rounded_up(max(room.rows for room in rooms)) / capacity
+    exchange = dataclasses.replace(alone.exchange, rows_per_pair=rows_per_pair)
+    return RenderSettings(capacity=capacity, exchange=exchange)
+
+
+def _rounded_up(number: int) -> int:
+    """Return the next power of two above a number."""
+    return 1 << number.bit_length()
 
 
 @functools.cache
@@ -162,7 +189,9 @@ def _weights(
         return (total + weights[:, 0], num + (weights[:, 0] >= least).astype(num.dtype)), None
 
     none = jnp.zeros(len(nothing), jnp.int32)
-    return jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))[0]
+    found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
+    shown: tuple[Array, Array] = spread(settings.exchange, found)
+    return shown
 
 
 def kept_first(model: Model, moments: AdamState, state: Any, is_kept: np.ndarray) -> Change:
@@ -175,7 +204,7 @@ def kept_first(model: Model, moments: AdamState, state: Any, is_kept: np.ndarray
         raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
     num, rows = model.num, np.arange(model.gaussians.num)
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
-    moments = gather_moments(model, moments, jnp.asarray(rows))
-    left = jnp.asarray(int(is_kept.sum()), jnp.int32)
-    model = dataclasses.replace(gather_rows(model, jnp.asarray(rows)), num_live=left)
+    moments = gather_moments(model, moments, rows)
+    left = placed_like(np.asarray(is_kept.sum(), np.int32), model.gaussians.means)
+    model = dataclasses.replace(gather_rows(model, rows), num_live=left)
     return Change(model, moments, state, rows=rows)

@@ -25,6 +25,7 @@ from a2tg_jax.core.gaussians import logit
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
+from a2tg_jax.core.spread_arrays import zeros_beside
 from a2tg_jax.densify.clone_split import SPLIT_SHRINK, halved
 from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, event, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
@@ -54,8 +55,9 @@ class SplitByGradient(FillingMcmc):
         return "position"
 
     def init(self, model: Model) -> SplitStatistics:
-        num, dtype = model.gaussians.num, model.gaussians.means.dtype
-        return SplitStatistics(GradientStatistics.init(num, dtype), jnp.zeros(num, dtype))
+        num, like = model.gaussians.num, model.gaussians.means
+        gradients = GradientStatistics.init(num, like.dtype, like)
+        return SplitStatistics(gradients, zeros_beside(like, (num,), like.dtype))
 
     def observe(self, state: SplitStatistics, model: Model, seen: Seen) -> SplitStatistics:
         gaussians = model.gaussians

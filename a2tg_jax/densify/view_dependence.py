@@ -17,6 +17,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_of, event_budget, within
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.core.spread_arrays import on_host, zeros_beside
 from a2tg_jax.events import Change, Due, HostEvent, Seen, event, iterations_at, static
 from a2tg_jax.model import Model
 
@@ -32,9 +33,10 @@ class ViewDependence:
     """[] int32, views so far."""
 
     @staticmethod
-    def init(num: int, dtype: Any = jnp.float32) -> "ViewDependence":
-        """Empty sums for `num` Gaussians."""
-        return ViewDependence(jnp.zeros((num, 16, 3), dtype), jnp.zeros((), jnp.int32))
+    def init(num: int, dtype: Any = jnp.float32, like: Array | None = None) -> "ViewDependence":
+        """Return empty sums for `num` Gaussians, whose rows are spread as those of an array `like` (None: on one
+        device)."""
+        return ViewDependence(zeros_beside(like, (num, 16, 3), dtype), zeros_beside(like, (), jnp.int32))
 
     def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
         """Add V views.
@@ -52,8 +54,8 @@ class ViewDependence:
 
     def strengths(self) -> np.ndarray:
         """Return [N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
-        mean = np.asarray(self.total) / max(1, int(self.views))
-        return np.stack([np.linalg.norm(mean[:, band], axis=(1, 2)) for band in BAND_SLICES], axis=1)
+        total, views = on_host(self.total), max(1, int(self.views))
+        return np.stack([np.linalg.norm(total[:, band] / views, axis=(1, 2)) for band in BAND_SLICES], axis=1)
 
 
 BAND_SLICES = tuple(slice(NUM_BASES[degree - 1], NUM_BASES[degree]) for degree in (1, 2, 3))
@@ -76,6 +78,7 @@ class AdaptDegrees(HostEvent):
     """Smallest change of a colour by a band (root mean square over all directions); bands below it are removed."""
 
     observes = True
+    reads_whole = False
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return iterations_at(self.at, num_iterations, of=self)
@@ -84,7 +87,7 @@ class AdaptDegrees(HostEvent):
         return max(num_bytes, bytes_of(self.budget_mb))
 
     def init(self, model: Model) -> ViewDependence:
-        return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
+        return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
     def observe(self, state: ViewDependence, model: Model, seen: Seen) -> ViewDependence:
         centers = jax.vmap(lambda camera: camera.center)(seen.cameras)
@@ -112,8 +115,8 @@ def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:
     degrees = layout.degrees
     highest = degrees.copy()
     for band, table, owners in zip(layout.bands, bands.tables, layout.owners, strict=True):
-        rows = np.asarray(owners)[np.asarray(owners) < layout.num]
-        energy = np.square(np.asarray(table)[: len(rows)]).sum(axis=(1, 2)) / (12 * np.pi)
+        rows = on_host(owners)[on_host(owners) < layout.num]
+        energy = np.square(on_host(table)[: len(rows)]).sum(axis=(1, 2)) / (12 * np.pi)
         is_idle = (energy < idle**2) & (degrees[rows] == band)
         highest[rows[is_idle]] -= 1
     return highest

@@ -49,9 +49,7 @@ def with_capacity(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(model, cameras) outside, then pass settings=settings"
         )
-    pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
-    if settings.exchange is not None:
-        pairs = max(pairs, room_of_view(gaussians, camera, rule, settings, num_live).pairs)
+    pairs = pairs_to_draw(gaussians, camera, rule, settings, num_live)
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
@@ -78,6 +76,16 @@ def pairs_of_view(
         return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
+
+
+def pairs_to_draw(
+    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the least capacity for a view (host): its pairs or, on several devices, what the fullest band needs."""
+    pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
+    if settings.exchange is None or not pairs:
+        return pairs
+    return max(pairs, room_of_view(gaussians, camera, rule, settings, num_live).pairs)
 
 
 class RoomOfView(NamedTuple):

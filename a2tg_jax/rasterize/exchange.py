@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -24,6 +23,7 @@ from jax.sharding import PartitionSpec as P
 from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import screen_bounds
+from a2tg_jax.core.spread_arrays import mesh_of, placed, sharding_of_rows
 from a2tg_jax.rasterize.compositor import Composited, composite_arrays
 from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
 from a2tg_jax.rasterize.kernels.native import composite as native
@@ -78,8 +78,7 @@ class Exchange:
 
     def sharding_of(self, shape: tuple[int, ...], axis: int = 0) -> NamedSharding:
         """Return where the rows of an array lie, along one of its axes."""
-        is_divided = len(shape) > axis and shape[axis] >= self.num and shape[axis] % self.num == 0
-        return NamedSharding(self.mesh, P(*[None] * axis, AXIS) if is_divided else P())
+        return sharding_of_rows(self.mesh, shape, axis)
 
     def sharding_of_pictures(self, num_views: int, height: int) -> NamedSharding:
         """Return where the pictures [V, H, ...] of a batch lie: each on the devices that draw its view, which share its
@@ -118,12 +117,10 @@ def spread(exchange: Exchange | None, tree: Any, axis: int = 0) -> Any:
     return jax.tree.map(of_leaf, tree)
 
 
-def placed(x: Any, sharding: NamedSharding) -> Array:
-    """Return an array whose parts lie where a sharding says; other processes place theirs of an equal one."""
-    if sharding.is_fully_addressable:
-        array: Array = jax.device_put(x, sharding)
-        return array
-    return jax.make_array_from_callback(jnp.shape(x), sharding, np.asarray(x).__getitem__)
+def exchange_of(x: Any) -> Exchange | None:
+    """Return the exchange among the devices over which an array is spread; None if it lies on one (host)."""
+    mesh = mesh_of(x)
+    return None if mesh is None else Exchange(mesh)
 
 
 def exchange_among(devices: Any) -> Exchange:

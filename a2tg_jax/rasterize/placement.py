@@ -1,6 +1,5 @@
 """Arrays on the devices of an exchange and back (host): in one process, or in several that make the same calls."""
 
-import zlib
 from typing import Any
 
 import jax
@@ -10,7 +9,9 @@ from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from a2tg_jax.rasterize.exchange import Exchange, placed
+from a2tg_jax.core import spread_arrays
+from a2tg_jax.core.spread_arrays import on_host, placed
+from a2tg_jax.rasterize.exchange import Exchange
 
 
 def spread_pixels(exchange: Exchange, pictures: Array) -> Array:
@@ -54,9 +55,7 @@ def readable(tree: Any) -> Any:
     """
 
     def of_leaf(x: Any) -> Any:
-        if not isinstance(x, jax.Array) or x.is_fully_addressable:
-            return x
-        return np.asarray(x) if x.is_fully_replicated else multihost_utils.process_allgather(x, tiled=True)
+        return x if not isinstance(x, jax.Array) or x.is_fully_addressable else on_host(x)
 
     return jax.tree.map(of_leaf, tree)
 
@@ -85,10 +84,5 @@ def of_first(exchange: Exchange | None, tree: Any) -> Any:
 
 def check_same(exchange: Exchange | None, tree: Any, what: str) -> None:
     """Raise ValueError unless all processes have the same arrays (host); all of them call it."""
-    if exchange is None or not exchange.is_of_processes:
-        return
-    digest = 0
-    for leaf in map(np.asarray, jax.tree.leaves(tree)):
-        digest = zlib.crc32(leaf.tobytes(), zlib.crc32(repr(leaf.shape).encode(), digest))
-    if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
-        raise ValueError(f"the processes differ after {what}: train on machines that are alike")
+    if exchange is not None and exchange.is_of_processes:
+        spread_arrays.check_same(tree, what)

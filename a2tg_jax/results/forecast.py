@@ -74,8 +74,8 @@ class RunForecast:
     """Training time on CPUs; 0 if it cannot be estimated."""
     limits: tuple[str, ...] = ()
     """Names of the options that limit the number of Gaussians."""
-    gathered: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Bytes on one of several devices at the events on the host, by stage; 0 without such."""
+    whole: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Bytes that one of several devices must have room for beside its share, by stage (`StageForecast.whole_bytes`)."""
     of_file: frozenset[str] = frozenset()
     """Names of the phases whose number of Gaussians is that of a file."""
 
@@ -124,17 +124,17 @@ class RunForecast:
         )
 
     def check_one_device(self, limit: float) -> None:
-        """Raise if one of several devices has no room for the events on the host, which need the whole state.
+        """Raise if one of several devices has no room for the finished model, or for the state that an event reads.
 
         Raises:
           ValueError: naming the options to change.
         """
-        phase, needed = max(self.gathered.items(), key=lambda item: item[1], default=("", 0.0))
+        phase, needed = max(self.whole.items(), key=lambda item: item[1], default=("", 0.0))
         if needed > limit:
             raise ValueError(
-                f"pruning and the growth of textures gather the whole state of {phase} on one device: that takes about "
-                f"{in_bytes(needed)}, and {in_bytes(limit)} may be used: change "
-                f"{self._told_options('model', phase)}, or leave these events out"
+                f"the model of {phase}, or the state that its events read whole, must fit on one device: that takes "
+                f"about {in_bytes(needed)}, and {in_bytes(limit)} may be used: change "
+                f"{self._told_options('model', phase)}"
             )
 
     def _told_options(self, largest: str, phase: str) -> str:
@@ -145,16 +145,17 @@ class RunForecast:
         return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
 
 
-def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None) -> RunForecast:
+def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
     """Return a forecast of what the run will take (host; nothing is compiled).
 
     Args:
       scene: the run's scene.
       plan: its stages.
       num_given: Gaussians of the file in place of the main system's first stage; None without one.
+      num_devices: number of devices that train together; memory is that of all of them.
     """
     is_host = jax.default_backend() == "cpu"
-    stages = _stages(scene, plan, num_given)
+    stages = _stages(scene, plan, num_given, num_devices)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
         if not stage.is_trained:
@@ -172,10 +173,10 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None) -> R
     systems = {id(planned.system): planned.system for planned in plan.stages}.values()
     limits = tuple(dict.fromkeys(name for system in systems for name in system.limits()))
     disk = _disk_bytes(scene, plan, list(stages.values()))
-    gathered = {name: stage.gathered_bytes for name, stage in stages.items()}
+    whole = {name: stage.whole_bytes for name, stage in stages.items()}
     of_file = {name for name in stages if num_given == stages[name].num_rows and plan.begins_like_main(name)}
     of_file |= {"evaluation"} if of_file == stages.keys() else set()
-    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, gathered, frozenset(of_file))
+    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, whole, frozenset(of_file))
 
 
 def quick_downscale(longest_side: int) -> int:
@@ -254,20 +255,20 @@ def tell_forecast(
     Raises:
       ValueError: if that cannot fit, naming the options to change.
     """
-    found, limit = forecast_run(scene, plan, num_given), allowed_memory(max_memory, num_devices)
+    found, limit = forecast_run(scene, plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
     found.check(limit)
     if num_devices > 1:
         found.check_one_device(allowed_memory(max_memory))
     print(found.told(limit), flush=True)
 
 
-def _stages(scene: Scene, plan: RunPlan, num_given: int | None) -> dict[str, StageForecast]:
+def _stages(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: int = 1) -> dict[str, StageForecast]:
     """Return the forecast of every stage, by name."""
     systems: dict[int, tuple[System, list[StageForecast]]] = {}
     for planned in plan.stages:
         if id(planned.system) not in systems:
             num = num_given if plan.begins_like_main(planned.name) else None
-            systems[id(planned.system)] = planned.system, list(forecast_stages(scene, planned.system, num))
+            systems[id(planned.system)] = planned.system, list(forecast_stages(scene, planned.system, num, num_devices))
     return {planned.name: systems[id(planned.system)][1][planned.index] for planned in plan.stages}
 
 

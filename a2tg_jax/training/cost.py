@@ -6,8 +6,11 @@ pixel and pair, as XLA reports for compiled steps (`memory_analysis`). The size 
 """
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
+
+import jax
 
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
@@ -29,8 +32,8 @@ COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
-GATHERED = 2
-"""Number of states that an event on the host holds: the former and the new one."""
+WHOLE_STATES = 2
+"""States on one of several devices while an event changes them that reads all rows (`HostEvent.reads_whole`)."""
 STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 """Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
 (colours, loss, and the gradients of both) and pair (tile lists)."""
@@ -43,6 +46,8 @@ CORRECTION_COPIES = 8
 """
 VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
 """Bytes of each view of a batch, beside its gradient of the model."""
+TRAVELLING_ROW = 164
+"""Bytes of a row that a device receives, and of its gradient."""
 PAIRS_PER_TILE = 90
 """Room in the tile lists of a stage that begins with few, large Gaussians."""
 DECODER_PER_PIXEL = 15
@@ -85,8 +90,9 @@ class StageForecast:
     """Programs compiled while it runs; 0 if it is not trained."""
     seconds: float
     """All its iterations, on CPUs, roughly."""
-    gathered_bytes: float
-    """Bytes on one device while an event on the host changes the state; 0 without such events."""
+    whole_bytes: float
+    """Bytes that one of several devices must have room for, beside its share: the finished model, or the state if an
+    event reads it whole."""
 
     @property
     def is_trained(self) -> bool:
@@ -94,13 +100,16 @@ class StageForecast:
         return self.num_programs > 0
 
 
-def forecast_stages(scene: Scene, system: System, num_given: int | None = None) -> Iterator[StageForecast]:
+def forecast_stages(
+    scene: Scene, system: System, num_given: int | None = None, num_devices: int = 1
+) -> Iterator[StageForecast]:
     """Yield the forecast of each stage of a system (host; nothing is compiled).
 
     Args:
       scene: its photographs and points.
       system: with its options.
       num_given: Gaussians of a file in place of the first stage, which takes nothing then; None: it is trained.
+      num_devices: number of devices that train together; bytes are of all of them.
     """
     num, floats, shown = initial_number(scene, system), 0.0, None
     stages = system.stages()
@@ -118,10 +127,11 @@ def forecast_stages(scene: Scene, system: System, num_given: int | None = None) 
         floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
-        gathered = GATHERED * STATES * model_bytes * any(event.iterations(stage.iterations) for event in on_host)
+        is_read = any(event.reads_whole and event.iterations(stage.iterations) for event in on_host)
+        whole = max(1, WHOLE_STATES * STATES * is_read) * model_bytes
         seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
-        needed = stage_bytes(scene, system, stage, num, model_bytes)
-        yield StageForecast(needed, model_bytes, num, programs, seconds, gathered)
+        needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
+        yield StageForecast(needed, model_bytes, num, programs, seconds, whole)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
 
@@ -129,11 +139,16 @@ def forecast_stages(scene: Scene, system: System, num_given: int | None = None) 
 def _given_stage(system: System, num: int) -> StageForecast:
     """Return the forecast of a first stage in whose place a file gives its Gaussians."""
     model_bytes = system.initial_bytes * num
-    return StageForecast(Bytes(), model_bytes, num, num_programs=0, seconds=0, gathered_bytes=0)
+    return StageForecast(Bytes(), model_bytes, num, num_programs=0, seconds=0, whole_bytes=0)
 
 
-def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_bytes: float) -> Bytes:
+def stage_bytes(
+    scene: Scene, system: System, stage: Stage, num: int, model_bytes: float, num_devices: int = 1
+) -> Bytes:
     """Return the bytes of a stage's last steps, programs and compilation left out.
+
+    Of the views of a batch, several devices draw G at once, each with room for all its rows and pixels. On CPUs every
+    device has the images of all of them whole, for SSIM.
 
     Args:
       scene: its photographs.
@@ -141,16 +156,22 @@ def stage_bytes(scene: Scene, system: System, stage: Stage, num: int, model_byte
       stage: its losses and corrections.
       num: rows.
       model_bytes: of the model.
+      num_devices: number of devices that train together; bytes are of all of them.
     """
+    at_once = math.gcd(system.batch_size, num_devices)
+    images = at_once * (num_devices if jax.default_backend() == "cpu" else 1)
+    is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
     largest, batch = largest_view(scene.train), system.batch_size
     per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * any(term.has_geometry for term in stage.losses)
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
+    of_step = STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num)
+    of_step += (at_once - 1) * TRAVELLING_ROW * num
     return Bytes(
         photographs=held_bytes(scene) + fed_bytes(scene.train, batch, stage.has_depths),
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
-        gradients=STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num),
-        pixels=largest * (per_pixel + VIEW_PER_PIXEL * (batch - 1)) + STEP_PER_PAIR * pairs,
+        gradients=max(of_step, STATES * model_bytes * is_changed),  # An event has the new state beside the old one.
+        pixels=largest * (images * per_pixel + VIEW_PER_PIXEL * (batch - 1)) + at_once * STEP_PER_PAIR * pairs,
         corrections=correction_bytes(stage.corrections, len(scene.train), largest),
     )
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
@@ -128,11 +129,10 @@ class StageRun:
             check_resume(resume, system, index)
             check_corrections(resume.state.corrections, len(self.views))
             warn_of_uneven_rows(resume, self.num_devices)
-            self.state: TrainState = spread(self.exchange, jax.tree.map(jnp.array, resume.state))
+            self.state: TrainState = spread(self.exchange, self._copied(resume.state))
             self.earlier_seconds = resume.history.last_seconds
         elif start is not None:
-            # Steps take over the buffers they are given: the caller keeps his own.
-            model = padded(jax.tree.map(jnp.array, start.live), self.stage, system, self.num_devices)
+            model = spread(self.exchange, padded(self._copied(start.live), self.stage, system, self.num_devices))
             state = initial_state(self.stage, model, [view.name for view in self.views], start.origin)
             self.state = spread(self.exchange, state)
         else:
@@ -160,6 +160,11 @@ class StageRun:
         self.started = time.perf_counter()
         self.num_regrown = self.num_refused = self.num_compiled = 0
 
+    def _copied(self, tree: Any) -> Any:
+        """Return copies of arrays, for steps take over the buffers they are given: on the device, or on the host if
+        several devices are to share them."""
+        return jax.tree.map(jnp.array if self.exchange is None else np.array, tree)
+
     @property
     def history(self) -> History:
         """Logged figures so far."""
@@ -177,8 +182,10 @@ class StageRun:
     @property
     def model(self) -> Model:
         """The Gaussians that exist, and what they show, on one device."""
-        model: Model = gathered(self.exchange, self.state.model)
-        return model.live
+        if self.exchange is None:
+            return self.state.model.live
+        on_one: Model = gathered(self.exchange, jax.tree.map(on_host, self.state.model).live)
+        return on_one
 
     @property
     def checkpoint(self) -> Checkpoint:
@@ -346,9 +353,7 @@ class StageRun:
 
     def _log(self, iteration: int, info: StepInfo) -> None:
         if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
-            model = self.state.model
-            model = dataclasses.replace(model, layout=readable(model.layout))
-            num_bytes = model.bytes_of(int(info.num_live))
+            num_bytes = self.state.model.bytes_of(int(info.num_live))
             row = (
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
                 num_bytes / 1e6, self.seconds,
@@ -359,32 +364,30 @@ class StageRun:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:
-        """Apply the host events that follow an iteration, on one device, and drop the statistics of past events."""
+        """Apply the host events that follow an iteration, and drop the statistics of past events."""
         if iteration not in self._due_on_host():
             return
-        if not any(iteration in event.iterations(self.stage.iterations) for event in self._on_host()):
-            return self._apply_host_events(iteration)
-        self.state = gathered(self.exchange, self.state)
-        self._apply_host_events(iteration)
-        check_same(self.exchange, self.state, f"the events at iteration {iteration} of stage {self.stage.name}")
-        self.state = spread(self.exchange, self.state)
-
-    def _apply_host_events(self, iteration: int) -> None:
         for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
-            state = self.state.events[place]
             if isinstance(event, HostEvent):
-                due = event.iterations(self.stage.iterations)
-                if iteration not in due:
-                    continue
-                agreed = functools.partial(of_first, self.exchange)
-                told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes, agreed)
-                change = event.apply(told, self.state.model, self.state.moments, state)
-                self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-                if change.rows is not None:
-                    self._move_rows(change.rows)
-                self._keep(place, None if iteration == due[-1] else change.state)
+                if iteration in event.iterations(self.stage.iterations):
+                    self._apply(place, event, iteration)
             elif times is not None and event.observes and iteration == times.last:
                 self._keep(place, None)
+
+    def _apply(self, place: int, event: HostEvent, iteration: int) -> None:
+        """Apply a host event: to arrays that are spread over the devices, or on one device if it wants them whole."""
+        if event.reads_whole:
+            self.state = gathered(self.exchange, self.state)
+        due, agreed = event.iterations(self.stage.iterations), functools.partial(of_first, self.exchange)
+        told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes, agreed)
+        change = event.apply(told, self.state.model, self.state.moments, self.state.events[place])
+        self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
+        if change.rows is not None:
+            self._move_rows(change.rows)
+        self._keep(place, None if iteration == due[-1] else change.state)
+        if event.reads_whole:
+            check_same(self.exchange, self.state, f"the events at iteration {iteration} of stage {self.stage.name}")
+        self.state = spread(self.exchange, self.state)
 
     def _move_rows(self, rows: np.ndarray) -> None:
         """Move the events' statistics along with the Gaussians."""
@@ -402,11 +405,13 @@ class StageRun:
         settings = RenderSettings(tile_size=self.system.tile_size)
         if size not in self.capacities:
             views = [view for view in self.views if view.picture.size == size]
-            live, dtype = self.model, self.scene_scale.dtype
+            model, dtype = self.state.model, self.scene_scale.dtype
             sample = views[:: -(-len(views) // PLANNED_VIEWS)]
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
-            pairs = max(pairs_of_view(live.gaussians, camera, live.rule, settings) for camera in cameras)
-            growth = (self.state.model.gaussians.num / max(live.gaussians.num, 1)) ** 0.5
+            pairs = max(
+                pairs_of_view(model.gaussians, camera, model.rule, settings, model.num_live) for camera in cameras
+            )
+            growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
             self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
             if self.exchange is not None:
                 self.exchanges[size] = self._planned_exchange(self.exchange, cameras, self.capacities[size])

@@ -19,9 +19,10 @@ from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, Times
+from a2tg_jax.events import Event, EventInfo, HostEvent, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import spread
+from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (
@@ -91,18 +92,23 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
 
     Args:
       stage: which.
-      model: with the rows and the appearance of the stage.
+      model: with the rows and the appearance of the stage; the state is spread over devices as its rows are.
       names: of the training views.
       origin: of the model that the stage starts from; its corrections go on.
     """
     return TrainState(
         model=model,
         moments=adam_init((model.gaussians, model.params)),
-        events=tuple(event.init(model) if stage.is_ahead(event) else None for event in stage.events),
+        events=tuple(_initial(event, model) if stage.is_ahead(event) else None for event in stage.events),
         iteration=jnp.zeros((), jnp.int32),
         status=jnp.zeros((), jnp.int32),
         corrections=initial_corrections(stage.corrections, names, origin, model.gaussians.means.dtype),
     )
+
+
+def _initial(event: Event, model: Model) -> Any:
+    """Return the state that an event starts from; if it wants all rows, it can read them."""
+    return event.init(readable(model) if isinstance(event, HostEvent) and event.reads_whole else model)
 
 
 class Attempt(NamedTuple):

@@ -1,0 +1,126 @@
+"""Arrays whose rows are spread over the devices of a mesh: read and written on the host, one at a time (host).
+
+So a change on the host takes its share of memory on each device, and one array on the host. Arrays of one device, and
+of numpy, are read and written as usual. If the devices are of several processes, all of these make the same calls.
+"""
+
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jax.typing import DTypeLike
+
+LARGEST_PART = 2**28
+"""Bytes that are read at a time: on a device they lie beside the array, with those of all other processes."""
+
+
+def mesh_of(x: Any) -> Mesh | None:
+    """Return the mesh of the devices that an array lies on; None of one device, and of arrays of numpy and tracers."""
+    sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
+    mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
+    return mesh if isinstance(mesh, Mesh) and mesh.size > 1 else None
+
+
+def sharding_of_rows(mesh: Mesh, shape: tuple[int, ...], axis: int = 0) -> NamedSharding:
+    """Return where the rows of an array lie, along one of its axes; every device has all if D does not divide them."""
+    is_divided = len(shape) > axis and shape[axis] >= mesh.size and shape[axis] % mesh.size == 0
+    return NamedSharding(mesh, P(*[None] * axis, mesh.axis_names[0]) if is_divided else P())
+
+
+def on_host(x: Any) -> np.ndarray:
+    """Return the values of an array."""
+    if mesh_of(x) is None:
+        return np.asarray(x)
+    if x.is_fully_replicated:
+        return np.asarray(x.addressable_data(0))
+    if not x.sharding.is_equivalent_to(sharding_of_rows(x.sharding.mesh, x.shape), x.ndim):
+        whole = x if x.is_fully_addressable else multihost_utils.process_allgather(x, tiled=True)
+        return np.asarray(whole)
+    found, starts = np.empty(x.shape, x.dtype), _starts_of_processes(x)
+    own = sorted(x.addressable_shards, key=_start_of)
+    num_rows = max(1, LARGEST_PART * len(x) // max(1, x.nbytes * len(starts)))
+    for shard, rows in zip(own, zip(*starts, strict=True), strict=True):
+        for first in range(0, len(shard.data), num_rows):
+            # JAX keeps what is read of an array as long as the array: of a copy, it does not.
+            part = np.asarray(jnp.array(shard.data[first : first + num_rows], copy=True))
+            parts = part[None] if x.is_fully_addressable else multihost_utils.process_allgather(part)
+            for row, values in zip(rows, parts, strict=True):
+                found[row + first : row + first + len(values)] = values
+    return found
+
+
+def _start_of(shard: Any) -> int:
+    start: int = shard.index[0].start or 0
+    return start
+
+
+def _starts_of_processes(x: Array) -> list[list[int]]:
+    """Return, for each process, the first rows of the parts of an array that lie on its devices, ascending."""
+    starts: dict[int, list[int]] = {}
+    places: Any = x.sharding.devices_indices_map(x.shape)
+    for device, index in places.items():
+        starts.setdefault(device.process_index, []).append(index[0].start or 0)
+    return [sorted(own) for _, own in sorted(starts.items())]
+
+
+def placed(x: Any, sharding: NamedSharding) -> Array:
+    """Return an array whose parts lie where a sharding says; other processes place theirs of an equal one."""
+    if isinstance(x, jax.Array) and x.sharding.is_equivalent_to(sharding, x.ndim):
+        return x
+    if sharding.is_fully_addressable:
+        array: Array = jax.device_put(x, sharding)
+        return array
+    return jax.make_array_from_callback(jnp.shape(x), sharding, on_host(x).__getitem__)
+
+
+def placed_like(new: Any, old: Any) -> Array:
+    """Return values of the host in rows that are spread as those of another array, of any shape, are.
+
+    Raises:
+      ValueError: if several processes have different values.
+    """
+    mesh = mesh_of(old)
+    if mesh is None:
+        return jnp.asarray(new)
+    new = np.asarray(new)
+    new = new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False)
+    sharding = sharding_of_rows(mesh, new.shape)
+    if not sharding.is_fully_addressable:
+        check_same(new, "a change of the model")
+    return placed(new, sharding)
+
+
+def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
+    """Return zeros in rows that are spread as those of another array are."""
+    mesh = mesh_of(old)
+    return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
+
+
+def rows_moved(x: Array, rows: Any) -> Array:
+    """Return an array whose row i is the former row rows[i], for the first of its rows; the others stay.
+
+    It is traceable. Outside jit, rows that are spread over devices move on the host.
+    """
+    if mesh_of(x) is not None:
+        values, rows = on_host(x), np.asarray(rows)
+        moved = values[rows] if len(rows) == len(values) else np.concatenate([values[rows], values[len(rows) :]])
+        return placed_like(moved, x)
+    moved_here: Array = x[rows] if len(rows) == len(x) else x.at[: len(rows)].set(x[rows])
+    return moved_here
+
+
+def check_same(tree: Any, what: str) -> None:
+    """Raise ValueError unless all processes have the same arrays."""
+    digest = 0
+    for leaf in map(np.asarray, jax.tree.leaves(tree)):
+        values: Any = np.ascontiguousarray(leaf).view(np.uint8)
+        digest = zlib.crc32(values, zlib.crc32(repr(leaf.shape).encode(), digest))
+    if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
+        raise ValueError(f"the processes differ after {what}: train on machines that are alike")
