@@ -275,14 +275,14 @@ def reallocate(
     check_textures(textures, layout, layout.num)
     check_shape("new_sizes", new_sizes, (layout.num, 2))
     new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket)
-    kept = np.ones(layout.num, bool) if kept is None else np.asarray(kept)
-    check_shape("kept", kept, (layout.num,))
-    texel_moves = _plan_moves(layout, new_layout, np.ones(layout.num, bool))
-    moment_moves = _plan_moves(layout, new_layout, kept)
+    texel_moves = moment_moves = _plan_moves(layout, new_layout)
+    if kept is not None:
+        check_shape("kept", kept, (layout.num,))
+        moment_moves = _plan_moves(layout, new_layout, np.asarray(kept))
+    shapes = [(capacity, *size, 4) for capacity, size in zip(capacities, new_layout.resolutions, strict=True)]
 
     def rebuild(tree: Textures, moves: list[_Move], padding: tuple[float, ...]) -> Textures:
-        shapes = [(capacity, *size, 4) for capacity, size in zip(capacities, new_layout.resolutions, strict=True)]
-        buckets = (_moved_texels(tree, index, shape, moves, padding) for index, shape in enumerate(shapes))
+        buckets = _moved_texels(tree, shapes, moves, padding)
         return Textures(tuple(placed_like(bucket, layout.bucket) for bucket in buckets))
 
     def rebuild_moments(leaf: Any) -> Any:
@@ -304,13 +304,14 @@ class _Move(NamedTuple):
     new_rows: np.ndarray
 
 
-def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray) -> list[_Move]:
-    """Return one move for each pair of buckets that some of the marked Gaussians [N] connect."""
+def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray | None = None) -> list[_Move]:
+    """Return one move for each pair of buckets that some Gaussian, among the marked ones [N] if given, connects."""
+    chosen = slice(None) if is_moved is None else is_moved
     num_new = len(new.resolutions)
-    pairs = on_host(old.bucket)[is_moved].astype(np.int64) * num_new + on_host(new.bucket)[is_moved]
+    pairs = on_host(old.bucket)[chosen].astype(np.int64) * num_new + on_host(new.bucket)[chosen]
     order = np.argsort(pairs, kind="stable")
     codes, starts = np.unique(pairs[order], return_index=True)
-    old_rows, new_rows = on_host(old.row)[is_moved][order], on_host(new.row)[is_moved][order]
+    old_rows, new_rows = on_host(old.row)[chosen][order], on_host(new.row)[chosen][order]
     stops = [*starts[1:], len(order)]
     return [
         _Move(int(code) // num_new, int(code) % num_new, old_rows[start:stop], new_rows[start:stop])
@@ -319,17 +320,22 @@ def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray) -> lis
 
 
 def _moved_texels(
-    old: Textures, index: int, shape: tuple[int, ...], moves: list[_Move], padding: tuple[float, ...]
-) -> np.ndarray:
-    """Return the new bucket of an index and shape, filled with `padding` and then with the moved texels."""
+    old: Textures, shapes: list[tuple[int, ...]], moves: list[_Move], padding: tuple[float, ...]
+) -> list[np.ndarray]:
+    """Return new buckets of these shapes, filled with `padding` and then with the moved texels.
+
+    Each old bucket is read once, one after the other.
+    """
     dtype = old.buckets[0].dtype if old.buckets else np.float32
-    target = np.broadcast_to(np.asarray(padding, dtype), shape).copy()
-    for move in moves:
-        if move.new_bucket == index and old.buckets[move.old_bucket].size:
-            source = on_host(old.buckets[move.old_bucket])
+    targets = [np.broadcast_to(np.asarray(padding, dtype), shape).copy() for shape in shapes]
+    for index, bucket in enumerate(old.buckets):
+        own = [move for move in moves if move.old_bucket == index]
+        source = on_host(bucket) if own and bucket.size else np.zeros(0)
+        for move in own if source.size else ():
+            target = targets[move.new_bucket]
             v, u = (_nearest(source.shape[axis], target.shape[axis]) for axis in (1, 2))
             target[move.new_rows] = source[np.ix_(move.old_rows, v, u)]
-    return target
+    return targets
 
 
 def _nearest(old: int, new: int) -> np.ndarray:

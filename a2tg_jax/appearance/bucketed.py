@@ -29,7 +29,8 @@ class Bucketed(Appearance):
 
     def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
         (bucket,) = self.only(params)
-        return Textures((rows_moved(bucket, rows),))
+        spare = jnp.arange(len(rows), len(bucket), dtype=rows.dtype)
+        return Textures((rows_moved(bucket, jnp.concatenate([rows, spare])),))
 
     def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
         (bucket,) = self.only(params)

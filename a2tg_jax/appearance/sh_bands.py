@@ -137,7 +137,7 @@ def gather_bands(bands: Bands, layout: BandLayout, rows: Array) -> Bands:
 
     Each row keeps its degree: coefficients above it are dropped, and those that the former Gaussian lacked are 0.
     """
-    tables = []
+    tables, rows = [], jnp.asarray(rows)
     for table, owners in zip(bands.tables, layout.owners, strict=True):
         places = jnp.full(layout.num + 1, table.shape[0], jnp.int32)
         places = places.at[owners].set(jnp.arange(table.shape[0], dtype=jnp.int32)).at[layout.num].set(table.shape[0])

@@ -104,16 +104,14 @@ def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
 
 
 def rows_moved(x: Array, rows: Any) -> Array:
-    """Return an array whose row i is the former row rows[i], for the first of its rows; the others stay.
+    """Return the array whose row i is the former row rows[i].
 
     It is traceable. Outside jit, rows that are spread over devices move on the host.
     """
-    if mesh_of(x) is not None:
-        values, rows = on_host(x), np.asarray(rows)
-        moved = values[rows] if len(rows) == len(values) else np.concatenate([values[rows], values[len(rows) :]])
-        return placed_like(moved, x)
-    moved_here: Array = x[rows] if len(rows) == len(x) else x.at[: len(rows)].set(x[rows])
-    return moved_here
+    if mesh_of(x) is None:
+        moved: Array = x[rows]
+        return moved
+    return placed_like(on_host(x)[np.asarray(rows)], x)
 
 
 def check_same(tree: Any, what: str) -> None:

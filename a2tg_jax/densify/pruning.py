@@ -116,7 +116,7 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
     """Return how much each Gaussian shows, and in how many views it shows as much as `least` pixels (host).
 
     The devices over which the model's rows are spread draw each view together. If they are of several processes, all
-    of these call it and get the same numbers.
+    of these call it; their numbers may differ by rounding (`Due.agreed`).
 
     Args, Raises: as of `blending_weights`.
     """
@@ -144,14 +144,15 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
 def _planned(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
     """Return settings with room for all cameras, rounded up, because programs are compiled for a room: for few of
     them."""
-    alone = RenderSettings(exchange=exchange_of(model.gaussians.means))
-    capacity = _rounded_up(plan_render(model, cameras, settings=alone).capacity or 1)
-    if alone.exchange is None:
-        return RenderSettings(capacity=capacity)
-    rooms = [room_of_view(model.gaussians, camera, model.rule, alone, model.num_live) for camera in cameras]
+    settings, rule = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.rule
+    if settings.exchange is None:
+        capacity = plan_render(model, cameras, settings=settings).capacity
+        return dataclasses.replace(settings, capacity=_rounded_up(capacity or 1))
+    rooms = [room_of_view(model.gaussians, camera, rule, settings, model.num_live) for camera in cameras]
+    capacity = _rounded_up(max(room.pairs for room in rooms))
     rows_per_pair = _rounded_up(max(room.rows for room in rooms)) / capacity
-    exchange = dataclasses.replace(alone.exchange, rows_per_pair=rows_per_pair)
-    return RenderSettings(capacity=capacity, exchange=exchange)
+    exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
+    return dataclasses.replace(settings, capacity=capacity, exchange=exchange)
 
 
 def _rounded_up(number: int) -> int:
@@ -202,9 +203,10 @@ def kept_first(model: Model, moments: AdamState, state: Any, is_kept: np.ndarray
     """
     if model.appearance.has_degrees:
         raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
-    num, rows = model.num, np.arange(model.gaussians.num)
+    num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
-    moments = gather_moments(model, moments, rows)
+    on_device = jnp.asarray(rows)
+    moments = gather_moments(model, moments, on_device)
     left = placed_like(np.asarray(is_kept.sum(), np.int32), model.gaussians.means)
-    model = dataclasses.replace(gather_rows(model, rows), num_live=left)
+    model = dataclasses.replace(gather_rows(model, on_device), num_live=left)
     return Change(model, moments, state, rows=rows)
