@@ -320,7 +320,7 @@ def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray | None 
 
 
 def _moved_texels(
-    old: Textures, shapes: list[tuple[int, ...]], moves: list[_Move], padding: tuple[float, ...]
+    old: Textures, shapes: Sequence[tuple[int, ...]], moves: list[_Move], padding: tuple[float, ...]
 ) -> list[np.ndarray]:
     """Return new buckets of these shapes, filled with `padding` and then with the moved texels.
 

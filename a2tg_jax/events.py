@@ -152,6 +152,12 @@ class FieldError(ValueError):
 class Event:
     """Base class of both kinds of event."""
 
+    reads_whole: ClassVar[bool] = True
+    """Whether `init` and `gather`, and `apply` of an event on the host, get arrays whole, on one device, where several
+    devices train together. That device needs room for the whole state twice. If False, they get the arrays as they
+    lie, with their rows spread over the devices, read them by `on_host` and place new ones by `placed_like`, one at a
+    time (`core.spread_arrays`)."""
+
     @property
     def statistic(self) -> Statistic | None:
         """Statistic of the gradients that `observe` wants; None: none."""
@@ -165,10 +171,9 @@ class Event:
     def init(self, model: Model) -> Any:
         """Return the state that `observe` starts from, a pytree of arrays; () if nothing is gathered.
 
-        Where several devices train together, the rows of the model are spread over them; arrays of
-        `core.spread_arrays.zeros_beside` are so from the start, others are spread afterwards.
         It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
-        none does. `gather` follows those that move on the host.
+        none does. `gather` follows those that move on the host. If several devices train together, they share the rows
+        of these arrays; those made by `core.spread_arrays.zeros_beside` never lie on one device.
         """
         return ()
 
@@ -232,11 +237,6 @@ class StepEvent(Event):
 
 class HostEvent(Event):
     """Event between steps on the host, where values may be read and shapes may change."""
-
-    reads_whole: ClassVar[bool] = True
-    """Whether `apply` wants all arrays on one device, where several train together: that device needs room for the
-    whole state twice. If False, it gets the arrays as they lie, with their rows spread over the devices, reads them by
-    `on_host` and places new ones by `placed_like`, one at a time (`core.spread_arrays`)."""
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         """Return the iterations of a stage after which it happens, ascending."""

@@ -288,6 +288,8 @@ def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
 class Noise(StepEvent):
     """Exploration noise on the means, after every iteration (`perturb`)."""
 
+    reads_whole = False
+
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means)
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
@@ -300,6 +302,7 @@ class Mcmc(StepEvent):
     cap: int = static(default=500_000)
     """Largest number of Gaussians."""
 
+    reads_whole = False
     num_keys: ClassVar[int] = 2
     impossible: ClassVar[str] = "no Gaussian above the death opacity is left"
     refused: ClassVar[str] = "raise {cap}"

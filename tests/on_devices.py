@@ -23,7 +23,7 @@ from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.core.jit import classes_of
 from a2tg_jax.core.spread_arrays import on_host, placed_like, rows_moved
 from a2tg_jax.densify.splitting import SplitByGradient
-from a2tg_jax.events import Change, Due, HostEvent, event
+from a2tg_jax.events import Change, Due, HostEvent, StepEvent, event
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.exchange import AXIS, ROOM_OF_A_BAND, exchange_among, spread
 from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
@@ -426,7 +426,7 @@ def events_change_the_same(session):
             same_bits(alone.state, readable(together.state))
             same_bits(alone.model, together.model)
             assert_spread(together.state)
-            events = [each for each in together._on_host() if due in each.iterations(20)]
+            events = [e for e in together.stage.events if isinstance(e, HostEvent) and due in e.iterations(20)]
             happened += [(type(each).__name__, together.model.num, together.model.num_bytes) for each in events]
         alone.photographs.close()
         together.photographs.close()
@@ -439,7 +439,10 @@ HAPPENED = ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "AdaptDegrees", "
 
 @contextlib.contextmanager
 def no_whole_rows(num):
-    """Fail if a new array of so many rows or more lies on one device, or on each, while others are read and placed."""
+    """Fail if a new array of so many rows or more lies on one device, or on each, while others are read and placed.
+
+    It sees the arrays that live whenever a function of `core.spread_arrays` returns.
+    """
     known, found = jax.live_arrays(), set()
     ids = set(map(id, known))
 
@@ -486,12 +489,26 @@ class Reverse(HostEvent):
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state, rows=rows)
 
 
+@event
+class Remember(StepEvent):
+    """An event of somebody else, whose state is made of values of the model and follows rows in a way of its own."""
+
+    def init(self, model):
+        return jnp.asarray(np.asarray(model.gaussians.means)[:, 0])
+
+    def gather(self, state, rows):
+        return jnp.asarray(np.asarray(state)[rows])
+
+    def apply(self, now, model, moments, state):
+        return Change(model, moments, state)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reversed(a2tg.System):
     name = "reversed"
 
     def stages(self):
-        events = SplitByGradient(ROWS), Reverse()
+        events = SplitByGradient(ROWS), Reverse(), Remember()
         return (a2tg.Stage("gaussians", a2tg.Plain(), events, self.loss.terms(), self.rates, 4),)
 
 
@@ -500,17 +517,22 @@ def others_get_all_rows(session):
     own = Reversed(sh_degree=1, initial_gaussians=ROWS)
     run = StageRun(scene(), own, 0, plain(), session=session)
     run.steps(1, 2)
-    means, totals = (on_host(x) for x in (run.state.model.gaussians.means, run.state.events[0].gradients.total))
-    assert len(np.unique(totals)) > 20
+    known = run.state.model.gaussians.means, run.state.events[0].gradients.total, run.state.events[2]
+    means, totals, remembered = map(on_host, known)
+    assert len(np.unique(totals)) > 20 and len(np.unique(remembered)) > 20
     run._host_events(2)
     np.testing.assert_array_equal(on_host(run.state.model.gaussians.means), means[::-1])
     np.testing.assert_array_equal(on_host(run.state.events[0].gradients.total), totals[::-1])
+    np.testing.assert_array_equal(on_host(run.state.events[2]), remembered[::-1])
     assert_spread(run.state)
+    run._move_rows(np.arange(len(means))[::-1])  # As after an event that leaves arrays where they lie.
+    np.testing.assert_array_equal(on_host(run.state.events[0].gradients.total), totals)
+    np.testing.assert_array_equal(on_host(run.state.events[2]), remembered)
     run.photographs.close()
 
 
 def rows_are_read_and_moved(exchange):
-    """In parts, and rows past those that move stay; arrays that cannot be shared evenly are on each device."""
+    """In parts, and fewer or more rows than before; arrays that cannot be shared evenly are on each device."""
     rng, num = np.random.default_rng(0), 2 * exchange.num
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spread_arrays, "LARGEST_PART", 48)
@@ -521,12 +543,11 @@ def rows_are_read_and_moved(exchange):
             assert x._npy_value is None or not (shape and shape[0] % num == 0 and shape[0])
             assert placed_like(values, x).sharding == x.sharding
             if shape and shape[0]:
-                rows = rng.permutation(2 * num)
-                moved = rows_moved(x, rows)
-                expected = np.concatenate([values[rows], values[2 * num :]])
-                np.testing.assert_array_equal(on_host(moved), expected)
-                np.testing.assert_array_equal(rows_moved(jnp.asarray(values), rows), expected)
-                assert moved.sharding == x.sharding
+                for rows in rng.permutation(2 * num), rng.integers(0, len(values), 4 * num + 1):
+                    moved = rows_moved(x, rows)
+                    np.testing.assert_array_equal(on_host(moved), values[rows])
+                    np.testing.assert_array_equal(rows_moved(jnp.asarray(values), rows), values[rows])
+                    assert moved.sharding == exchange.sharding_of((len(rows), *shape[1:]))
         columns = spread(exchange, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)
         np.testing.assert_array_equal(on_host(columns), values_of)
 

@@ -11,6 +11,7 @@ from scenes_random import as_gaussians, draw_scene
 from a2tg_jax import adam_init, adam_update, concatenate, value_and_grad
 from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Shaped, Textured
 from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.events import gather_moments, gather_rows
 from a2tg_jax.model import Model
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
 
@@ -145,3 +146,16 @@ def test_a_loss_may_return_more():
     found, gradient = value_and_grad(lambda m: (jnp.sum(m.gaussians.means**2), m.num_live), has_aux=True)(model)
     assert found[1] == NUM and gradient.params == ()
     np.testing.assert_allclose(gradient.gaussians.means, 2 * model.gaussians.means)
+
+
+@pytest.mark.parametrize("name", ["plain", "shaped"])
+@pytest.mark.parametrize("rows", [[0, 5, 3], [1, 1, *range(NUM + 2)]])
+def test_an_event_may_leave_fewer_rows_or_more(name, rows):
+    model = some_model(name)
+    moments = adam_init((model.gaussians, model.params))
+    moments = dataclasses.replace(moments, mu=moved(moments.mu))
+    found, found_moments = gather_rows(model, np.asarray(rows)), gather_moments(model, moments, np.asarray(rows))
+    assert found.gaussians.num == len(rows)
+    for before, after in ((model.gaussians, found.gaussians), (model.params, found.params)):
+        jax.tree.map(lambda b, a: np.testing.assert_array_equal(np.asarray(b)[rows], a), before, after)
+    jax.tree.map(lambda b, a: np.testing.assert_array_equal(np.asarray(b)[rows], a), moments.mu, found_moments.mu)

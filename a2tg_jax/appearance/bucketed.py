@@ -29,8 +29,8 @@ class Bucketed(Appearance):
 
     def gather(self, params: Textures, layout: AtlasLayout, rows: Array) -> Textures:
         (bucket,) = self.only(params)
-        spare = jnp.arange(len(rows), len(bucket), dtype=rows.dtype)
-        return Textures((rows_moved(bucket, jnp.concatenate([rows, spare])),))
+        spare = jnp.arange(len(rows), len(bucket), dtype=jnp.int32)
+        return Textures((rows_moved(bucket, jnp.concatenate([jnp.asarray(rows, jnp.int32), spare])),))
 
     def clear(self, params: Textures, layout: AtlasLayout, is_cleared: Array) -> Textures:
         (bucket,) = self.only(params)

@@ -1,7 +1,8 @@
 """Arrays whose rows are spread over the devices of a mesh: read and written on the host, one at a time (host).
 
-So a change on the host takes its share of memory on each device, and one array on the host. Arrays of one device, and
-of numpy, are read and written as usual. If the devices are of several processes, all of these make the same calls.
+A change on the host then takes a share of the memory of each device, and one array on the host. Arrays on one device
+and NumPy arrays are read and written as usual. If the devices belong to several processes, all of them must make the
+same calls.
 """
 
 import zlib
@@ -18,11 +19,11 @@ from jax.sharding import PartitionSpec as P
 from jax.typing import DTypeLike
 
 LARGEST_PART = 2**28
-"""Bytes that are read at a time: on a device they lie beside the array, with those of all other processes."""
+"""Largest number of bytes read at a time. Each device holds them beside the array, for all processes."""
 
 
 def mesh_of(x: Any) -> Mesh | None:
-    """Return the mesh of the devices that an array lies on; None of one device, and of arrays of numpy and tracers."""
+    """Return the mesh of the devices that share an array; None for an array on one device, of NumPy, or traced."""
     sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
     mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
     return mesh if isinstance(mesh, Mesh) and mesh.size > 1 else None
@@ -48,7 +49,7 @@ def on_host(x: Any) -> np.ndarray:
     num_rows = max(1, LARGEST_PART * len(x) // max(1, x.nbytes * len(starts)))
     for shard, rows in zip(own, zip(*starts, strict=True), strict=True):
         for first in range(0, len(shard.data), num_rows):
-            # JAX keeps what is read of an array as long as the array: of a copy, it does not.
+            # JAX keeps what was read of an array as long as the array lives, so a copy is read.
             part = np.asarray(jnp.array(shard.data[first : first + num_rows], copy=True))
             parts = part[None] if x.is_fully_addressable else multihost_utils.process_allgather(part)
             for row, values in zip(rows, parts, strict=True):
@@ -81,7 +82,7 @@ def placed(x: Any, sharding: NamedSharding) -> Array:
 
 
 def placed_like(new: Any, old: Any) -> Array:
-    """Return values of the host in rows that are spread as those of another array, of any shape, are.
+    """Return values of the host, their rows spread over the devices of another array, whose shape may differ.
 
     Raises:
       ValueError: if several processes have different values.
@@ -98,7 +99,7 @@ def placed_like(new: Any, old: Any) -> Array:
 
 
 def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
-    """Return zeros in rows that are spread as those of another array are."""
+    """Return zeros, their rows spread over the devices of another array."""
     mesh = mesh_of(old)
     return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
 

@@ -233,6 +233,8 @@ class OpacityReset(StepEvent):
     most: float = 0.01
     """Largest opacity after a reset."""
 
+    reads_whole = False
+    reads_whole = False
     num_keys: ClassVar[int] = 0
 
     def times(self, num_iterations: int) -> Times:

@@ -19,7 +19,7 @@ from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.spread_arrays import on_host, placed_like
+from a2tg_jax.core.spread_arrays import mesh_of, on_host, placed_like
 from a2tg_jax.data import View, counted_pixels, views_by_kind
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, Times, event, gather_moments, gather_rows, static
 from a2tg_jax.host.text import shortened
@@ -205,8 +205,9 @@ def kept_first(model: Model, moments: AdamState, state: Any, is_kept: np.ndarray
         raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
     num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
-    on_device = jnp.asarray(rows)
-    moments = gather_moments(model, moments, on_device)
-    left = placed_like(np.asarray(is_kept.sum(), np.int32), model.gaussians.means)
-    model = dataclasses.replace(gather_rows(model, on_device), num_live=left)
+    means = model.gaussians.means
+    moved: Any = jnp.asarray(rows) if mesh_of(means) is None else rows  # To the device once, or moved on the host.
+    moments = gather_moments(model, moments, moved)
+    left = placed_like(np.asarray(is_kept.sum(), np.int32), means)
+    model = dataclasses.replace(gather_rows(model, moved), num_live=left)
     return Change(model, moments, state, rows=rows)

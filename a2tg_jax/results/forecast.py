@@ -75,7 +75,7 @@ class RunForecast:
     limits: tuple[str, ...] = ()
     """Names of the options that limit the number of Gaussians."""
     whole: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Bytes that one of several devices must have room for beside its share, by stage (`StageForecast.whole_bytes`)."""
+    """Bytes that one of several devices must have room for, by stage (`StageForecast.whole_bytes`)."""
     of_file: frozenset[str] = frozenset()
     """Names of the phases whose number of Gaussians is that of a file."""
 

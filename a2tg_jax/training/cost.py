@@ -15,7 +15,7 @@ import jax
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.data.scene import Scene, View, ray_bytes
-from a2tg_jax.events import HostEvent
+from a2tg_jax.events import HostEvent, StepEvent
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.corrections import Correction
@@ -33,7 +33,7 @@ COMPILER = 240 * MB
 STATES = 3
 """Parameters and the two moments of Adam."""
 WHOLE_STATES = 2
-"""States on one of several devices while an event changes them that reads all rows (`HostEvent.reads_whole`)."""
+"""States on one of several devices while an event changes them that reads all rows (`Event.reads_whole`)."""
 STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 """Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
 (colours, loss, and the gradients of both) and pair (tile lists)."""
@@ -91,8 +91,8 @@ class StageForecast:
     seconds: float
     """All its iterations, on CPUs, roughly."""
     whole_bytes: float
-    """Bytes that one of several devices must have room for, beside its share: the finished model, or the state if an
-    event reads it whole."""
+    """Bytes that one of several devices must have room for: its share, and the finished model, or the state if an event
+    reads it whole."""
 
     @property
     def is_trained(self) -> bool:
@@ -128,7 +128,7 @@ def forecast_stages(
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         is_read = any(event.reads_whole and event.iterations(stage.iterations) for event in on_host)
-        whole = max(1, WHOLE_STATES * STATES * is_read) * model_bytes
+        whole = (max(1, WHOLE_STATES * STATES * is_read) + (STATES + 1) / num_devices) * model_bytes
         seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
         yield StageForecast(needed, model_bytes, num, programs, seconds, whole)
@@ -167,6 +167,8 @@ def stage_bytes(
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
     of_step = STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num)
     of_step += (at_once - 1) * TRAVELLING_ROW * num
+    if any(isinstance(event, StepEvent) and event.most_gaussians is not None for event in stage.events):
+        of_step += (num_devices - 1) * model_bytes  # Rows that move inside a step are gathered on each device.
     return Bytes(
         photographs=held_bytes(scene) + fed_bytes(scene.train, batch, stage.has_depths),
         model=(STATES + 1) * model_bytes,  # what the stage began with stays

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.spread_arrays import on_host
+from a2tg_jax.core.spread_arrays import mesh_of, on_host
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import Due, HostEvent, StepEvent
+from a2tg_jax.events import Due, Event, HostEvent, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
@@ -92,8 +92,8 @@ def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
 
 def read(infos: list[StepInfo]) -> list[StepInfo]:
     """Return the scalars of some steps as host numbers. Only here the loop waits for the device."""
-    on_host: list[StepInfo] = jax.device_get(infos)
-    return on_host
+    known: list[StepInfo] = jax.device_get(infos)
+    return known
 
 
 class StageRun:
@@ -260,9 +260,6 @@ class StageRun:
             stops.append(iteration + checkpoint_every - iteration % checkpoint_every)
         return min(stops)
 
-    def _on_host(self) -> list[HostEvent]:
-        return [event for event in self.stage.events if isinstance(event, HostEvent)]
-
     def _due_on_host(self) -> list[int]:
         """Return the iterations of all host events, and the last one of each step event."""
         count = self.stage.iterations
@@ -385,15 +382,20 @@ class StageRun:
         if change.rows is not None:
             self._move_rows(change.rows)
         self._keep(place, None if iteration == due[-1] else change.state)
-        if event.reads_whole:
-            check_same(self.exchange, self.state, f"the events at iteration {iteration} of stage {self.stage.name}")
+        # What lies on the devices of all processes was compared when it was placed there.
+        own = [leaf for leaf in jax.tree.leaves(self.state) if mesh_of(leaf) is None]
+        check_same(self.exchange, own, f"the events at iteration {iteration} of stage {self.stage.name}")
         self.state = spread(self.exchange, self.state)
 
     def _move_rows(self, rows: np.ndarray) -> None:
         """Move the events' statistics along with the Gaussians."""
         pairs = zip(self.stage.events, self.state.events, strict=True)
-        events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
+        events = tuple(None if state is None else self._moved(event, state, rows) for event, state in pairs)
         self.state = dataclasses.replace(self.state, events=events)
+
+    def _moved(self, event: Event, state: Any, rows: np.ndarray) -> Any:
+        """Return the statistic of an event in new rows."""
+        return event.gather(gathered(self.exchange, state) if event.reads_whole else state, rows)
 
     def _keep(self, place: int, gathered: Any) -> None:
         events = list(self.state.events)
@@ -408,9 +410,8 @@ class StageRun:
             model, dtype = self.state.model, self.scene_scale.dtype
             sample = views[:: -(-len(views) // PLANNED_VIEWS)]
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
-            pairs = max(
-                pairs_of_view(model.gaussians, camera, model.rule, settings, model.num_live) for camera in cameras
-            )
+            rule = model.rule
+            pairs = max(pairs_of_view(model.gaussians, camera, rule, settings, model.num_live) for camera in cameras)
             growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
             self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
             if self.exchange is not None:

@@ -19,10 +19,10 @@ from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.events import Event, EventInfo, HostEvent, Now, Seen, StepEvent, Times
+from a2tg_jax.events import Event, EventInfo, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.exchange import spread
-from a2tg_jax.rasterize.placement import readable
+from a2tg_jax.rasterize.exchange import exchange_of, spread
+from a2tg_jax.rasterize.placement import gathered
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (
@@ -107,8 +107,8 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
 
 
 def _initial(event: Event, model: Model) -> Any:
-    """Return the state that an event starts from; if it wants all rows, it can read them."""
-    return event.init(readable(model) if isinstance(event, HostEvent) and event.reads_whole else model)
+    """Return the state that an event starts from."""
+    return event.init(gathered(exchange_of(model.gaussians.means), model) if event.reads_whole else model)
 
 
 class Attempt(NamedTuple):
