@@ -73,7 +73,8 @@ def never() -> bool:
 
 Watch = Callable[["StageRun", IsStopped], float]
 """Function called between steps with the running stage. It may read the state but not keep it, because the next step
-reuses its buffers. It returns the seconds it took, which are not counted as training."""
+reuses its buffers. Of several processes, all must read the same parts of it, or the training hangs. It returns the
+seconds it took, which are not counted as training."""
 
 
 def are_events_decided_by_host() -> bool:
