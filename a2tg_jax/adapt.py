@@ -312,7 +312,7 @@ def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray | None 
     order = np.argsort(pairs, kind="stable")
     codes, starts = np.unique(pairs[order], return_index=True)
     old_rows, new_rows = on_host(old.row)[chosen][order], on_host(new.row)[chosen][order]
-    stops = [*starts[1:], len(order)]
+    stops = [*starts[1:], len(order)][: len(starts)]
     return [
         _Move(int(code) // num_new, int(code) % num_new, old_rows[start:stop], new_rows[start:stop])
         for code, start, stop in zip(codes, starts, stops, strict=True)

@@ -43,6 +43,7 @@ def test_two_processes_train_as_one(tmp_path):
     assert load_model(run.model(first)).num_bytes == alone.model.num_bytes
 
 
+@pytest.mark.long
 def test_events_change_the_same_in_two_processes():
     ended(pair(["--what", "events"]))
 
