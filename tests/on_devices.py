@@ -532,7 +532,7 @@ def others_get_all_rows(session):
 
 
 def rows_are_read_and_moved(exchange):
-    """In parts, and fewer or more rows than before; arrays that cannot be shared evenly are on each device."""
+    """Arrays are read in parts, and rows may become fewer or more. Each device has all rows if they do not divide."""
     rng, num = np.random.default_rng(0), 2 * exchange.num
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spread_arrays, "LARGEST_PART", 48)

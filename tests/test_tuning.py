@@ -231,7 +231,7 @@ def test_tuning_keeps_what_was_learned_of_the_photographs():
 
 
 def test_a_model_without_what_was_learned_of_the_photographs_is_refused():
-    """As a compact file gives it back: it would be trained towards photographs as they are, not as they should be."""
+    """A compact file gives back such a model, which would be trained towards photographs that nothing corrects."""
     scene, model = corrected()
     bare = dataclasses.replace(model, origin=dataclasses.replace(model.origin, corrections={}))
     with pytest.raises(ValueError, match="corrections that training learned, pose and exposure, which a compact file"):
