@@ -254,13 +254,13 @@ def borders_find_room():
         run = StageRun(scene(), own, 0, plain(), session=Session(devices=jax.devices()[:4]))
         (size,) = {view.picture.size for view in run.views}
         run.arguments(1)
-        run.exchanges[size] = dataclasses.replace(
-            run.exchanges[size], border_room=room or run.exchanges[size].border_room
+        run.room.exchanges[size] = dataclasses.replace(
+            run.room.exchanges[size], border_room=room or run.room.exchanges[size].border_room
         )
-        capacity, taken = run.capacities[size], 0
+        capacity, taken = run.room.capacities[size], 0
         while taken < 4:
             taken += len(run.steps(taken + 1, 4))
-        assert bool(run.num_regrown) == (room is not None) and run.capacities[size] == capacity
+        assert bool(run.num_regrown) == (room is not None) and run.room.capacities[size] == capacity
         states.append(run.model)
         run.photographs.close()
     for a, b in zip(*map(jax.tree.leaves, states), strict=True):

@@ -80,7 +80,7 @@ def test_a_step_needs_what_xla_says(width, height, num):
     system = a2tg.Gaussians2dMcmc(stage1_iterations=4, densify=a2tg.McmcConfig(cap=num))
     run = StageRun(scene, system, 0, initial_model(scene, system))
     photographs, views = run.photographs.batch(1)
-    settings = StepSettings(run._settings((height, width)), system.background)
+    settings = StepSettings(run.render_settings((height, width)), system.background)
     args = (settings, run.stage, run.clock, run.state, photographs, views, run.scene_scale, run.key)
     lowered = jitted_step()._jitted.lower(classes_of((args, {})), *args)
     said = lowered.compile().memory_analysis()

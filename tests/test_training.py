@@ -207,7 +207,7 @@ def test_overflow_loses_nothing(scene):
     def one_step(capacity):
         run = StageRun(scene, CONFIG, 0, initial_model(scene, CONFIG))
         if capacity is not None:
-            run.capacities[scene.train[0].picture.size] = capacity
+            run.room.capacities[scene.train[0].picture.size] = capacity
         taken = run.steps(1, 1)
         return run, len(taken) or len(run.steps(1, 1))
 

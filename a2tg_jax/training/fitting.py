@@ -15,8 +15,9 @@ from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_depths, check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
-from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, check_resume, never, unwatched
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
+from a2tg_jax.training.resume import check_resume
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import initial_model

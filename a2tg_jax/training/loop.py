@@ -15,16 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.spread_arrays import mesh_of, on_host
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Due, Event, HostEvent, StepEvent
-from a2tg_jax.host.text import shortened
-from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view, room_of_view
-from a2tg_jax.rasterize.exchange import Exchange, spread
-from a2tg_jax.rasterize.image_bands import BorderRoom
+from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -34,6 +29,8 @@ from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diver
 from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
+from a2tg_jax.training.resume import check_resume, warn_of_uneven_rows
+from a2tg_jax.training.room import Size, StageRoom
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import padded
 from a2tg_jax.training.step import (
@@ -52,13 +49,6 @@ from a2tg_jax.training.step import (
 LAUNCHED = 10
 """Number of steps between two waits for the device; fewer if their photographs take too much memory."""
 LOG_EVERY = 10
-MOST_TOLD = 300
-"""Largest number of characters of the options that differ from a checkpoint's."""
-PLANNED_VIEWS = 64
-GROWTH_ROOM = 1.5
-"""Room in the lists of a stage, as a multiple of the pairs of the first image."""
-SURELY_FITTING = 0.999
-"""Share of the capacity that surely holds pairs whose number is rounded."""
 
 OnCheckpoint = Callable[[Checkpoint], None]
 OnLog = Callable[[Mapping[str, float]], object]
@@ -154,8 +144,7 @@ class StageRun:
             small_budget=system.small_budget,
         )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
-        self.capacities: dict[tuple[int, int], int] = {}
-        self.exchanges: dict[tuple[int, int], Exchange] = {}
+        self.room = StageRoom(self.stage, self.views, system.tile_size, self.exchange, self.session)
         self.on_log: OnLog | None = None
         """Called with each row of the history."""
         self.started = time.perf_counter()
@@ -289,11 +278,15 @@ class StageRun:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
         due = self._due(iteration) if are_events_decided_by_host() else None
-        settings = StepSettings(self._settings(self._size(iteration)), self.system.background, due)
+        settings = StepSettings(self.render_settings(self._size(iteration)), self.system.background, due)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
         if self.exchange is not None:  # Else XLA may choose a sharding for them that JAX cannot name.
             views, rows = jax.tree.map(functools.partial(everywhere, self.exchange), (views, rows))
         return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
+
+    def render_settings(self, size: Size) -> RenderSettings:
+        """Return the settings of a step with views of a size, whose room is planned before the first of them."""
+        return self.room.settings(size, self.state.model)
 
     def _due(self, iteration: int) -> tuple[bool, ...]:
         """Return whether each event follows this iteration inside its step."""
@@ -309,7 +302,7 @@ class StageRun:
             self.session.after_compiling()
         return info
 
-    def _size(self, iteration: int) -> tuple[int, int]:
+    def _size(self, iteration: int) -> Size:
         return self.views[self.order.indices(iteration)[0]].picture.size
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
@@ -318,7 +311,7 @@ class StageRun:
         self.state = dataclasses.replace(self.state, status=fine)
         if info.status == OVERFLOW:
             self.num_regrown += 1
-            return self._make_room(self._size(iteration), float(info.num_pairs))
+            return self.room.widen(self._size(iteration), self.state.model, float(info.num_pairs))
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
             raise self._diverged(iteration, where, info)
@@ -328,16 +321,6 @@ class StageRun:
             f"training cannot go on {where}: {reasons}; check the cameras and points of the scene, or lower "
             "rates.logit_opacities"
         )
-
-    def _make_room(self, size: tuple[int, int], num_pairs: float) -> None:
-        """Make room for the pairs of views of a size or, if there was enough, for the borders between bands."""
-        exchange = self.exchanges.get(size)
-        if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
-            self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
-        else:
-            room = exchange.border_room.wider()
-            covers_image = min(room) >= size[0] + self.system.tile_size
-            self.exchanges[size] = dataclasses.replace(exchange, border_room=None if covers_image else room)
 
     def _diverged(self, iteration: int, where: str, info: StepInfo) -> DivergedError:
         """Return the error that names the values that are not finite or too large."""
@@ -402,74 +385,3 @@ class StageRun:
         events = list(self.state.events)
         events[place] = gathered
         self.state = dataclasses.replace(self.state, events=tuple(events))
-
-    def _settings(self, size: tuple[int, int]) -> RenderSettings:
-        """Render settings with the capacity for views of a size, planned before the first of them."""
-        settings = RenderSettings(tile_size=self.system.tile_size)
-        if size not in self.capacities:
-            views = [view for view in self.views if view.picture.size == size]
-            model, dtype = self.state.model, self.scene_scale.dtype
-            sample = views[:: -(-len(views) // PLANNED_VIEWS)]
-            cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
-            rule = model.rule
-            pairs = max(pairs_of_view(model.gaussians, camera, rule, settings, model.num_live) for camera in cameras)
-            growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
-            self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
-            if self.exchange is not None:
-                self.exchanges[size] = self._planned_exchange(self.exchange, cameras, self.capacities[size])
-        return dataclasses.replace(settings, capacity=self.capacities[size], exchange=self.exchanges.get(size))
-
-    def _planned_exchange(self, exchange: Exchange, cameras: list[Camera], capacity: int) -> Exchange:
-        """Return the exchange with room for the rows that travel in some views once all rows exist, and for the borders
-        between bands."""
-        model, rows = self.state.model, -(-self.state.model.gaussians.num // exchange.num)
-        settings, rule = RenderSettings(tile_size=self.system.tile_size, exchange=exchange), model.rule
-        found = [room_of_view(model.gaussians, one, rule, settings, model.num_live) for one in cameras]
-        most = max(own.rows for own in found)
-        share = min(1.0, GROWTH_ROOM * max(1, most) / max(1, min(model.num, rows)))
-        above, below = (max(own) for own in zip(*(each.borders for each in found), strict=True))
-        room = BorderRoom(*(int(GROWTH_ROOM * own) + settings.tile_size for own in (above, below)))
-        return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity, border_room=room)
-
-    def _capacity(self, size: tuple[int, int], pairs: float) -> int:
-        """Return a capacity for so many pairs in views of a size, one that the session knows if possible."""
-        stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
-        return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
-
-
-def check_resume(resume: Checkpoint, system: System, index: int) -> None:
-    """Raise ValueError unless the checkpoint is of that stage of that system."""
-    if resume.stage != index:
-        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
-    if resume.system != system:
-        raise ValueError(
-            f"the checkpoint was made with another configuration ({_differing(resume.system, system)}): resume with "
-            "checkpoint.system"
-        )
-    found, wanted = resume.state.model.gaussians.sh_degree, system.initial_sh_degree
-    if found != wanted:
-        raise ValueError(
-            f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
-            "version, so train anew"
-        )
-
-
-def warn_of_uneven_rows(resume: Checkpoint, num_devices: int) -> None:
-    """Warn if the rows of a checkpoint cannot be spread evenly over so many devices, which costs memory."""
-    rows = resume.state.model.gaussians.num
-    if rows % num_devices:
-        fitting = [number for number in range(1, num_devices) if rows % number == 0]
-        warnings.warn(
-            f"the checkpoint has {rows:,} rows, which {num_devices} devices cannot share evenly: each holds all of "
-            f"them until the stage ends; {' or '.join(map(str, fitting))} could share them",
-            stacklevel=2,
-        )
-
-
-def _differing(before: System, now: System) -> str:
-    """Return the options in which two systems differ, in a few words."""
-    if type(before) is not type(now):
-        return f"{type(before).__name__}, not {type(now).__name__}"
-    values, others = flatten_config(before), flatten_config(now)
-    pairs = ((name, value, others[name]) for name, value in values.items() if value != others[name])
-    return shortened(", ".join(f"{name} {value!r}, not {other!r}" for name, value, other in pairs), MOST_TOLD)
