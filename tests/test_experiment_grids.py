@@ -1,0 +1,307 @@
+"""Grids of experiments name the runs that they should, with keys of what decides a result."""
+
+import dataclasses
+import itertools
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+from experiment_records import CELL, record, result
+from lab import tables
+from lab.cli import EXPERIMENTS, Lab, argument_parser
+from lab.figures import figures_table
+from lab.grid import GRIDS, Method, has_scale, read_grid, splats_in
+from lab.jobs import Folders
+from lab.scenes import SceneAt, own_scene
+from run import chosen, experiments, main, parse_arguments
+
+import a2tg_jax as a2tg
+from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.results.plan import fingerprint
+from a2tg_jax.training.terms import Term
+
+NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
+SCALES = ("full", "small", "smoke")
+LONG = sorted(name for name in NAMES if has_scale(name, "long"))
+"""Grids of the paper's length on small photographs."""
+
+
+@pytest.mark.parametrize(("name", "scale"), [*itertools.product(NAMES, SCALES), *((name, "long") for name in LONG)])
+def test_every_grid_names_runs_that_can_be_trained(name, scale):
+    grid = read_grid(name, scale)
+    first = {job.key: job for job in grid.jobs({})}
+    assert grid.cells and first
+    for job in first.values():
+        job.system.check()
+    finished = {key: record(mb=job.system.densify.cap * 290e-6) for key, job in first.items()}
+    runs = list(grid.runs(finished))
+    places = [(run.cell, run.method.label, run.is_at_equal_bytes) for run in runs]
+    methods = dict.fromkeys((grid.reference, *grid.methods))
+    at_equal_number = sum((method.most or 10**9) >= cell.gaussians for cell in grid.cells for method in methods)
+    assert len(set(places)) == len(places) == at_equal_number + len(grid.cells) * len(grid.at_equal_bytes)
+
+
+def test_choices_are_made_on_validation_views(tmp_path):
+    """No run for choosing holds test views, nor is it taken for a run that does, and its pages say so."""
+    final = next(read_grid("claim", "smoke").jobs({}))
+    choosing = next(read_grid("claim", "smoke", validation=True).jobs({}))
+    assert choosing == dataclasses.replace(final, validation=True) and choosing.key != final.key
+    assert choosing.start is None or choosing.start.validation
+    folders = Folders(tmp_path, tmp_path)
+    whole, scene = folders.load_scene(final), folders.load_scene(choosing)
+    assert [view.name for view in scene.test] == [view.name for view in whole.train[::8]]
+    assert {view.name for view in (*scene.train, *scene.test)} == {view.name for view in whole.train}
+    lab = Lab(argument_parser("").parse_args(["--scale", "smoke", "--validation", "--out", str(tmp_path)]))
+    assert lab.grid("claim").validation
+    lab.write("page", "# Title\n")
+    assert "validation views" in (tmp_path / "page.md").read_text()
+    named = Lab(argument_parser("").parse_args(["--scale", "smoke", "--validation", "--tables-only"]))
+    assert named.out.name == "smoke-validation"
+
+
+def test_every_grid_belongs_to_an_experiment_that_says_what_it_shows():
+    known = experiments()
+    assert {name for experiment in known.values() for name in experiment.grids} == set(NAMES)
+    assert all(experiment.summary.endswith(".") for experiment in known.values())
+
+
+def test_methods_of_a_cell_differ_in_what_their_names_say_only():
+    grid = read_grid("ablation", "small")
+    cell = next(cell for cell in grid.cells if cell.scene.label == "fox")
+    jobs = {run.method.label: run.job for run in grid.runs({}) if run.cell == cell}
+    own, square = (flatten_config(jobs[label].system) for label in ("A²TG", "w/o anisotropy"))
+    assert {name for name in own if own[name] != square[name]} == {"texture.anisotropic"}
+    starts = {jobs[label].start.key for label in ("A²TG", "Textured Gaussians*", "2DGS*-MCMC", "w/o anisotropy")}
+    assert starts == {jobs["2DGS*-MCMC, first stage"].key}, "the first stage is trained once"
+
+
+@pytest.mark.parametrize("mb", [0.9, 1.504544, 20.0])
+@pytest.mark.parametrize("floats", [58, 85, 122, 1081])
+def test_equal_bytes_are_no_more_and_less_by_a_splat_at_most(mb, floats):
+    num = splats_in(mb, Method("any", "any", floats=floats))
+    assert num * floats * 4 <= mb * 1e6 + 0.5 < (num + 1) * floats * 4 + 1
+
+
+def test_a_method_whose_gaussians_differ_in_size_fills_the_bytes_of_the_reference_as_its_budget():
+    grid = read_grid("fixed_memory", "long", scenes=["fox"])
+    finished = {grid.reference_job(grid.cells[0]).key: record(mb=0.7123)}
+    (run,) = (run for run in grid.runs(finished) if run.method.label == "Bytewise, Gaussian kernels")
+    assert run.is_at_equal_bytes and run.job.system.memory_budget == 0.7123
+    assert run.cell.budget is None, "it stays in the cell of the others"
+
+
+def test_a_rehearsal_runs_every_method_once_and_keeps_to_itself():
+    whole, short = read_grid("fixed_memory", "full"), read_grid("fixed_memory", "full", rehearsal=True)
+    (cell,) = short.cells
+    assert cell == dataclasses.replace(whole.cells[0], iterations=(300, 300))
+    assert short.methods == whole.methods and short.at_equal_bytes == whole.at_equal_bytes
+    lab = Lab(argument_parser("").parse_args(["--scale", "full", "--rehearsal", "--tables-only"]))
+    assert lab.out.parts[-3:] == ("runs", "results", "full-rehearsal") and len(lab.grid("claim").cells) == 1
+
+
+def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
+    known = experiments()
+    names = {found.name for found in chosen(known, parse_arguments(known, ["all", "--scale", "long"]))}
+    assert {"fixed_memory", "ablation"} <= names < set(known)
+    assert len(chosen(known, parse_arguments(known, ["all"]))) == len(known)
+
+
+def test_scenes_are_chosen_and_held_out():
+    labels = lambda **wanted: {cell.scene.label for cell in read_grid("claim", "small", **wanted).cells}  # noqa: E731
+    assert labels() == {"fox", "herz_jesus_p25", "lego", "snowmiku"}
+    assert labels(held_out=False) == labels() - {"snowmiku"}
+    assert labels(scenes=["lego"]) == {"lego"}
+    assert labels(scenes=["built-in"]) == {"built-in"}, "what is asked for comes before what a grid has"
+    assert "snowmiku" not in {cell.scene.label for cell in read_grid("defaults", "small").cells}
+    with pytest.raises(ValueError, match="no scene 'dog' at this scale; there are"):
+        labels(scenes=["dog"])
+
+
+def test_scenes_of_ones_own_take_the_place_of_the_scales(tmp_path):
+    (tmp_path / "garden").mkdir()
+    own = own_scene(tmp_path / "garden", 4)
+    grid = read_grid("claim", "small", own=(own,))
+    assert {cell.scene for cell in grid.cells} == {SceneAt("garden", (tmp_path / "garden").as_posix(), 4)}
+    assert Folders(pathlib.Path("scenes"), tmp_path).scenes / own.path == tmp_path / "garden"
+    lab = Lab(argument_parser("").parse_args(["--scene", str(tmp_path / "garden"), "--out", str(tmp_path / "out")]))
+    assert lab.is_partial and {cell.scene.label for cell in lab.grid("claim").cells} == {"garden"}
+    with pytest.raises(ValueError, match="no scene folder"):
+        own_scene(tmp_path / "nowhere", 1)
+    with pytest.raises(ValueError, match="at least 1"):
+        own_scene(tmp_path / "garden", 0)
+
+
+OWN_GRID = """
+title = "Mine"
+table = "gains"
+reference = "bytewise"
+methods = ["2DGS*-MCMC"]
+
+[variants]
+"bytewise" = { system = "bytewise" }
+
+[small]
+budgets = [0.3]
+
+[small.scenes]
+"mine" = { path = "captures/garden", downscale = 4, options.background = "white" }
+"""
+
+
+def own_grid(tmp_path, text=OWN_GRID):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
+    grid = read_grid(own_grid(tmp_path), "small")
+    (cell,) = grid.cells
+    options = {"background": "white"}
+    place = (tmp_path / "captures" / "garden").resolve().as_posix()
+    assert (grid.name, grid.table, cell.scene) == ("mine", "gains", SceneAt("mine", place, 4, options=options))
+    job = next(grid.jobs({}))
+    assert job.system.background == "white" and job.key.startswith("garden-4-")
+    assert [method.label for method in grid.methods] == ["2DGS*-MCMC"], "a reference among the variants is one method"
+
+
+@pytest.mark.parametrize(
+    "before, after, words",
+    [
+        ("gains", "gain", "table must be one of quality, gains, choices"),
+        ("2DGS*-MCMC", "2DGS-MCMC", r"no method '2DGS-MCMC'; did you mean 2DGS\*-MCMC"),
+        ("budgets", "budget", "needs gaussians or budgets"),
+        ("path =", "folder =", "'folder', which is none of path"),
+        ("downscale = 4", "downscale = 0.5", "must be at least 1; got 0.5"),
+        ("[small]", "[full]", r"no table of --scale small, \[small\]; it has \[full\]"),
+        ("title = ", "titel = ", "no entry 'title'"),
+        ("system = ", "sytem = ", "'sytem', which is none of like, system"),
+        ('system = "bytewise"', 'like = "A2TG"', "like 'A2TG', which is no method"),
+        ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
+    ],
+)
+def test_mistakes_in_a_grid_file_are_told(tmp_path, before, after, words):
+    text = OWN_GRID.replace(before, after)
+    if before == "[small]":
+        text = text.replace("[small.scenes]", "[full.scenes]")
+    with pytest.raises(ValueError, match=words):
+        read_grid(own_grid(tmp_path, text), "small")
+
+
+def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
+    cell = dataclasses.replace(CELL, gaussians=0, budget=0.3)
+    runs = [result("own", 21.0), result("other", 20.0)]
+    runs = [tables.Result(dataclasses.replace(one.run, cell=cell), one.record) for one in runs]
+    assert "1,000 (5.00 a pixel)" in tables.gains_table(runs, "own", ["other"])
+    assert "| other | 1,000 | 1.00 | 20.00 / .800 / .200 | 21.00 | 1 |" in figures_table(runs)
+    larger = dataclasses.replace(cell, budget=0.6)
+    richer = [tables.Result(dataclasses.replace(one.run, cell=larger), one.record) for one in runs]
+    assert "fox, 0.3 MB: dB · LPIPS | fox, 0.6 MB" in tables.choices_table([*runs, *richer], "own")
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["clam"], "no experiment 'clam'; did you mean claim?"),
+        (["claim", "--scale", "smal"], "no --scale smal; did you mean small?"),
+        (["claim", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
+        (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
+        (["claim", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
+    ],
+)
+def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--out", str(tmp_path), "--work", str(tmp_path)])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and words in told and told.count("\n") == 1
+
+
+def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
+    path = tmp_path / "claim.toml"
+    path.write_text(OWN_GRID, encoding="utf-8")
+    with pytest.raises(SystemExit):
+        main([str(path)])
+    assert "rename the file" in capsys.readouterr().err
+
+
+def test_experiments_and_grid_files_are_not_mixed_in_one_folder(tmp_path, capsys):
+    given = ["claim", own_grid(tmp_path), "--tables-only", "--work", str(tmp_path / "work")]
+    with pytest.raises(SystemExit) as ended:
+        main(given)
+    assert ended.value.code == 2 and "call them one after another" in capsys.readouterr().err
+    assert len(chosen(experiments(), parse_arguments(experiments(), [*given, "--out", str(tmp_path)]))) == 2
+
+
+def test_smoke_and_grid_files_leave_the_committed_results_alone(tmp_path):
+    args = parse_arguments(experiments(), [own_grid(tmp_path), "--work", str(tmp_path)])
+    assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "small"
+    args = parse_arguments(experiments(), ["claim", "--scale", "smoke", "--work", str(tmp_path)])
+    assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "smoke"
+
+
+def test_a_scale_may_have_fewer_methods():
+    small, smoke = (read_grid("defaults", scale) for scale in ("small", "smoke"))
+    assert len(small.methods) > 10 and [method.label for method in smoke.methods] == small_ends(small.methods)
+
+
+def small_ends(methods):
+    """The first and the last label."""
+    return [methods[0].label, methods[-1].label]
+
+
+def test_the_grid_of_the_documentation_can_be_read(tmp_path):
+    page = (EXPERIMENTS.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    grid = read_grid(own_grid(tmp_path, text), "small")
+    assert (len(grid.cells), grid.table, grid.cells[0].scene.path) == (1, "choices", "synthetic")
+    rates = [run.job.system.texture.rate for run in grid.runs({})]
+    assert rates == [a2tg.A2tg.preset("quick").texture.rate, 2.5e-3, 5e-3]
+
+
+def test_the_smoke_scale_has_few_runs():
+    """It takes minutes on two cores, where each run is mostly compilation."""
+    jobs: set[str] = set()
+    for name in NAMES:
+        for job in read_grid(name, "smoke").jobs({}):
+            jobs |= {job.key, *([job.start.key] if job.start else [])}
+    assert len(jobs) <= 24
+
+
+def test_a_fingerprint_is_of_what_decides_the_result():
+    quick = a2tg.A2tg.preset("quick")
+    other = dataclasses.replace(quick, texture=dataclasses.replace(quick.texture, fraction=0.5))
+    assert fingerprint(quick, 0) == fingerprint(other, 0), "textures come later"
+    assert fingerprint(quick, 1) != fingerprint(other, 1)
+    assert fingerprint(quick, 0) == fingerprint(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), 0)
+    assert fingerprint(quick, 0) != fingerprint(dataclasses.replace(quick, seed=1), 0)
+    code = (
+        "import a2tg_jax as a; from a2tg_jax.results.plan import fingerprint as f; print(f(a.A2tg.preset('quick'), 1))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told.strip() == fingerprint(quick, 1), "another process says the same"
+
+
+KEYS = """
+import sys
+sys.path.insert(0, {folder!r})
+from lab.grid import read_grid
+print(*[job.key for name in {names} for job in read_grid(name, "small").jobs({{}})])
+"""
+
+
+def test_keys_are_the_same_in_every_process():
+    script = KEYS.format(folder=str(EXPERIMENTS), names=NAMES)
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert told == [job.key for name in NAMES for job in read_grid(name, "small").jobs({})]
+
+
+def test_functions_without_a_name_have_no_fingerprint():
+    class Nameless(a2tg.A2tg):
+        def stages(self):
+            first, second = super().stages()
+            return dataclasses.replace(first, losses=(Term(lambda *_: 0.0),)), second
+
+    with pytest.raises(ValueError, match="make it a function of a module"):
+        fingerprint(Nameless(), 0)
