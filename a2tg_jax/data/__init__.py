@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from a2tg_jax.data.scene import counted_pixels as counted_pixels
     from a2tg_jax.data.scene import view_image as view_image
     from a2tg_jax.data.scene import views_by_kind as views_by_kind
-    from a2tg_jax.data.scene import with_validation_views as with_validation_views
     from a2tg_jax.data.sfm import SfmSummary as SfmSummary
     from a2tg_jax.data.sfm import run_sfm as run_sfm
+    from a2tg_jax.data.splits import with_validation_views as with_validation_views
     from a2tg_jax.data.synthetic import synthetic_scene as synthetic_scene
 
 _NAMES = {
@@ -26,8 +26,9 @@ _NAMES = {
     "a2tg_jax.data.load": ("load_scene",),
     "a2tg_jax.data.masks": ("Mask",),
     "a2tg_jax.data.photo_store": ("Picture",),
-    "a2tg_jax.data.scene": ("Scene", "View", "counted_pixels", "view_image", "views_by_kind", "with_validation_views"),
+    "a2tg_jax.data.scene": ("Scene", "View", "counted_pixels", "view_image", "views_by_kind"),
     "a2tg_jax.data.sfm": ("SfmSummary", "run_sfm"),
+    "a2tg_jax.data.splits": ("with_validation_views",),
     "a2tg_jax.data.synthetic": ("synthetic_scene",),
 }
 """Module of each public name; the imports above repeat them for type checkers."""

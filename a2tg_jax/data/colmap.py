@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.similarity import camera_centers
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.colmap_binary import RECORDS, check_binary
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.colmap_text import check_text
@@ -23,7 +24,8 @@ from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
-from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, rigid_viewmat, scene_name
+from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.regular_files import is_folder, is_regular, open_regular
 from a2tg_jax.host.remote_files import is_remote
 

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
 from a2tg_jax.data.division import Division, divided_masks
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.photo_store import Picture, Shelf
-from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, every_kth, scene_name
+from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.splits import every_kth
 from a2tg_jax.data.transforms import check_meta, read_shots
 from a2tg_jax.host.text import shortened
 

@@ -16,7 +16,8 @@ from a2tg_jax.data.photo_folder import check_no_video, holds_photos
 from a2tg_jax.data.polycam import polycam_folders, polycam_frames
 from a2tg_jax.data.realityscan import realityscan_files, realityscan_frames
 from a2tg_jax.data.record3d import record3d_file, record3d_frames
-from a2tg_jax.data.scene import Scene, check_test_every, warn_of_lenses
+from a2tg_jax.data.scene import Scene, warn_of_lenses
+from a2tg_jax.data.splits import check_test_every
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.regular_files import is_regular

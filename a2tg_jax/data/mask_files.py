@@ -8,12 +8,13 @@ from typing import Literal
 
 import numpy as np
 
+from a2tg_jax.data.assembly import Shot
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.division import Division, divided_masks
 from a2tg_jax.data.images import resize_pixels
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.scene import Scene, Shot, View
+from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.regular_files import is_folder, is_regular
 
 FOLDER = "masks"

@@ -6,8 +6,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, read_vertex_header
-from a2tg_jax.data.scene import PointCloud
 from a2tg_jax.host.regular_files import is_regular, open_regular
 
 COLORS = ("red", "green", "blue")

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import binary_dilation, label
 
+from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import read_depth, read_pixels
 from a2tg_jax.data.frames import Frames, warn_of_missing_images
 from a2tg_jax.data.images import map_in_threads, named_image
-from a2tg_jax.data.scene import PointCloud
 from a2tg_jax.host.json_text import read_object
 from a2tg_jax.host.regular_files import is_regular
 

@@ -10,9 +10,11 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
 from a2tg_jax.data.lighting import light
 from a2tg_jax.data.photo_store import Picture
-from a2tg_jax.data.scene import PointCloud, Scene, Shot, assemble_scene, check_test_every, every_kth
+from a2tg_jax.data.scene import Scene
+from a2tg_jax.data.splits import check_test_every, every_kth
 from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
 
 TARGET = np.array([0.0, 0.1, 0.45])

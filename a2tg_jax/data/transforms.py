@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, random_points, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
@@ -22,16 +23,8 @@ from a2tg_jax.data.mask_files import check_masks, find_mask, named_mask
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
-from a2tg_jax.data.scene import (
-    PointCloud,
-    Scene,
-    Shot,
-    assemble_scene,
-    every_kth,
-    random_points,
-    rigid_viewmat,
-    scene_name,
-)
+from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened

@@ -4,8 +4,9 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import intrinsics, looking
+from a2tg_jax.data.assembly import Shot, assemble_scene
 from a2tg_jax.data.lighting import light
-from a2tg_jax.data.scene import Shot, assemble_scene, every_kth
+from a2tg_jax.data.splits import every_kth
 from a2tg_jax.data.surfaces import Surface, trace
 from a2tg_jax.data.synthetic import DISTANCE, DOWN, FIELD_OF_VIEW, SAMPLE_OFFSETS, TARGET, sample_points, still_life
 
