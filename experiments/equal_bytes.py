@@ -76,6 +76,14 @@ def told_gain(results: Sequence[tables.Result], label: str, other: str) -> str:
     return f"{tables.over_scenes(psnr).told(2)} · {distance} ({len(psnr)})"
 
 
+def on_scene(results: Sequence[tables.Result], scene: str, label: str, other: str) -> str:
+    """Return the gains of a method over another on one scene, in dB and in LPIPS."""
+    psnr, lpips = (tables.gains_by_scene(results, label, other, figure) for figure in ("psnr", "lpips"))
+    if scene not in psnr:
+        return tables.MISSING
+    return f"{tables.signed(psnr[scene], 2)} · {tables.signed(lpips[scene], 3)}"
+
+
 def panels(results: Sequence[tables.Result]) -> list:
     """Return curves of PSNR and LPIPS against bytes: means over the scenes, if a method was trained on all of them."""
     scenes = {result.run.cell.scene for result in results}

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from equal_bytes import GRIDS, at_budget, told_gain, unique
+from equal_bytes import GRIDS, at_budget, on_scene, told_gain, unique
 from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
@@ -44,7 +44,7 @@ def bytes_table(results: Sequence[tables.Result]) -> str:
     found = [at_budget(results, budget) for budget in budgets]
     scenes, rows = sorted({result.run.cell.scene.label for result in results}), []
     for scene in scenes:
-        rows.append([f"{BYTEWISE} less {BEST}: {scene}", *(_on(own, scene) for own in found)])
+        rows.append([f"{BYTEWISE} less {BEST}: {scene}", *(on_scene(own, scene, BYTEWISE, BEST) for own in found)])
     for told, (label, other) in OTHERS.items():
         means = [told_gain(own, label, other).removesuffix(f" ({len(scenes)})") for own in found]
         rows.append([f"**{told}: mean**", *means])
@@ -61,14 +61,6 @@ def best_plain(results: Sequence[tables.Result]) -> list[tables.Result]:
             method = dataclasses.replace(highest.run.method, label=BEST)
             best.append(dataclasses.replace(highest, run=dataclasses.replace(highest.run, method=method)))
     return best
-
-
-def _on(results: Sequence[tables.Result], scene: str) -> str:
-    """Return the gains over the best plain method on one scene."""
-    psnr, lpips = (tables.gains_by_scene(results, BYTEWISE, BEST, figure) for figure in ("psnr", "lpips"))
-    if scene not in psnr:
-        return tables.MISSING
-    return f"{tables.signed(psnr[scene], 2)} · {tables.signed(lpips[scene], 3)}"
 
 
 def textures_table(budgets: Sequence[tables.Result], claim: Sequence[tables.Result]) -> str:
