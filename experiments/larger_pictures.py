@@ -1,4 +1,4 @@
-"""Gains at equal bytes in larger photographs beside smaller ones: do textures pay where Gaussians cover more pixels?"""
+"""Gains at equal bytes in larger photographs beside smaller ones, where a Gaussian covers more pixels."""
 
 from collections.abc import Sequence
 
