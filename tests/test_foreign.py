@@ -124,12 +124,22 @@ call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))
 run = jax.jit(hundred)
 run(jnp.zeros(3)).block_until_ready()
 x = jnp.ones(3) + 0 * (jnp.ones((1500, 1500)) @ jnp.ones((1500, 1500)))[0, :3]
-threading.Thread(target=lambda: run(x).block_until_ready(), daemon=True).start()
-begun.wait()
+{waiting}
 raise SystemExit(3)
 """
 
 
-def test_a_program_ends_well_while_functions_run_and_are_still_to_run():
-    done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False, timeout=60)
+@pytest.mark.parametrize(
+    "waiting",
+    [
+        "threading.Thread(target=lambda: run(x).block_until_ready(), daemon=True).start(); begun.wait()",
+        """for power in range(1, 9):
+    y = jnp.linalg.matrix_power(jnp.ones((1000, 1000)), 2**power)
+    threading.Thread(target=y.block_until_ready, daemon=True).start()""",
+    ],
+    ids=["for functions that run and are still to run", "for XLA"],
+)
+def test_a_program_ends_well_while_threads_wait(waiting):
+    script = ENDING.replace("{waiting}", waiting)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 3, done.stderr

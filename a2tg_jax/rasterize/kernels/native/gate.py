@@ -2,14 +2,18 @@
 
 XLA may still compute on its own threads when a program ends. A thread that then asks for Python's GIL never gets it:
 the program crashes or hangs. So these threads pass a gate in native code, which closes at the end. Threads that come
-later return with an error; the gate waits for those inside.
+later return with an error; the gate waits for those inside. The same holds for daemon threads of Python that wait for
+arrays in native code: the program ends once XLA has computed what they wait for, or met the error.
 """
 
 import atexit
+import contextlib
 import ctypes
 import os
+import threading
 import time
 
+import jax
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import llvm_modules
@@ -17,6 +21,8 @@ from a2tg_jax.rasterize.kernels.native.lanes import INT
 from a2tg_jax.rasterize.kernels.native.writer import LONG, POINTER
 
 SIGNATURE = ir.FunctionType(POINTER, [POINTER])
+SECONDS_TO_RETURN = 0.1
+"""Time for daemon threads to return from native code to Python, where the end of the program is harmless."""
 _num_inside, _is_closed = ctypes.c_int32(0), ctypes.c_int32(0)
 
 
@@ -69,10 +75,21 @@ if hasattr(os, "register_at_fork"):
 
 @atexit.register
 def _close() -> None:
-    """Close the gate and wait until no thread is inside."""
-    _is_closed.value = 1
-    while _num_inside.value:
-        time.sleep(1e-3)
+    """Close the gate, and wait until no thread is inside and none waits for arrays."""
     # The gate is used as long as the process lives, so that its parts must outlive Python's shutdown.
     for kept in (_num_inside, _is_closed, llvm_modules._engine()):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+    _is_closed.value = 1
+    while _num_inside.value:
+        time.sleep(1e-3)
+    if threading.active_count() > 1:
+        _wait_for_arrays()
+
+
+def _wait_for_arrays() -> None:
+    """Wait until all arrays on the CPU are computed or have failed, and other threads have had time to see it."""
+    with contextlib.suppress(RuntimeError):  # no CPU among JAX's platforms
+        for array in jax.live_arrays("cpu"):
+            with contextlib.suppress(RuntimeError):
+                array.block_until_ready()
+    time.sleep(SECONDS_TO_RETURN)
