@@ -69,6 +69,7 @@ def textures_table(budgets: Sequence[tables.Result], claim: Sequence[tables.Resu
     rows = [
         _row("`a2tg` of `quick` less MCMC, bytes of `a2tg`", claim, TEXTURED, PLAIN + equal),
         _row("`a2tg` of `quick` less MCMC, given budgets", budgets, TEXTURED, PLAIN),
+        _row("`a2tg` of `quick` less MCMC of degree 0, given budgets", budgets, TEXTURED, PLAIN_METHODS[0]),
         _row("`a2tg` of the paper less MCMC, bytes of `a2tg`", claim, "A²TG", PLAIN + equal),
         _row("`a2tg` of `quick` less textures of one size, its bytes", claim, TEXTURED, "Textured Gaussians*" + equal),
     ]

@@ -14,7 +14,7 @@ from a2tg_jax.training import Stage, System
 PACKAGE = "a2tg_jax"
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""
-STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "floaters")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "floaters", "jitter")
 """Options of every system that reach training only through its stages."""
 
 

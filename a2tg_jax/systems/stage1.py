@@ -157,6 +157,7 @@ def growing_stage(
         iterations=iterations,
         params_rate=params_rate,
         corrections=system.corrections_of(0),
+        jitter=system.jitter,
         raises_sh_degree=True,
     )
 

@@ -53,6 +53,9 @@ class System:
     """Seed of all random numbers."""
     tile_size: int = 8
     """Side of a tile in pixels. Results do not depend on it."""
+    jitter: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
+    """Standard deviation of random displacements of the Gaussians in each step of the first stage, as a share of their
+    sizes, such as 0.1, against overfitting; 0: none."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     exposure: bool = False
@@ -227,6 +230,11 @@ class System:
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
+        if self.jitter and not any(stage.jitter for stage in stages):
+            raise ValueError(
+                f"jitter is {self.jitter}, but no stage of {type(self).__name__} displaces Gaussians: compose its "
+                "stages with jitter=self.jitter"
+            )
         if self.floaters.is_asked and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
             raise ValueError(
                 f"floaters are to be pruned, but no stage of {type(self).__name__} does so: give its first stage the "
@@ -323,6 +331,7 @@ RANGES = {
     "sh_degree": (0, 3),
     "seed": (0, 2**31 - 1),
     "tile_size": (1, MAX_TILE_SIZE),
+    "jitter": (0, 1),
     "loss.ssim_weight": (0, 1),
     "loss.robust_share": (0, 1),
     "rates.means_by_size": (0, 1),

@@ -12,7 +12,7 @@ from jax import Array
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
+from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -57,6 +57,9 @@ class Stage:
     """Learning rate of the appearance: a number, or the argument of `Appearance.rates`."""
     corrections: tuple[Correction, ...] = ()
     """Corrections of each training view, such as exposures and poses."""
+    jitter: float = static(default=0.0, is_addition=True)
+    """Standard deviation of the random displacements of the Gaussians in each step, as a share of their sizes
+    (`training.jitter`); 0: none."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
     """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
 

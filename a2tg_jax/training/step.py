@@ -27,6 +27,7 @@ from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batch_gradients import BatchGradients, batch_gradients, drawn_backgrounds
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import CorrectionState, corrected_camera, initial_corrections, rows_of, updated
+from a2tg_jax.training.jitter import jittered
 from a2tg_jax.training.stage import Background, Clock, Stage
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
@@ -157,7 +158,8 @@ def attempt(
     """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
-    keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
+    own_key = jax.random.fold_in(key, iteration)
+    keys = jax.random.split(own_key, 1 + num_keys)
     dtype = state.model.gaussians.means.dtype
     batch = photographs.of(views)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
@@ -165,9 +167,10 @@ def attempt(
     backgrounds = drawn_backgrounds(keys[0], settings.background, batch.viewmats.shape[0], dtype)
     own = rows_of(state.corrections, rows)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    found = batch_gradients(
-        settings.render, stage, clock, state.model, batch, backgrounds, iteration, own, is_gathering
-    )
+    shown = state.model
+    if stage.jitter:
+        shown = dataclasses.replace(shown, gaussians=jittered(own_key, shown.gaussians, stage.jitter))
+    found = batch_gradients(settings.render, stage, clock, shown, batch, backgrounds, iteration, own, is_gathering)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
     progress = clock.progress(state.iteration)
