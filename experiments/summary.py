@@ -10,14 +10,16 @@ from lab.grid import Grid
 from lab.versions import is_from_before
 
 BYTEWISE, TEXTURED, PLAIN = "Bytewise", "A²TG, as quick has it", "2DGS*-MCMC"
-GAUSSIAN = f"{BYTEWISE}, Gaussian kernels"
+STILL, GAUSSIAN = f"{BYTEWISE}, no jitter", f"{BYTEWISE}, Gaussian kernels"
 PLAIN_METHODS = (f"{PLAIN}, degree 0", "2DGS*, degree 0")
 """Plain methods of which a cell must have all before its best one is named."""
 BEST = "the best plain method"
 OTHERS = {
     f"{BYTEWISE} less {BEST}": (BYTEWISE, BEST),
+    f"{STILL}, less {BEST}": (STILL, BEST),
     f"{GAUSSIAN}, less {BEST}": (GAUSSIAN, BEST),
-    f"{BYTEWISE} less the same with Gaussian kernels": (BYTEWISE, GAUSSIAN),
+    f"{BYTEWISE} less the same without jitter": (BYTEWISE, STILL),
+    f"{STILL}, less the same with Gaussian kernels": (STILL, GAUSSIAN),
     f"{BYTEWISE} less MCMC of degree 0": (BYTEWISE, PLAIN_METHODS[0]),
     f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
 }
