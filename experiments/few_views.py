@@ -48,8 +48,8 @@ SMALL_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE: METHODS[REFERENCE],
     "the same with jitter": ("gaussians-2d-mcmc", {**PLAIN, "jitter": 0.1}),
     "bytewise": METHODS["bytewise"],
-    "without jitter": ("bytewise", NO_JITTER),
-    "without jitter, floaters pruned": ("bytewise", {**NO_JITTER, "floaters": {"near_share": 0.7}}),
+    "bytewise without jitter": ("bytewise", NO_JITTER),
+    "the same, floaters pruned": ("bytewise", {**NO_JITTER, "floaters": {"near_share": 0.7}}),
 }
 
 

@@ -31,6 +31,7 @@ from a2tg_jax.data.lighting import light
 from a2tg_jax.data.surfaces import Surface, trace
 from a2tg_jax.data.synthetic import SAMPLE_OFFSETS, camera_path, look_at, still_life
 from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.training.registry import with_changes
 
 SIZE = 208, 156
 """Width and height of the photographs in pixels."""
@@ -101,7 +102,8 @@ def measured(folder: Path, name: str, use: str) -> dict[str, float]:
     if not (folder / "transforms.json").is_file():
         write_scene(folder, name)
     scene, kept = read_scene(folder, use), read_scene(folder, "keep")
-    system = dataclasses.replace(a2tg.find_system("bytewise").preset("quick"), memory_budget=BUDGET)
+    gaussian = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}, "jitter": 0.0}
+    system = with_changes(a2tg.find_system("bytewise").preset("quick"), {**gaussian, "memory_budget": BUDGET}, "lenses")
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     is_cropped = seen_when_undistorted(name)
     masked = [dataclasses.replace(view, mask=is_cropped & counted(view)) for view in kept.test]

@@ -122,12 +122,14 @@ class _Tuning(System):
 
 
 def _tuning(system: System, stage: Stage) -> _Tuning:
-    """Return the options of a system with a stage whose rates fall, and whose corrections stay."""
+    """Return the options of a system with a stage whose rates fall, whose corrections stay, and without jitter."""
     rates = dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means, cooldown=1.0)
     corrections = tuple(map(_Constant, stage.corrections))
-    stage = dataclasses.replace(stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False)
+    stage = dataclasses.replace(
+        stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False, jitter=0.0
+    )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
-    return _Tuning(**shared | {"memory_budget": None}, stage=stage)
+    return _Tuning(**shared | {"memory_budget": None, "jitter": 0.0}, stage=stage)
 
 
 @event

@@ -97,7 +97,7 @@ class Bytewise(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
-    jitter: float = dataclasses.field(default=0.1, metadata={"is_addition": True})
+    jitter: float = 0.1
     """Standard deviation of random displacements of the Gaussians in each step of the first stage, as a share of their
     sizes; 0: none."""
     base_degree: int = 0

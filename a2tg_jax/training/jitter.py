@@ -21,7 +21,7 @@ def jittered(key: Array, gaussians: Gaussians, share: float) -> Gaussians:
     """Return Gaussians with displaced means: μ + share·√(s_x·s_y)·ε, ε standard normal in the world.
 
     Args:
-      key: of the iteration; the stream of numbers is one of its own.
+      key: key of the iteration; `STREAM` is folded in.
       gaussians: N rows.
       share: standard deviation of each coordinate, as a share of the Gaussian's size.
     """

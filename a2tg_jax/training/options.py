@@ -343,12 +343,16 @@ RANGES = {
 def like(kind: type[System] | System, other: System) -> System:
     """Return a system of a kind with the options of another that have the same name and type.
 
+    Systems have defaults of their own for `jitter`, so only another value than the default is handed on.
+
     Args:
       kind: class or instance that gives all other options.
       other: the other system.
     """
-    changed: System = _like(kind() if isinstance(kind, type) else kind, other)
-    return changed
+    start = kind() if isinstance(kind, type) else kind
+    changed: System = _like(start, other)
+    is_default = other.jitter == type(other).jitter
+    return dataclasses.replace(changed, jitter=start.jitter) if is_default else changed
 
 
 def _like(value: Any, other: Any) -> Any:

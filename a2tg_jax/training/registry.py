@@ -1,5 +1,6 @@
 """Systems by name: those of this library, and others as package.module:NAME."""
 
+import dataclasses
 import importlib
 import sys
 from collections.abc import Mapping
@@ -108,8 +109,8 @@ def with_earlier_options(kind: type[System], options: Any) -> Any:
     then. Options given by hand lack others, too, and are returned unchanged."""
     if not isinstance(options, Mapping) or not kind.earlier_options:
         return options
-    values = config_to_dict(kind())
-    groups = {name for name in vars(kind).get("__annotations__", {}) if isinstance(values.get(name), Mapping)}
+    shared = {field.name for field in dataclasses.fields(System)}
+    groups = {name for name, value in config_to_dict(kind()).items() if isinstance(value, Mapping)} - shared
     is_record = groups - kind.earlier_options.keys() <= options.keys()
     return {**kind.earlier_options, **options} if is_record else options
 

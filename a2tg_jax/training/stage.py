@@ -57,11 +57,11 @@ class Stage:
     """Learning rate of the appearance: a number, or the argument of `Appearance.rates`."""
     corrections: tuple[Correction, ...] = ()
     """Corrections of each training view, such as exposures and poses."""
-    jitter: float = static(default=0.0, is_addition=True)
-    """Standard deviation of the random displacements of the Gaussians in each step, as a share of their sizes
-    (`training.jitter`); 0: none."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
     """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
+    jitter: float = static(default=0.0, is_addition=True)
+    """Standard deviation of the random displacements of the Gaussians in each step, as a share of their sizes
+    (`training.jitter`), in 0..1; 0: none. A step is compiled for each value."""
 
     @property
     def statistic(self) -> Statistic | None:
@@ -98,6 +98,8 @@ class Stage:
             raise ValueError(
                 f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
             )
+        if not 0 <= self.jitter <= 1:
+            raise ValueError(f"jitter must lie in 0..1; that of the stage {self.name!r} is {self.jitter}")
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must want one statistic; those of {self.name!r} want {kinds}")
