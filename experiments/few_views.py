@@ -32,24 +32,20 @@ DOWNSCALE, BUDGET = 2, 0.6
 """Size of the photographs, as a divisor, and the memory budget in MB."""
 SMALL_DOWNSCALE, SMALL_BUDGET = 4, 0.15
 NUM_KEPT, NUM_SCORED, NUM_FOLDS = 24, 12, 5
-NO_JITTER: dict[str, Any] = {"jitter": 0.0}
-GAUSSIAN_KERNELS = {**NO_JITTER, "kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
-WITHOUT_DETAILS = {**GAUSSIAN_KERNELS, "view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
-PLAIN = {"sh_degree": 0, "stage2_iterations": 1_000}
+GAUSSIAN_KERNELS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
+WITHOUT_DETAILS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
 REFERENCE = "MCMC, degree 0"
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: ("gaussians-2d-mcmc", PLAIN),
+    REFERENCE: ("gaussians-2d-mcmc", {"sh_degree": 0, "stage2_iterations": 1_000}),
     "bytewise": ("bytewise", {}),
     "bytewise, Gaussian kernels": ("bytewise", GAUSSIAN_KERNELS),
     "bytewise without details": ("bytewise", WITHOUT_DETAILS),
     "the same without pruning": ("bytewise", {**WITHOUT_DETAILS, "prune": {"share": 0.0}}),
 }
 SMALL_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: METHODS[REFERENCE],
-    "the same with jitter": ("gaussians-2d-mcmc", {**PLAIN, "jitter": 0.1}),
-    "bytewise": METHODS["bytewise"],
-    "bytewise without jitter": ("bytewise", NO_JITTER),
-    "the same, floaters pruned": ("bytewise", {**NO_JITTER, "floaters": {"near_share": 0.7}}),
+    **{label: METHODS[label] for label in (REFERENCE, "bytewise")},
+    "floaters pruned": ("bytewise", {"floaters": {"near_share": 0.7}}),
+    "jitter": ("bytewise", {"jitter": 0.1}),
 }
 
 

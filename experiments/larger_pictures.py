@@ -10,8 +10,8 @@ from lab.grid import Grid
 LARGER, SMALLER = "larger_pictures", "equal_bytes"
 COMPARED = (
     ("A²TG, as quick has it", "2DGS*-MCMC"),
-    ("Bytewise, no jitter", "Bytewise, without textures"),
-    ("Bytewise, no jitter", "2DGS*-MCMC, degree 0"),
+    ("Bytewise", "Bytewise, without textures"),
+    ("Bytewise", "2DGS*-MCMC, degree 0"),
 )
 """Methods, each with the one that it is compared with."""
 

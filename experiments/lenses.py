@@ -102,7 +102,7 @@ def measured(folder: Path, name: str, use: str) -> dict[str, float]:
     if not (folder / "transforms.json").is_file():
         write_scene(folder, name)
     scene, kept = read_scene(folder, use), read_scene(folder, "keep")
-    gaussian = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}, "jitter": 0.0}
+    gaussian = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
     system = with_changes(a2tg.find_system("bytewise").preset("quick"), {**gaussian, "memory_budget": BUDGET}, "lenses")
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     is_cropped = seen_when_undistorted(name)

@@ -10,18 +10,16 @@ from lab.grid import Grid
 from lab.versions import is_from_before
 
 BYTEWISE, TEXTURED, PLAIN = "Bytewise", "A²TG, as quick has it", "2DGS*-MCMC"
-STILL, GAUSSIAN = f"{BYTEWISE}, no jitter", f"{BYTEWISE}, Gaussian kernels"
+GAUSSIAN = f"{BYTEWISE}, Gaussian kernels"
 PLAIN_METHODS = (f"{PLAIN}, degree 0", "2DGS*, degree 0")
 """Plain methods of which a cell must have all before its best one is named."""
 BEST = "the best plain method"
 OTHERS = {
-    f"{STILL}, less {BEST}": (STILL, BEST),
     f"{BYTEWISE} less {BEST}": (BYTEWISE, BEST),
-    f"{BYTEWISE} less the same without jitter": (BYTEWISE, STILL),
     f"{GAUSSIAN}, less {BEST}": (GAUSSIAN, BEST),
-    f"{STILL}, less the same with Gaussian kernels": (STILL, GAUSSIAN),
-    f"{STILL}, less MCMC of degree 0": (STILL, PLAIN_METHODS[0]),
-    f"{STILL}, less MCMC of degree 3": (STILL, PLAIN),
+    f"{BYTEWISE} less the same with Gaussian kernels": (BYTEWISE, GAUSSIAN),
+    f"{BYTEWISE} less MCMC of degree 0": (BYTEWISE, PLAIN_METHODS[0]),
+    f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
 }
 """Differences of means: what they are called, and the two methods."""
 LEFT_OUT = "\nRuns from before are left out. A number of scenes in brackets stands where not all were run.\n"
@@ -46,7 +44,7 @@ def bytes_table(results: Sequence[tables.Result]) -> str:
     found = [at_budget(results, budget) for budget in budgets]
     scenes, rows = sorted({result.run.cell.scene.label for result in results}), []
     for scene in scenes:
-        rows.append([f"{STILL}, less {BEST}: {scene}", *(on_scene(own, scene, STILL, BEST) for own in found)])
+        rows.append([f"{BYTEWISE} less {BEST}: {scene}", *(on_scene(own, scene, BYTEWISE, BEST) for own in found)])
     for told, (label, other) in OTHERS.items():
         means = [told_gain(own, label, other).removesuffix(f" ({len(scenes)})") for own in found]
         rows.append([f"**{told}: mean**", *means])

@@ -8,9 +8,10 @@ import pytest
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.densify.view_dependence import AdaptDegrees
+from a2tg_jax.io.config_json import config_to_dict
 from a2tg_jax.results.record import RunFile, compared_system
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.training.registry import system_from_dict, system_to_dict, with_changes
+from a2tg_jax.training.registry import system_from_dict, system_to_dict, with_changes, with_earlier_options
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,17 @@ def test_beside_another_system_it_stays_what_it_is():
     beside = compared_system("bytewise", other, "quick")
     assert beside.initial_sh_degree == 0 and beside.sh_degree == 3
     assert compared_system("gaussians-2d-mcmc", Bytewise.preset("quick"), "quick").initial_sh_degree == 3
+
+
+class Other(Bytewise):
+    """A kind of `Bytewise` without an option of its own."""
+
+
+def test_options_by_hand_of_a_subclass_are_no_record():
+    assert with_earlier_options(Other, {"memory_budget": 1.0}) == {"memory_budget": 1.0}
+    record = config_to_dict(Other())
+    del record["kernel"]
+    assert with_earlier_options(Other, record)["kernel"] == {"rate": 0.0}
 
 
 def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():

@@ -10,14 +10,12 @@ from small_models import some_gaussians
 from toy_system import Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax.io.config_json import config_to_dict
+from a2tg_jax.finish.tuning import _tuning
 from a2tg_jax.results.plan import fingerprint
-from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training import step
 from a2tg_jax.training.jitter import STREAM, jittered
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.options import like
-from a2tg_jax.training.registry import SYSTEMS, find_system, with_changes, with_earlier_options
+from a2tg_jax.training.registry import SYSTEMS, find_system, with_changes
 from a2tg_jax.training.start import initial_model
 
 SMALL = {"initial_gaussians": 60, "densify": a2tg.McmcConfig(cap=60), "stage1_iterations": 8}
@@ -97,6 +95,11 @@ def test_every_system_displaces_in_its_first_stage_only(name):
     assert first.jitter == 0.1 and all(stage.jitter == 0 for stage in others)
 
 
+def test_tuning_for_a_file_has_none():
+    system = a2tg.Gaussians2dMcmc(**SMALL, jitter=0.2)
+    assert _tuning(system, system.stages()[-1]).stages()[0].jitter == 0
+
+
 def test_what_was_trained_without_it_is_the_same_training():
     none, some = (with_changes(find_system("gaussians-2d-mcmc"), {"jitter": share}, "test") for share in (0.0, 0.1))
     assert "jitter" not in fingerprint(none, 0)
@@ -110,29 +113,6 @@ def test_a_share_that_is_none_is_refused(share):
     stage = dataclasses.replace(a2tg.A2tg().stages()[0], jitter=share)
     with pytest.raises(ValueError, match=rf"jitter must lie in 0\.\.1; that of the stage 'gaussians' is {share}"):
         stage.check()
-
-
-def test_each_system_keeps_its_own_default_beside_others():
-    bytewise, plain, toy = find_system("bytewise"), find_system("gaussians-2d-mcmc"), Toy()
-    assert (bytewise.jitter, plain.jitter) == (0.1, 0.0)
-    assert like(plain, bytewise).jitter == like(toy, bytewise).jitter == 0.0
-    assert like(bytewise, plain).jitter == 0.1
-    asked = dataclasses.replace(bytewise, jitter=0.2)
-    assert like(plain, asked).jitter == 0.2
-    assert like(bytewise, dataclasses.replace(plain, jitter=0.05)).jitter == 0.05
-
-
-class Other(Bytewise):
-    """A kind of `Bytewise` without an option of its own."""
-
-
-@pytest.mark.parametrize("kind", [Bytewise, Other])
-def test_records_from_before_there_was_jitter_have_none(kind):
-    record = config_to_dict(kind())
-    del record["jitter"]
-    assert with_earlier_options(kind, record)["jitter"] == 0.0
-    assert with_earlier_options(kind, {**record, "jitter": 0.1})["jitter"] == 0.1
-    assert with_earlier_options(kind, {"memory_budget": 1.0}) == {"memory_budget": 1.0}, "given by hand"
 
 
 def test_a_system_that_does_not_displace_refuses_the_option():

@@ -97,9 +97,6 @@ class Bytewise(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
-    jitter: float = 0.1
-    """Standard deviation of random displacements of the Gaussians in each step of the first stage, as a share of their
-    sizes; 0: none."""
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: CapConfig = dataclasses.field(default_factory=CapConfig)
@@ -110,7 +107,7 @@ class Bytewise(System):
 
     name: ClassVar[str] = "bytewise"
     version: ClassVar[int] = 2
-    earlier_options: ClassVar[Mapping[str, Any]] = {"kernel": {"rate": 0.0}, "jitter": 0.0}
+    earlier_options: ClassVar[Mapping[str, Any]] = {"kernel": {"rate": 0.0}}
     ranges: ClassVar[Ranges] = {**LOOKUP_RANGES, **PRUNE_RANGES}
     event_options: ClassVar[Mapping[str, str]] = {
         **MCMC_OPTIONS,

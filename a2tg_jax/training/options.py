@@ -55,7 +55,7 @@ class System:
     """Side of a tile in pixels. Results do not depend on it."""
     jitter: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
     """Standard deviation of random displacements of the Gaussians in each step of the first stage, as a share of their
-    sizes, such as 0.1, against overfitting; 0: none."""
+    sizes, such as 0.1, against overfitting where views are few; 0: none."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     exposure: bool = False
@@ -343,16 +343,12 @@ RANGES = {
 def like(kind: type[System] | System, other: System) -> System:
     """Return a system of a kind with the options of another that have the same name and type.
 
-    Systems have defaults of their own for `jitter`, so only another value than the default is handed on.
-
     Args:
       kind: class or instance that gives all other options.
       other: the other system.
     """
-    start = kind() if isinstance(kind, type) else kind
-    changed: System = _like(start, other)
-    is_default = other.jitter == type(other).jitter
-    return dataclasses.replace(changed, jitter=start.jitter) if is_default else changed
+    changed: System = _like(kind() if isinstance(kind, type) else kind, other)
+    return changed
 
 
 def _like(value: Any, other: Any) -> Any:
