@@ -283,7 +283,7 @@ def fit(own, count, **options):
 
 def batches(folder):
     """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
-    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True)
+    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, jitter=0.1)
     for index, size, is_streamed in ((1, 4, False), (0, 6, False), (0, 6, True)):
         own = dataclasses.replace(own, batch_size=size)
         if not is_streamed:

@@ -14,10 +14,10 @@ SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
 FOUR = "--xla_force_host_platform_device_count=4"
 
 
-LONG = [pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures", "memory")]
+LONG = [pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures", "memory", "lenses", "balance")]
 
 
-@pytest.mark.parametrize("what", ["rendering", "balance", "batches", "lenses", "training", "events", *LONG])
+@pytest.mark.parametrize("what", ["rendering", "batches", "training", "events", *LONG])
 def test_several_devices_do_what_one_does(what, tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} {FOUR}")
     command = [sys.executable, str(SCRIPT), what, str(tmp_path)]
