@@ -14,7 +14,9 @@ SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
 FOUR = "--xla_force_host_platform_device_count=4"
 
 
-LONG = [pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures", "memory", "lenses", "balance")]
+LONG = [
+    pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures", "memory", "lenses", "balance")
+]
 
 
 @pytest.mark.parametrize("what", ["rendering", "batches", "training", "events", *LONG])
