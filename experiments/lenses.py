@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from few_views import GAUSSIAN_KERNELS
 from lab import tables
 from lab.interrupts import interruptible
 from lab.kept import KeptFigures, parser_of
@@ -102,8 +103,8 @@ def measured(folder: Path, name: str, use: str) -> dict[str, float]:
     if not (folder / "transforms.json").is_file():
         write_scene(folder, name)
     scene, kept = read_scene(folder, use), read_scene(folder, "keep")
-    gaussian = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
-    system = with_changes(a2tg.find_system("bytewise").preset("quick"), {**gaussian, "memory_budget": BUDGET}, "lenses")
+    options = {**GAUSSIAN_KERNELS, "memory_budget": BUDGET}
+    system = with_changes(a2tg.find_system("bytewise").preset("quick"), options, "lenses")
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     is_cropped = seen_when_undistorted(name)
     masked = [dataclasses.replace(view, mask=is_cropped & counted(view)) for view in kept.test]

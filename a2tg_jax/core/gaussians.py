@@ -64,6 +64,11 @@ class Gaussians:
         return jnp.exp(self.log_scales)
 
     @property
+    def sizes(self) -> Array:
+        """[N] sizes √(s_x·s_y), the geometric means of both standard deviations."""
+        return jnp.exp(jnp.mean(self.log_scales, axis=1))
+
+    @property
     def opacities(self) -> Array:
         """[N] peak opacities in (0, 1)."""
         return jax.nn.sigmoid(self.logit_opacities)

@@ -85,8 +85,7 @@ class SplitByGradient(FillingMcmc):
 
 def draw_weights(model: Model, state: SplitStatistics) -> Array:
     """Return [N] weights of hosts: average gradient by position, times the size."""
-    size = jnp.exp(jnp.mean(model.gaussians.log_scales, axis=1))
-    return state.gradients.average() * size + LEAST_WEIGHT
+    return state.gradients.average() * model.gaussians.sizes + LEAST_WEIGHT
 
 
 def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: Array) -> Array:

@@ -129,7 +129,7 @@ def _tuning(system: System, stage: Stage) -> _Tuning:
         stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False, jitter=0.0
     )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
-    return _Tuning(**shared | {"memory_budget": None, "jitter": 0.0}, stage=stage)
+    return _Tuning(**shared | {"memory_budget": None}, stage=stage)
 
 
 @event

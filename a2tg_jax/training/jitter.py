@@ -26,6 +26,6 @@ def jittered(key: Array, gaussians: Gaussians, share: float) -> Gaussians:
       share: standard deviation of each coordinate, as a share of the Gaussian's size.
     """
     means = gaussians.means
-    sizes = jnp.exp(jnp.mean(gaussians.log_scales, axis=1, keepdims=True))
     noise = jax.random.normal(jax.random.fold_in(key, STREAM), means.shape, means.dtype)
-    return dataclasses.replace(gaussians, means=means + jnp.asarray(share, means.dtype) * sizes * noise)
+    deviations = jnp.asarray(share, means.dtype) * gaussians.sizes[:, None]
+    return dataclasses.replace(gaussians, means=means + deviations * noise)
