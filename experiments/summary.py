@@ -22,7 +22,7 @@ OTHERS = {
     f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
 }
 """Differences of means: what they are called, and the two methods."""
-LEFT_OUT = "\nRuns from before are left out. A number of scenes in brackets stands where not all were run.\n"
+BRACKETS = "\nA number of scenes in brackets stands where not all were run.\n"
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -30,11 +30,13 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     *budgets, claim = grids
     found = unique(result for grid in budgets for result in tables.results_of(grid, lab.records))
     results = [result for result in found if not is_from_before(result.record)]
-    lab.write("summary-bytes", f"# Bytewise at equal bytes\n\n{bytes_table(results)}{LEFT_OUT}")
-    lab.write(
-        "summary-textures",
-        f"# Textures at equal bytes\n\n{textures_table(results, tables.results_of(claim, lab.records))}{LEFT_OUT}",
-    )
+    claimed = tables.results_of(claim, lab.records)
+    tables_of_pages = {
+        "summary-bytes": f"# Bytewise at equal bytes\n\n{bytes_table(results)}",
+        "summary-textures": f"# Textures at equal bytes\n\n{textures_table(results, claimed)}",
+    }
+    for name, text in tables_of_pages.items():
+        lab.write(name, f"{text}{BRACKETS}", has_old_rows=False)
 
 
 def bytes_table(results: Sequence[tables.Result]) -> str:

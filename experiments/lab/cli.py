@@ -120,11 +120,11 @@ class Lab:
         print(f"{result.label} on {result.run.cell.scene.label}: left out, its model is missing in {path.parent}")
         return None
 
-    def write(self, name: str, text: str) -> None:
-        """Print a page and save it among the results."""
+    def write(self, name: str, text: str, *, has_old_rows: bool = True) -> None:
+        """Print a page and save it among the results. A page that may have rows of runs from before counts them."""
         if self.args.validation:
             text = f"*Measured on validation views, taken from the training views; test views were not used.*\n\n{text}"
-        text = f"{text.rstrip()}\n{self._note}"
+        text = f"{text.rstrip()}\n{self._note if has_old_rows else ''}"
         path = self.pages / f"{name}.md"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
