@@ -40,15 +40,16 @@ def test_gains_have_the_verdict_that_seeds_allow():
 
 
 def test_the_best_plain_method_is_that_of_each_cell_which_has_all():
-    first, second = summary.PLAIN_METHODS
-    results = [result(first, 20.0), result(second, 21.0), result(first, 24.0, 1), result(second, 23.0, 1)]
-    results += [result(first, 30.0, 2), result(summary.BYTEWISE, 22.0), result(summary.BYTEWISE, 26.0, 1)]
+    first, *others = summary.PLAIN_METHODS
+    results = [result(label, 20.0 + place) for place, label in enumerate([first, *reversed(others)])]
+    results += [result(label, 24.0 - place, 1) for place, label in enumerate([first, *others])]
+    results += [result(first, 30.0, 2), result(summary.BYTEWISE, 24.0), result(summary.BYTEWISE, 26.0, 1)]
     best = summary.best_plain(results)
-    assert [(one.run.cell.seed, one["psnr"]) for one in best] == [(0, 21), (1, 24)]
+    assert [(one.run.cell.seed, one["psnr"]) for one in best] == [(0, 23), (1, 24)]
     assert {one.label for one in best} == {summary.BEST}
     told = summary.bytes_table([dataclasses.replace(one, run=with_budget(one.run, 0.3)) for one in results])
     assert "Bytewise less the best plain method: fox | +1.50" in told
-    assert "less MCMC of degree 0: mean** | +2.00" in told
+    assert "less MCMC of degree 0: mean** | +3.00" in told
 
 
 def with_budget(run: Run, megabytes: float) -> Run:
