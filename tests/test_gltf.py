@@ -309,6 +309,17 @@ def test_other_kernels_and_colours_are_told(tmp_path):
         load_gltf(path)
 
 
+def test_degree_4_is_read_to_degree_3(tmp_path):
+    path, model = tmp_path / "m.glb", plain(16)
+    save_gltf(path, model)
+    described, binary = parts_of(path)
+    attributes = described["meshes"][0]["primitives"][0]["attributes"]
+    attributes |= {f"{SPLATS}:SH_DEGREE_4_COEF_{n}": attributes[f"{SPLATS}:SH_DEGREE_3_COEF_0"] for n in range(9)}
+    write_parts(path, described, binary)
+    with pytest.warns(UserWarning, match=r"m\.glb: has SH of degree 4; degree 3 is read"):
+        assert_shows_the_same(load_gltf(path), model)
+
+
 # Damaged files
 
 

@@ -78,6 +78,26 @@ def test_ply_of_lower_degree_is_filled_with_zeros(tmp_path):
     assert np.all(sh[:, 4:] == 0)
 
 
+def test_ply_of_degree_4_is_read_to_degree_3(tmp_path):
+    names = [name for name in ATTRIBUTES if not name.startswith(("f_rest_", "n"))] + [f"f_rest_{i}" for i in range(72)]
+    rows = np.random.default_rng(0).normal(size=(3, len(names))).astype(np.float32)
+    write_ply(tmp_path / "g.ply", names, rows)
+    with pytest.warns(UserWarning, match=r"g\.ply: has SH of degree 4; degree 3 is read"):
+        sh = np.asarray(load_ply(tmp_path / "g.ply").sh)
+    for channel in range(3):  # Each has 24 attributes, of which 9 belong to degree 4.
+        first = names.index(f"f_rest_{24 * channel}")
+        np.testing.assert_array_equal(sh[:, 1:, channel], rows[:, first : first + 15])
+
+
+@pytest.mark.parametrize("num", [44, 46, 60, 73])
+def test_ply_of_other_numbers_of_coefficients_is_refused(tmp_path, num):
+    names = [name for name in ATTRIBUTES if not name.startswith(("f_rest_", "n"))]
+    names += [f"f_rest_{i}" for i in range(num)]
+    write_ply(tmp_path / "g.ply", names, np.ones((2, len(names))))
+    with pytest.raises(ValueError, match=rf"has {num} attributes f_rest_\*; .* have 0, 9, 24, 45 or 72"):
+        load_ply(tmp_path / "g.ply")
+
+
 def test_infinite_logits_of_opacities_become_finite(tmp_path):
     rows = np.ones((2, len(ATTRIBUTES)))
     rows[:, ATTRIBUTES.index("opacity")] = -np.inf, np.inf

@@ -63,7 +63,7 @@ def packed_file(path, rows, *, has_colors: bool = True, has_sh: bool = True, cha
     header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
     body = np.array(bounds, "<f4").tobytes() + vertex.astype("<u4").tobytes()
     if has_sh:
-        header += [f"element sh {num}", *(f"property uchar f_rest_{k}" for k in range(9))]
+        header += [f"element sh {num}", *(f"property uchar f_rest_{k}" for k in range(rows["sh"].shape[1]))]
         body += np.clip(np.trunc((rows["sh"] / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes()
     text = "\n".join([*header, "end_header\n"])
     for old, new in (changes or {}).items():
@@ -121,6 +121,15 @@ def test_they_are_gaussians_like_others(tmp_path):
     assert gaussians.num == NUM and gaussians.sh_degree == 1
     with pytest.warns(UserWarning, match="thinnest axis"):
         assert load_ply(packed_file(tmp_path / "b.ply", some_rows(), has_sh=False)).sh_degree == 0
+
+
+def test_degree_4_is_read_to_degree_3(tmp_path):
+    rows = some_rows() | {"sh": np.random.default_rng(6).uniform(-3.5, 3.5, (NUM, 72))}
+    path = packed_file(tmp_path / "a.ply", rows)
+    with pytest.warns(UserWarning, match="thinnest axis"), pytest.warns(UserWarning, match="has SH of degree 4"):
+        sh = np.asarray(load_ply(path).sh)
+    wanted = rows["sh"].reshape(NUM, 3, 24)[:, :, :15].transpose(0, 2, 1)
+    assert np.abs(sh[:, 1:] - wanted).max() <= 8 / 256 / 2 + 1e-6
 
 
 def test_opacities_of_nothing_and_all_are_finite(tmp_path):

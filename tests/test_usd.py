@@ -120,6 +120,21 @@ def test_a_degree_without_coefficients_takes_no_memory(tmp_path):
     assert load_usd(path).gaussians.sh_degree == 0
 
 
+def test_degree_4_is_read_to_degree_3(tmp_path):
+    path, gaussians = tmp_path / "m.usda", some_gaussians()
+    sh = np.random.default_rng(0).normal(size=(gaussians.num, 25, 3)).astype(np.float32)
+    stage, field = stage_of(gaussians)
+    harmonics = UsdVol.ParticleFieldSphericalHarmonicsAttributeAPI(field)
+    harmonics.CreateRadianceSphericalHarmonicsDegreeAttr(4)
+    coefficients = Vt.Vec3fArray.FromNumpy(sh.reshape(-1, 3))
+    harmonics.CreateRadianceSphericalHarmonicsCoefficientsAttr(coefficients)
+    stage.GetRootLayer().Export(str(path))
+    with pytest.warns(UserWarning, match=r"m\.usda: has SH of degree 4; degree 3 is read"):
+        found = load_usd(path)
+    np.testing.assert_array_equal(found.sh[:, 0], sh[:, 0])  # The constant ones, which the file's axes leave alone.
+    assert found.gaussians.sh_degree == 3
+
+
 def test_other_kernels_are_refused(tmp_path):
     path = tmp_path / "m.usda"
     for kernel in (None, UsdVol.ParticleFieldKernelConstantSurfletAPI):

@@ -37,6 +37,7 @@ from a2tg_jax.io.gltf_textures import EXTENSION, Shown, TexelKind, add_textures,
 from a2tg_jax.io.gltf_writer import Builder
 from a2tg_jax.io.model_file import appearance_to_dict
 from a2tg_jax.io.rows import Rows, check_encodable, model_of, rows_of
+from a2tg_jax.io.sh_degrees import HIGHEST_DEGREE, degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model, concatenate
@@ -218,7 +219,9 @@ def _splats(document: Document, primitive: Mapping[str, Any]) -> Splats:
 
     means, quats = numbers(MEANS, "VEC3"), numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]
     scales, opacities = numbers(SCALE, "VEC3"), numbers(OPACITY, "SCALAR")[:, 0]
-    degree = max((degree for degree in range(4) if coefficient(degree, 0) in attributes), default=0)
+    tried = range(HIGHEST_DEGREE + 2)  # One more than is read, for the warning.
+    found = max((degree for degree in tried if coefficient(degree, 0) in attributes), default=0)
+    degree = degree_to_read(found, str(document.path))
     names = [coefficient(band, order) for band in range(degree + 1) for order in range(2 * band + 1)]
     columns = [means, quats, scales, opacities, *(numbers(name, "VEC3") for name in names)]
     if len({len(column) for column in columns}) > 1:

@@ -20,6 +20,7 @@ import numpy as np
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.ply_header import header_lines, read_vertex_header
@@ -27,6 +28,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.flattening import flattened, third_log_scales
 from a2tg_jax.io.ply_packed import is_packed, read_packed
+from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
@@ -36,6 +38,8 @@ SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" 
 SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
+NUM_REST = (0, 9, 24, 45, 72)
+"""Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
 THIRD_SCALE = "scale_2"
 LEAST_OPACITY = 1e-6
 ENCODING = "binary_little_endian"
@@ -128,7 +132,8 @@ def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
-    They have the SH degree of the file; further attributes are left aside. The third scale (scale_2) of a file that
+    They have the SH degree of the file, at most 3; a warning tells that higher ones are left out, as are further
+    attributes. The third scale (scale_2) of a file that
     says that its splats are flat is dropped. Any other holds ellipsoids: the thinnest axis of each becomes the normal
     and its scale is dropped, with a warning if that is more than a thousandth of the others.
 
@@ -212,14 +217,16 @@ def _logits_of(vertices: np.ndarray) -> np.ndarray:
 
 def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
     """Return the spherical harmonics [N, K, 3] of a structured array of vertices."""
-    rest = [name for name in SH_REST if name in (vertices.dtype.names or ())]
-    if len(rest) not in (0, 9, 24, 45) or rest != list(SH_REST[: len(rest)]):
-        raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 3 have 0, 9, 24 or 45")
-    sh = np.zeros((len(vertices), 1 + len(rest) // 3, 3), np.float32)
+    found = {name for name in vertices.dtype.names or () if name.startswith("f_rest_")}
+    rest = [f"f_rest_{i}" for i in range(len(found))]
+    if len(rest) not in NUM_REST or found != set(rest):
+        raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 4 have 0, 9, 24, 45 or 72")
+    num_bases = NUM_BASES[degree_to_read(NUM_REST.index(len(rest)), str(path))]
+    sh = np.zeros((len(vertices), num_bases, 3), np.float32)
     sh[:, 0] = _columns(vertices, SH_DEGREE0)
     if rest:
         per_channel = _columns(vertices, rest).reshape(len(vertices), 3, len(rest) // 3)
-        sh[:, 1:] = per_channel.transpose(0, 2, 1)
+        sh[:, 1:] = per_channel[:, :, : num_bases - 1].transpose(0, 2, 1)
     return sh
 
 

@@ -35,6 +35,7 @@ from a2tg_jax.io.exchange import (
     splats_of,
     upright,
 )
+from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model, concatenate
@@ -192,7 +193,7 @@ def _model_of(usd: Any, field: Any, path: Path) -> Model:
     kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
-    gaussians = gaussians_of(_splats(usd, prim), path, is_flat=SURFLET in kernels)
+    gaussians = gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
     origin = origin_from_json(parse_json(kept)) if isinstance(kept, str) else None
     model = Model(gaussians, origin=origin)
@@ -200,7 +201,7 @@ def _model_of(usd: Any, field: Any, path: Path) -> Model:
     return model
 
 
-def _splats(usd: Any, prim: Any) -> Splats:
+def _splats(usd: Any, prim: Any, path: Path) -> Splats:
     """Return the numbers of a particle field.
 
     Attributes that are too long are cut, and those that are missing or too short have the values of the schema.
@@ -212,7 +213,10 @@ def _splats(usd: Any, prim: Any) -> Splats:
     degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get(usd.Usd.TimeCode.EarliestTime())
     bases = (int(degree) + 1) ** 2
     sh = _numbers(usd, prim, "radiance:sphericalHarmonicsCoefficients", 3, num * bases)
-    sh = np.zeros((num, 1, 3), np.float32) if sh is None else sh.reshape(num, bases, 3)[:, : NUM_BASES[-1]]
+    if sh is None:
+        sh = np.zeros((num, 1, 3), np.float32)
+    else:
+        sh = sh.reshape(num, bases, 3)[:, : NUM_BASES[degree_to_read(int(degree), str(path))]]
 
     def column(name: str, default: tuple[float, ...]) -> np.ndarray:
         values = _numbers(usd, prim, name, len(default), num)
