@@ -164,6 +164,36 @@ def test_downscale(tmp_path, has_folder):
     check_dots(scene)
 
 
+@pytest.mark.parametrize("is_full_there", [True, False])
+@pytest.mark.parametrize("values", [FOCAL, FOCAL | {"w": WIDTH}, dict(camera_angle_x=2 * np.arctan(WIDTH / 200))])
+def test_intrinsics_without_a_size_belong_to_the_full_images(tmp_path, values, is_full_there):
+    place = FOCAL if "cx" in values else dict(fl_x=100.0, fl_y=100.0, cx=WIDTH / 2, cy=HEIGHT / 2)
+    frames = write_frames(tmp_path, place=lambda pose: pinhole_place(pose, **place))
+    write_ply(tmp_path / "sparse_pc.ply")
+    write_json(tmp_path, frames, ply_file_path="sparse_pc.ply", **values)
+    (tmp_path / "images_2").mkdir()
+    for file in (tmp_path / "images").iterdir():
+        Image.open(file).reduce(2).save(tmp_path / "images_2" / file.name)
+        if not is_full_there:
+            file.unlink()
+    scene = load_scene(tmp_path, downscale=2)
+    assert scene.train[0].image.shape == (45, 60, 3)
+    check_dots(scene)
+
+
+def test_full_images_tell_their_size_where_reduced_ones_are_rounded(tmp_path):
+    """Reduced images of 8 pixels stand for 23, not 24."""
+    pixels = np.zeros((23, 23, 3), np.uint8)
+    frames = write_frames(tmp_path)
+    for frame in frames:
+        Image.fromarray(pixels).save(tmp_path / frame["file_path"])
+        (tmp_path / "images_3").mkdir(exist_ok=True)
+        Image.fromarray(pixels[:8, :8]).save(tmp_path / frame["file_path"].replace("images", "images_3"))
+    write_ply(tmp_path / "sparse_pc.ply")
+    write_json(tmp_path, frames, ply_file_path="sparse_pc.ply", fl_x=46.0)
+    np.testing.assert_allclose(load_scene(tmp_path, downscale=3).train[0].camera.K[0, 0], 46 * 8 / 23, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("distortion", "model", "params"),
     [

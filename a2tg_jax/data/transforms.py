@@ -7,6 +7,7 @@ both are in the file's own world, which is the original world here.
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, random_points, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import check_inside, locate_image, map_in_threads, num_readers
@@ -27,6 +29,7 @@ from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
@@ -167,12 +170,31 @@ def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> P
     # Only a folder of images below the scene has siblings of the form images_k.
     image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
     image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
+
+    def lens_of(stored: tuple[int, int]) -> Lens:
+        has_size = frame.get("w") and frame.get("h")
+        is_reduced = still_to_downscale < downscale
+        full = _full_size(image_folder, image_name, stored, downscale) if is_reduced and not has_size else stored
+        return _lens(frame, full, f"{file}: {name}", use)
+
     return PhotoFiles(
-        name, image_file, still_to_downscale, lambda stored: _lens(frame, stored, f"{file}: {name}", use),
+        name, image_file, still_to_downscale, lens_of,
         error_message=lambda error: f"{file}: {name}: its camera model {error}",
         mask=_find_mask(file, frame, image_folder / image_name, downscale),
         depths=_find_depths(file, frame, image_folder / image_name),
     )  # fmt: skip
+
+
+def _full_size(folder: Path, name: str, stored: tuple[int, int], downscale: int) -> tuple[int, int]:
+    """Return the (width, height) of the full image of a reduced one, to which the intrinsics belong.
+
+    It is that of the full image's file, or `downscale` times the size `stored` of the reduced one if that file is
+    missing or in object storage.
+    """
+    if not is_remote(folder):
+        with suppress(FileNotFoundError):
+            return picture_size(locate_image(folder, name, 1)[0])
+    return downscale * stored[0], downscale * stored[1]
 
 
 def _shot(file: Path, frame: dict[str, Any], read: Reading) -> Shot:
@@ -216,9 +238,9 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
     return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
-def _lens(frame: dict[str, Any], stored: tuple[int, int], what: str, use: LensUse) -> Lens:
-    """Return the camera of a frame; sizes default to the image's, the principal point to the centre."""
-    width, height = _side(frame, "w", stored[0], what), _side(frame, "h", stored[1], what)
+def _lens(frame: dict[str, Any], full: tuple[int, int], what: str, use: LensUse) -> Lens:
+    """Return the camera of a frame; its size defaults to the full image's, the principal point to the centre."""
+    width, height = _side(frame, "w", full[0], what), _side(frame, "h", full[1], what)
     fx, fy = _focal_lengths(frame, width, height, what)
     model, distortion = _distortion(frame, what)
     params = [fx, fy, _number(frame, "cx", width / 2, what), _number(frame, "cy", height / 2, what), *distortion]
