@@ -214,9 +214,32 @@ def test_distortion_is_taken_out(tmp_path, distortion, model, params):
 def test_split_lists(tmp_path):
     names = [f"images/{index:02d}.png" for index in range(8)]
     write_scene(tmp_path, train_filenames=names[:5], val_filenames=names[5:7], test_filenames=[f"./{names[7]}"])
-    scene = load_scene(tmp_path)
+    with pytest.warns(UserWarning, match=r"2 of 8 frames .* such as images/05\.png; val_filenames count only without"):
+        scene = load_scene(tmp_path)
     assert [view.name for view in scene.train] == names[:5]
     assert [view.name for view in scene.test] == names[7:]
+
+
+def test_frames_of_no_list_are_told(tmp_path):
+    names = [f"images/{index:02d}.png" for index in range(8)]
+    write_scene(tmp_path, train_filenames=names[:5], val_filenames=names[5:7])
+    with pytest.warns(UserWarning, match=r"transforms\.json: 1 of 8 frames .* such as images/07\.png"):
+        scene = load_scene(tmp_path)
+    assert [view.name for view in scene.test] == names[5:7]
+
+
+def test_without_a_list_for_training_all_other_frames_are_trained_on(tmp_path):
+    names = [f"images/{index:02d}.png" for index in range(8)]
+    write_scene(tmp_path, test_filenames=names[:2])
+    assert [view.name for view in load_scene(tmp_path).train] == names[2:]
+
+
+@pytest.mark.parametrize("key", ["train_filenames", "val_filenames", "test_filenames"])
+def test_listed_names_without_a_frame_are_refused(tmp_path, key):
+    names = [f"images/{index:02d}.png" for index in range(8)]
+    write_scene(tmp_path, **{"train_filenames": names[:4], "test_filenames": names[4:], key: [*names[4:], "03"]})
+    with pytest.raises(ValueError, match=f"{key} names 03, which is no frame; .* such as images/00.png"):
+        load_scene(tmp_path)
 
 
 def write_blender(folder, splits=("train", "test")):

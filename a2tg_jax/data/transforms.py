@@ -6,6 +6,7 @@ both are in the file's own world, which is the original world here.
 """
 
 import logging
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -52,7 +53,7 @@ def load_transforms(
     """Read a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
-    split without a test list); otherwise test_every does.
+    split without a test list); otherwise test_every does. A warning counts frames that the lists leave out.
 
     Args:
       file: path of transforms.json.
@@ -61,18 +62,13 @@ def load_transforms(
 
     Raises:
       FileNotFoundError: if an image or the point file is missing.
-      ValueError: if the JSON, a frame, an image or a pose is invalid, or the views make no scene (`assemble_scene`).
+      ValueError: if the JSON, a frame, an image or a pose is invalid, a list names what is no frame, or the views make
+        no scene (`assemble_scene`).
     """
     meta = _read_json(file)
     (shots,) = read_shots([(file, meta)], downscale, Shelf(room), lens, division)
-    listed = {key: _names(meta[f"{key}_filenames"]) for key in ("train", "val", "test") if f"{key}_filenames" in meta}
-    if listed:
-        test_names = listed.get("test") or listed.get("val") or set()
-        test = [shot for shot in shots if shot.name in test_names]
-        train_names = listed.get("train", {shot.name for shot in shots} - test_names)
-        train = [shot for shot in shots if shot.name in train_names - test_names]
-    else:
-        train, test = every_kth(shots, test_every)
+    listed = {key: _names(meta[key]) for key in SPLIT_KEYS if key in meta}
+    train, test = _listed_split(file, shots, listed) if listed else every_kth(shots, test_every)
     cloud = read_ply_points(_beside(file, meta["ply_file_path"])) if meta.get("ply_file_path") else None
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
@@ -101,6 +97,28 @@ def load_blender(
     cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
     logger.info("%s: a Blender scene, starting from %s random points", folder, f"{len(cloud.points):,}")
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder))
+
+
+def _listed_split(file: Path, shots: Sequence[Shot], listed: dict[str, set[str]]) -> tuple[list[Shot], list[Shot]]:
+    """Return (train, test) of lists by their keys. Warn of frames that they leave out.
+
+    Raises:
+      ValueError: if a list names what is no frame.
+    """
+    names = {shot.name for shot in shots}
+    for key, own in listed.items():
+        if unknown := sorted(own - names):
+            raise ValueError(
+                f"{file}: {key} names {shortened(unknown[0])}, which is no frame; write names as file_path has them, "
+                f"such as {shots[0].name}"
+            )
+    test_names = listed.get("test_filenames") or listed.get("val_filenames") or set()
+    train_names = listed.get("train_filenames", names) - test_names
+    if unused := sorted(names - train_names - test_names):
+        only = "; val_filenames count only without test_filenames" if listed.get("val_filenames") else ""
+        message = f"{file}: {len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
+        warnings.warn(message, stacklevel=3)
+    return [shot for shot in shots if shot.name in train_names], [shot for shot in shots if shot.name in test_names]
 
 
 def _read_json(file: Path) -> dict[str, Any]:
