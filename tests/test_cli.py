@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -595,14 +596,27 @@ def test_render_without_ffmpeg_says_so(tiny_run, tmp_path, monkeypatch, capsys):
         assert animation.info["duration"] == 125
 
 
-def test_render_tells_ffmpeg_the_rate(tmp_path, monkeypatch):
-    asked = []
+def test_a_shorter_flight_leaves_no_frames_of_a_longer_one(tiny_run, tmp_path, monkeypatch):
+    run, *_ = tiny_run
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    others = {"frame_00003.png", "frame_3.png", "frame_0003.jpg", "my_frame_0003.png"}
+    for name in others:
+        (tmp_path / name).touch()
+    for num, names in ((4, others | {"frame_0002.png", "frame_0003.png"}), (2, others)):
+        assert cli.main(["render", str(run.path), "--frames", str(num), "--out", str(tmp_path), "--size", "12x8"]) == 0
+        assert {path.name for path in tmp_path.iterdir()} == names | {"frame_0000.png", "frame_0001.png", "flight.webp"}
+
+
+def test_render_tells_ffmpeg_the_rate_and_the_frames(tmp_path, monkeypatch):
+    asked, paths = [], [tmp_path / f"frame_{index:04d}.png" for index in range(5)]
     monkeypatch.setattr(shutil, "which", lambda name: name)
     monkeypatch.setattr(
         subprocess, "run", lambda command, **_: asked.append(command) or subprocess.CompletedProcess([], 0)
     )
-    assert frames.write_video(tmp_path, tmp_path / "flight.mp4", frames_per_second=12)
-    assert asked[0][asked[0].index("-framerate") + 1] == "12"
+    assert frames.write_video(paths, tmp_path / "flight.mp4", frames_per_second=12)
+    words = dict(itertools.pairwise(asked[0]))
+    assert (words["-framerate"], words["-frames:v"]) == ("12", "5")
+    assert words["-i"] == str(tmp_path / "frame_%04d.png")
 
 
 def test_doctor_compares_the_compositors(capsys, monkeypatch):

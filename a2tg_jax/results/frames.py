@@ -29,6 +29,8 @@ Route = Literal["test", "smooth", "orbit"]
 FRAMES_PER_SECOND = 30
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
+FRAME_NAME = "frame_%04d.png"
+"""File name of a flight's frame by its number, as Python and ffmpeg write it."""
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -60,7 +62,8 @@ def render_frames(
 
     Args:
       run: an opened run folder.
-      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views.
+      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. Frames that a
+        longer path left there are deleted.
       route: the test views, a smooth path past all cameras, an orbit around the subject, or a file of views that the
         viewer saved, through which a path goes.
       num_frames: length of the path.
@@ -89,7 +92,17 @@ def render_frames(
     renderer = Renderer(model, cameras=cameras.values(), settings=settings, has_geometry=False)
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         save_picture(out / file_name, to_uint8(renderer(camera).color))
+    if route != "test":
+        _drop_frames_from(out, num_frames)
     return [out / file_name for file_name in cameras]
+
+
+def _drop_frames_from(folder: Path, number: int) -> None:
+    """Delete the frames of an earlier flight from a number on."""
+    for path in folder.glob("frame_*.png"):
+        match = re.fullmatch(r"frame_(\d+)\.png", path.name)
+        if match and int(match[1]) >= number and path.name == FRAME_NAME % int(match[1]):
+            path.unlink()
 
 
 def check_rate(frames_per_second: float) -> None:
@@ -120,8 +133,13 @@ def _opened(path: Path) -> Image.Image:
         return image
 
 
-def write_video(folder: Path, path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> bool:
-    """Make an mp4 of frame_0000.png … with ffmpeg; return False if ffmpeg is not installed.
+def write_video(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> bool:
+    """Make an mp4 of a flight with ffmpeg; return False if ffmpeg is not installed.
+
+    Args:
+      frames: frame_0000.png … of one folder, without a gap.
+      path: the video.
+      frames_per_second: its rate.
 
     Raises:
       ValueError: if ffmpeg fails.
@@ -130,8 +148,9 @@ def write_video(folder: Path, path: Path, *, frames_per_second: float = FRAMES_P
     if program is None:
         return False
     even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
-    frames = ["-framerate", str(frames_per_second), "-i", str(folder / "frame_%04d.png")]
-    command = [program, "-y", "-loglevel", "error", *frames, "-vf", even_sides, "-pix_fmt", "yuv420p", str(path)]
+    source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
+    made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", str(path)]
+    command = [program, "-y", "-loglevel", "error", *source, *made]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise ValueError(f"ffmpeg could not make {path}: {done.stderr.strip()}")
@@ -159,4 +178,4 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
 
 def _numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
     """Return the cameras of a flight by the names that `write_video` looks for."""
-    return ((f"frame_{index:04d}.png", camera) for index, camera in enumerate(path))
+    return ((FRAME_NAME % index, camera) for index, camera in enumerate(path))
