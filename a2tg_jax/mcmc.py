@@ -305,7 +305,6 @@ class Mcmc(StepEvent):
     reads_whole = False
     num_keys: ClassVar[int] = 2
     impossible: ClassVar[str] = "no Gaussian above the death opacity is left"
-    refused: ClassVar[str] = "raise {cap}"
 
     def times(self, num_iterations: int) -> Times:
         return densify_times(num_iterations)

@@ -16,16 +16,18 @@ from a2tg_jax import (
     StepEvent,
     event,
     fit,
+    init_from_points,
     load_checkpoint,
     save_checkpoint,
     synthetic_scene,
 )
+from a2tg_jax.appearance import Banded
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
-from a2tg_jax.training.divergence import largest_loss
+from a2tg_jax.training.divergence import _not_finite, largest_loss
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 
@@ -88,6 +90,13 @@ def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_pat
     save_checkpoint(tmp_path / "kept.npz", raised.value.checkpoint)
     kept = load_checkpoint(tmp_path / "kept.npz", Poisoned)
     assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.log_scales).all()
+
+
+def test_tables_without_rows_are_finite():
+    """As those of `bytewise` are while no Gaussian has a degree."""
+    gaussians = init_from_points(np.eye(3), np.zeros((3, 3)), sh_degree=0)
+    tables, _ = Banded().allocate(jax.random.key(0), gaussians)
+    assert not jax.tree.leaves(tables)[0].size and not list(_not_finite((gaussians, tables, ())))
 
 
 @event

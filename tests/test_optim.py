@@ -67,6 +67,13 @@ def test_first_step_moves_by_the_rate():
     assert state.count == 1
 
 
+def test_without_decay_the_present_gradient_alone_counts():
+    state = adam_init(jnp.zeros(2))
+    params, state = adam_update(jnp.zeros(2), jnp.asarray([4.0, -3.0]), state, 0.1, b1=0.0, b2=0.0)
+    params, _ = adam_update(params, jnp.asarray([5.0, -1.0]), state, 0.1, b1=0.0, b2=0.0)
+    np.testing.assert_allclose(params, [-0.2, 0.2], rtol=1e-6)
+
+
 def test_one_rate_may_stand_for_a_subtree():
     params = {"a": jnp.ones(2), "b": {"c": jnp.ones(3), "d": jnp.ones(1)}}
     result = adam_update(params, params, adam_init(params), {"a": 0.0, "b": 0.5})

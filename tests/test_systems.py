@@ -268,6 +268,27 @@ def test_gaussians_that_find_no_room_are_counted_and_said(scene):
         a2tg.fit(scene, system, progress=False)
 
 
+def test_a_resumed_training_says_what_found_no_room_before(scene, tmp_path):
+    """Nothing is added in the second half of the stage, from which it goes on."""
+    system = tiny("gaussians-2d", densify={"cap": 61, "threshold": 1e-9})
+
+    def keep(checkpoint):
+        a2tg.save_checkpoint(tmp_path / f"{checkpoint.stage}-{checkpoint.iteration}.npz", checkpoint)
+
+    with pytest.warns(UserWarning, match="no room for a Gaussian") as whole:
+        a2tg.fit(scene, system, progress=False, on_checkpoint=keep, checkpoint_every=1)
+    late = a2tg.load_checkpoint(tmp_path / f"0-{system.stage1_iterations - 1}.npz")
+    with pytest.warns(UserWarning, match="no room for a Gaussian") as resumed:
+        a2tg.fit(scene, system, progress=False, resume=late)
+    assert [str(one.message) for one in whole] == [str(one.message) for one in resumed]
+
+
+def test_the_cap_of_alphas_is_the_same_in_both_stages():
+    system = tiny("textured-gaussians", texture={"lookup": {"max_alpha": 0.95}})
+    first, second = (stage.appearance for stage in system.stages())
+    assert first.max_alpha == second.max_alpha == 0.95
+
+
 @pytest.mark.parametrize(
     "name, reason",
     [

@@ -24,6 +24,7 @@ from a2tg_jax.training.batches import stack_views
 from a2tg_jax.training.bilateral import BilateralGrid, sliced, total_variation
 from a2tg_jax.training.corrections import exposed, learned
 from a2tg_jax.training.depth_prior import DepthPrior, depth_loss, scale_and_shift
+from a2tg_jax.training.option_groups import LossConfig
 from a2tg_jax.training.robust import RobustPhotometric, inliers
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import Photometric
@@ -105,6 +106,13 @@ class TestRobust:
 
         gradient = jax.grad(loss)(image)
         assert not gradient[8:16, 8:16].any() and (gradient[20:] != 0).all()
+
+    def test_images_smaller_than_the_window_of_ssim_train_without_it(self):
+        (term,) = LossConfig(ssim_weight=0.0, robust_share=0.2).terms()
+        image = jnp.full((8, 20, 3), 0.5)
+        target = a2tg.Target(None, image + 0.02, jnp.zeros(3))
+        loss = jax.jit(lambda term: term(None, target, a2tg.render.RenderOutput(image, *[None] * 5)))(term)
+        assert loss == pytest.approx(0.02, rel=1e-5)
 
 
 class TestBilateralGrid:

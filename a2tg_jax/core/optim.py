@@ -112,4 +112,4 @@ def _check_like(name: str, tree: Any, params: Any) -> None:
 
 def _bias_correction(decay: float, count: Array, dtype: DTypeLike) -> Array:
     """Return 1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
-    return -jnp.expm1(count.astype(dtype) * math.log(decay))
+    return -jnp.expm1(count.astype(dtype) * math.log(decay)) if decay else jnp.ones((), dtype)

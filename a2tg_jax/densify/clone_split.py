@@ -234,7 +234,6 @@ class OpacityReset(StepEvent):
     """Largest opacity after a reset."""
 
     reads_whole = False
-    reads_whole = False
     num_keys: ClassVar[int] = 0
 
     def times(self, num_iterations: int) -> Times:

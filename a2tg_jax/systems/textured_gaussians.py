@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar, Self
 
-from a2tg_jax.appearance import Textured, TextureOptions
+from a2tg_jax.appearance import Plain, Textured, TextureOptions
 from a2tg_jax.systems.stage1 import (
     ANY_RATE,
     FLOATS_PER_TEXEL,
@@ -59,7 +59,7 @@ class TexturedGaussians(System):
         side = self.texture.side
         textured = Textured((side, side), self.texture.lookup)
         events = self.densify.events(self.budget_cap(FLOATS_PER_TEXEL * side * side))
-        first = growing_stage(self, self.stage1_iterations, events)
+        first = growing_stage(self, self.stage1_iterations, events, Plain(self.texture.lookup.max_alpha))
         return first, later_stage(self, "textures", textured, (), self.stage2_iterations, self.texture.rate)
 
     @classmethod

@@ -118,6 +118,8 @@ class Checkpoint:
     """Machine on which it was saved; None if unknown or not saved yet."""
     devices: Devices = ALONE
     """Devices that trained it; it can go on with others."""
+    num_refused: int = 0
+    """Number of times so far that there was no room for a Gaussian which should have been added."""
 
     @property
     def iteration(self) -> int:
@@ -161,6 +163,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "num_restored": checkpoint.num_restored,
         "machine": config_to_dict(this_machine()),
         "devices": config_to_dict(checkpoint.devices),
+        "num_refused": checkpoint.num_refused,
     }
     shown = model.appearance.arrays(model.params, model.layout)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
@@ -214,14 +217,15 @@ def _checkpoint_of(
     state, history = TrainState(model, moments, *others), History(**columns)
     check_state(state, wanted, stage)
     check_history(history)
-    num_restored = header.get("num_restored", 0)
-    check_count("num_restored", num_restored, MOST_RESTORED)
+    counts = [header.get(name, 0) for name in ("num_restored", "num_refused")]
+    check_count("num_restored", counts[0], MOST_COUNTED)
+    check_count("num_refused", counts[1], MOST_COUNTED)
     machine = config_from_dict(Machine, header["machine"], "machine") if "machine" in header else None
     devices = config_from_dict(Devices, header.get("devices", {}), "devices")
-    return Checkpoint(options, header["stage"], state, history, num_restored, machine, devices)
+    return Checkpoint(options, header["stage"], state, history, counts[0], machine, devices, counts[1])
 
 
-MOST_RESTORED = 2**31 - 1
+MOST_COUNTED = 2**31 - 1
 SHOWN = "shown/"
 """Prefix of the names of appearance arrays."""
 

@@ -78,7 +78,7 @@ def _not_finite(parameters: tuple[Any, ...]) -> Iterator[str]:
     for prefix, part in zip(("", "params", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
             numbers = np.asarray(leaf)
-            is_bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
+            is_bad = ~np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))  # There may be 0 rows.
             if is_bad.any():
                 rows = np.flatnonzero(is_bad)
                 told = ", ".join(map(str, rows[:TOLD_ROWS])) + (", …" if len(rows) > TOLD_ROWS else "")

@@ -148,7 +148,8 @@ class StageRun:
         self.on_log: OnLog | None = None
         """Called with each row of the history."""
         self.started = time.perf_counter()
-        self.num_regrown = self.num_refused = self.num_compiled = 0
+        self.num_regrown = self.num_compiled = 0
+        self.num_refused = resume.num_refused if resume else 0
 
     def _copied(self, tree: Any) -> Any:
         """Return copies of arrays, for steps take over the buffers they are given: on the device, or on the host if
@@ -181,7 +182,10 @@ class StageRun:
     def checkpoint(self) -> Checkpoint:
         """Present state; the next step reuses its buffers."""
         state = readable(self.state)
-        return Checkpoint(self.system, self.index, state, self.history, self.num_restored, devices=self.session.devices)
+        return Checkpoint(
+            self.system, self.index, state, self.history, self.num_restored, devices=self.session.devices,
+            num_refused=self.num_refused,
+        )  # fmt: skip
 
     def train(
         self,

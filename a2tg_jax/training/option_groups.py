@@ -59,7 +59,8 @@ class LossConfig:
     def _photometric(self, is_first: bool) -> LossTerm:
         if self.robust_share:
             start = RobustPhotometric.start if is_first else 0.0
-            return RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start)
+            has_ssim = self.ssim_weight != 0
+            return RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start, has_ssim)
         return Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.events import event
+from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import photometric_loss
@@ -32,6 +32,8 @@ class RobustPhotometric:
     """Least residual of what is left out, as a multiple of the photograph's median."""
     start: float = 0.25
     """Share of the stage after which something is left out; before, much is outlying that is not learned yet."""
+    has_ssim: bool = static(default=True)
+    """Whether SSIM is computed; False where its weight is 0, for images smaller than its window."""
 
     has_geometry = False
 
@@ -39,7 +41,7 @@ class RobustPhotometric:
         residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)
         counts = inliers(residual, self.share, self.factor, target.mask) | (target.progress < self.start)
         color, image = (jnp.where(counts[..., None], x, jnp.zeros_like(x)) for x in (output.color, target.image))
-        return photometric_loss(color, image, ssim_weight=self.ssim_weight)
+        return photometric_loss(color, image, ssim_weight=self.ssim_weight if self.has_ssim else 0)
 
 
 def inliers(residual: Array, share: Array | float, factor: Array | float, mask: Array | None = None) -> Array:
