@@ -29,7 +29,7 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
 from a2tg_jax.finish import baking
 from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
-from a2tg_jax.finish.distilling import distill, likeness, pictures
+from a2tg_jax.finish.distilling import distill, drawn_scene, likeness, pictures
 from a2tg_jax.finish.texel_choice import fewest_texels
 from a2tg_jax.results import conversion
 from a2tg_jax.texture import Textures
@@ -145,6 +145,12 @@ def test_training_on_pictures_brings_a_plain_model_nearer(split):
     trained = distill(split, model, [CAMERA], iterations=30)
     assert trained.num == split.num and trained.origin == model.origin
     assert psnr(trained, model) > psnr(split, model) + 0.5
+
+
+def test_cameras_in_one_place_move_the_means_too(split):
+    assert drawn_scene(textured(), [CAMERA], WHITE).scene_scale > 1
+    trained = distill(split, textured(), [CAMERA], iterations=2)
+    assert (np.asarray(trained.gaussians.means) != np.asarray(split.gaussians.means)).any()
 
 
 def test_training_draws_over_the_background_of_the_model(split):

@@ -12,7 +12,9 @@ from test_data_colmap import HEIGHT, WIDTH, dot_place, write_scene
 from test_data_transforms import FOCAL, SIZE, write_frames, write_json
 
 from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_scene, polish, psnr, ssim, synthetic_scene
+from a2tg_jax.data.masks import Mask
 from a2tg_jax.measure.metrics import load_lpips, lpips
+from a2tg_jax.training.batches import check_views
 from a2tg_jax.training.start import initial_model
 
 NAMES = tuple(f"img_{index:02d}.png" for index in range(9))
@@ -90,6 +92,13 @@ def test_what_is_wrong_with_masks_is_told(tmp_path):
         write_mask(tmp_path / "masks" / name, np.zeros((HEIGHT, WIDTH), bool))
     with pytest.raises(ValueError, match=r"the mask of img_00.png excludes every pixel"):
         load_scene(tmp_path)
+
+
+def test_a_view_of_your_own_whose_mask_excludes_every_pixel_is_refused():
+    scene = synthetic_scene(num_views=4, width=24, height=16)
+    view = dataclasses.replace(scene.train[0], mask=Mask.of(np.zeros((16, 24), bool)))
+    with pytest.raises(ValueError, match=rf"the mask of view {view.name} excludes every pixel: leave the view out"):
+        check_views((view,))
 
 
 def test_mask_path_of_nerfstudio(tmp_path):

@@ -62,5 +62,7 @@ def drawn_scene(model: Model, cameras: Sequence[Camera], background: Color) -> S
     )
     points = np.asarray(model.gaussians.means, np.float32)
     world = Similarity(1.0, np.eye(3), np.zeros(3)) if model.origin is None else model.origin.transform
-    scale = scene_scale(camera_centers(np.array([camera.viewmat for camera in cameras], np.float64)))
+    centers = camera_centers(np.array([camera.viewmat for camera in cameras], np.float64))
+    # Cameras in one place have no extent: the distance of what they see takes its place.
+    scale = scene_scale(centers) or float(np.median(np.linalg.norm(points - centers[0], axis=1)))
     return Scene("drawn", views, (), points, np.zeros_like(points), world, scale)

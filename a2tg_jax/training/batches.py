@@ -265,7 +265,8 @@ def check_depths(views: tuple[View, ...]) -> None:
 
 
 def check_views(views: tuple[View, ...]) -> None:
-    """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes."""
+    """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes, of which some
+    pixels count."""
     if not views:
         raise ValueError("scene.train must hold at least one view; got none")
     for view in views:
@@ -280,6 +281,8 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
                 f"got {list(view.mask.shape)}"
             )
+        if view.mask is not None and not view.mask.num:
+            raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or mend its mask")
         if view.depth is not None and view.depth.shape != (height, width):
             raise ValueError(
                 f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
