@@ -116,6 +116,19 @@ def test_turned_photographs_are_turned_back(tmp_path, orientation):
     np.testing.assert_allclose(np.asarray(upright)[..., 0], np.asarray(image), atol=12)
 
 
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_photographs_that_lose_their_alpha_are_told(tmp_path, mode):
+    """Two photographs have transparent pixels; the alpha channel of another is opaque."""
+    image = Image.fromarray(np.full((48, 64, 4), 255, np.uint8))
+    for index in range(4):
+        image.putpixel((index, 0), (0, 0, 0, 0 if index < 2 else 255))
+        image.convert("RGB" if index == 3 else mode).save(tmp_path / f"{index}.png")
+        image.putpixel((index, 0), (255, 255, 255, 255))
+    with pytest.warns(UserWarning, match=r"2 of 4 photographs have transparent pixels.* folder masks") as told:
+        staged([tmp_path], tmp_path / "work")
+    assert len(told) == 1
+
+
 def test_heic_photographs_become_jpeg(tmp_path):
     pillow_heif = pytest.importorskip("pillow_heif")
     image = Image.fromarray(np.full((48, 64, 3), 99, np.uint8))

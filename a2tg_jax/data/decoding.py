@@ -50,7 +50,7 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
       ValueError: naming the file, if it cannot be read as an image of 8 bits per channel and at most `MAX_PIXELS`.
     """
     with _opened(path) as image:
-        has_alpha = "A" in image.getbands() or "transparency" in image.info
+        has_alpha = _has_alpha(image)
         pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
@@ -72,6 +72,8 @@ class PictureFacts(NamedTuple):
     """Pillow's name of the format."""
     lens: tuple[str, ...]
     """Camera and focal length as EXIF has them."""
+    is_transparent: bool
+    """Whether some of its pixels are not opaque."""
 
 
 def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
@@ -83,7 +85,13 @@ def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
         details = exif.get_ifd(ExifTags.IFD.Exif)
         size = image.size[::-1] if turn in SIDEWAYS else image.size
         lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
-        return PictureFacts(size, turn in TURNED, image.format or "", tuple(str(value) for value in lens if value))
+        told = tuple(str(value) for value in lens if value)
+        is_transparent = _has_alpha(image) and bool((np.asarray(image.convert("RGBA"))[..., 3] < 255).any())
+        return PictureFacts(size, turn in TURNED, image.format or "", told, is_transparent)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return "A" in image.getbands() or "transparency" in image.info
 
 
 def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:

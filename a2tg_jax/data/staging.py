@@ -6,6 +6,7 @@ Folders, videos and panoramas may be mixed. Photographs that need no change are 
 import itertools
 import os
 import shutil
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
@@ -122,7 +123,20 @@ def stage(
     num_turned = sum(photo.facts.is_turned for photo in photos)
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
+    _warn_of_alpha(photos, sources)
     return Staged(folder, groups, rigs)
+
+
+def _warn_of_alpha(photos: Sequence[_Photo], sources: Sequence[Path]) -> None:
+    """Warn of photographs whose alpha channels the scene will not have."""
+    num_transparent = sum(photo.facts.is_transparent for photo in photos)
+    if num_transparent:
+        message = (
+            f"{', '.join(map(str, sources))}: {num_transparent} of {len(photos)} photographs have transparent pixels, "
+            "but COLMAP writes the scene's images without alpha; to leave pixels out, put masks of these images into "
+            "the scene's folder masks"
+        )
+        warnings.warn(message, stacklevel=4)
 
 
 def _prefixes(sources: Sequence[Path]) -> list[str]:
