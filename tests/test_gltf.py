@@ -136,6 +136,13 @@ def test_what_the_extension_cannot_hold_is_refused_or_left_out(tmp_path):
     assert not (tmp_path / "n.glb").exists()
 
 
+def test_long_names_of_other_scripts_come_back(tmp_path):
+    """Percent-encoded, the name of the buffer has three times as many bytes as on disk."""
+    path = tmp_path / f"{'場' * 70}.gltf"
+    save_gltf(path, plain())
+    assert_shows_the_same(load_gltf(path), plain())
+
+
 # The specification
 
 

@@ -143,10 +143,11 @@ def buffer_files(path: Path) -> list[Path]:
 
 def _named_file(path: Path, uri: str) -> Path:
     """Return the file of a buffer. Raises ValueError if it is missing or does not lie in the folder of the glTF."""
-    if len(uri.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
+    name = urllib.parse.unquote(uri, errors="strict")
+    if len(name.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
         raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
     folder = path.parent.resolve()
-    file = (folder / urllib.parse.unquote(uri, errors="strict")).resolve() if "://" not in uri else None
+    file = (folder / name).resolve() if "://" not in uri else None
     if file is None or not file.is_relative_to(folder):
         raise ValueError(f"its buffer {shortened(uri)} does not lie in the folder of the file")
     if not is_regular(file):
