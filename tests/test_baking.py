@@ -148,7 +148,7 @@ def test_training_on_pictures_brings_a_plain_model_nearer(split):
 
 
 def test_cameras_in_one_place_move_the_means_too(split):
-    assert drawn_scene(textured(), [CAMERA], WHITE).scene_scale > 1
+    assert drawn_scene(textured(), [CAMERA], WHITE).scale > 1
     trained = distill(split, textured(), [CAMERA], iterations=2)
     assert (np.asarray(trained.gaussians.means) != np.asarray(split.gaussians.means)).any()
 
