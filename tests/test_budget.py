@@ -318,6 +318,21 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
         check_start(scene, system, num_given=most + 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "size", "stage"),
+    [("a2tg", 248, "textures"), ("textured-gaussians", 488, "textures"), ("bbsplat", 1252, "billboards")],
+)
+def test_given_gaussians_must_fit_with_what_later_stages_show(name, size, stage):
+    """At degree 3 a Gaussian takes 232 bytes, a texel 16."""
+    system = smoke(name, memory_budget=120 * size / 1e6)
+    system.check_given_number(120)
+    message = (
+        rf"^memory_budget of .* room for 120 Gaussians of {size:,} bytes when the stage '{stage}' begins, and 121 "
+    )
+    with pytest.raises(ValueError, match=message):
+        system.check_given_number(121)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
 def test_presets_reach_ordinary_budgets(scene, name, preset):

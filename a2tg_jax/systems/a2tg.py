@@ -171,7 +171,8 @@ class A2tg(System):
         self._check_budget(num, "raise it, or lower densify.cap")
 
     def check_given_number(self, num: int) -> None:
-        """Refuse a budget of textures that the given Gaussians already exhaust."""
+        """Refuse a memory budget, or a budget of textures, that the given Gaussians already exhaust."""
+        self.check_given_bytes(num)
         self._check_budget(num, "raise it")
 
     def _check_budget(self, num: int, remedy: str) -> None:

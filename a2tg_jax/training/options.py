@@ -283,9 +283,29 @@ class System:
         """
 
     def check_given_number(self, num: int) -> None:
-        """Do what `check_number` does, for Gaussians of a file in place of the first stage. It calls that unless
-        overridden."""
+        """Do what `check_number` does, for Gaussians of a file in place of the first stage, and refuse more than the
+        memory budget has room for. It calls `check_number` unless overridden."""
         self.check_number(num)
+        self.check_given_bytes(num)
+
+    def check_given_bytes(self, num: int) -> None:
+        """Refuse more Gaussians of a file than the memory budget has room for, with what a stage shows of them when it
+        begins.
+
+        Raises:
+          ValueError: naming the budget.
+        """
+        if self.budget_bytes is None:
+            return
+        degree = self.initial_sh_degree
+        for stage in self.stages():
+            size = bytes_per_gaussian(degree, stage.floats_shown(degree))
+            if num * size > self.budget_bytes:
+                raise ValueError(
+                    f"memory_budget of {self.memory_budget} MB has room for {int(self.budget_bytes // size):,} "
+                    f"Gaussians of {size:,.0f} bytes when the stage {stage.name!r} begins, and {num:,} are given: "
+                    "raise it, leave it out, or give fewer"
+                )
 
     def _check_numbers(self) -> None:
         """Refuse numbers that are not finite or outside the range of an option that every system has."""
