@@ -7,6 +7,7 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
+from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.io.config_json import config_to_dict
 from a2tg_jax.results.record import RunFile, compared_system
@@ -87,6 +88,24 @@ def test_without_a_budget_the_cap_says_how_many_bytes():
     assert isinstance(degrees, AdaptDegrees) and isinstance(textures, Upscale)
     assert textures.budget_mb == pytest.approx(56e-6 * system.densify.cap)
     assert degrees.budget_mb == pytest.approx((1 - system.texture.share) * textures.budget_mb)
+
+
+@pytest.mark.parametrize("limit", [{"densify": {"cap": 1_000}}, {"memory_budget": "56kB"}])
+@pytest.mark.parametrize(("shares", "most"), [((0.1, 0.02), 980), ((0.0, 0.02), 1_000), ((0.1, 0.0), 1_000)])
+def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
+    """At 56 bytes each. Degrees must leave the share of textures; textures take what is left."""
+    changes = {"view_dependence": {"share": shares[0]}, "texture": {"share": shares[1]}}
+    system = Bytewise.preset("quick", **changes, **limit)
+    system.check_given_number(most)
+    for event in system.stages()[1].events:
+        assert event_budget(bytes_of(event.budget_mb), 56 * most, 1, 1) >= 0
+    name = "densify.cap" if "densify" in limit else "memory_budget"
+    with pytest.raises(ValueError, match=rf"^{name} .*has room for {most:,} .* and {most + 1:,} are given: raise it"):
+        system.check_given_number(most + 1)
+
+
+def test_given_gaussians_without_details_may_be_any_number():
+    Bytewise.preset("quick", view_dependence={"share": 0.0}, texture={"share": 0.0}).check_given_number(100_000)
 
 
 def test_beside_another_system_it_stays_what_it_is():

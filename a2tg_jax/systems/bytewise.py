@@ -17,7 +17,7 @@ from a2tg_jax.appearance import (
     Textured,
     TextureOptions,
 )
-from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
@@ -153,6 +153,15 @@ class Bytewise(System):
         """Return the bytes of the finished model."""
         return self.densify.cap * self._own_bytes if self.budget_bytes is None else self.budget_bytes
 
+    def _megabytes_before_texels(self) -> float:
+        """Return the megabytes of Gaussians and degrees."""
+        return self._num_bytes() / MEGABYTE * (1 - self.texture.share)
+
+    @property
+    def _limit(self) -> str:
+        """Name of the option that sets the bytes of the finished model."""
+        return "densify.cap" if self.memory_budget is None else "memory_budget"
+
     @property
     def _own_bytes(self) -> int:
         """Bytes of a Gaussian without degrees and texels."""
@@ -181,7 +190,7 @@ class Bytewise(System):
         view, texture = self.view_dependence, self.texture
         events: list[Event] = []
         if view.share:
-            most = megabytes * (1 - texture.share)
+            most = self._megabytes_before_texels()
             events.append(from_options(AdaptDegrees, view, budget_mb=most, highest=self.sh_degree))
         if texture.share:
             events.append(from_options(Upscale, texture, select="budget", budget_mb=megabytes))
@@ -223,10 +232,22 @@ class Bytewise(System):
             )
         self._check_times()
         if self._num_gaussians() < 2 or self._num_kept() < 2:
-            name = "densify.cap" if self.memory_budget is None else "memory_budget"
             size = self.densify.cap if self.memory_budget is None else self.memory_budget
-            raise ValueError(f"{name} must leave room for 2 Gaussians beside degrees and textures; got {size}")
+            raise ValueError(f"{self._limit} must leave room for 2 Gaussians beside degrees and textures; got {size}")
         super().check()
+
+    def check_given_number(self, num: int) -> None:
+        """Refuse more given Gaussians than degrees and textures leave bytes for."""
+        super().check_given_number(num)
+        if not self._share:
+            return
+        megabytes = self._megabytes_before_texels() if self.view_dependence.share else self._num_bytes() / MEGABYTE
+        most = bytes_of(megabytes) // self._own_bytes
+        if num > most:
+            raise ValueError(
+                f"{self._limit} has room for {most:,} Gaussians when the stage 'details' begins, and {num:,} are "
+                "given: raise it, or give fewer"
+            )
 
     def _check_times(self) -> None:
         """Refuse times outside a stage, times after the last growth, and degrees that change after textures took the
