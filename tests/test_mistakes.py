@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import os
 
 import numpy as np
 import pytest
@@ -186,6 +187,16 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, place, mista
     assert printed.err.startswith("a2tg: error: ") and printed.err.count("\n") == 1
     assert MISTAKES[mistake] in printed.err and len(printed.err) < 600
     assert sorted(place.rglob("*")) == before
+
+
+def test_a_deleted_current_folder_is_told(capsys, monkeypatch):
+    def gone():
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(cli, "configure_cpu", lambda: None)
+    monkeypatch.setattr(os, "getcwd", gone)
+    assert cli.main(["info", "run"]) == 2
+    assert capsys.readouterr().err == "a2tg: error: the current folder was deleted: change to one that exists\n"
 
 
 def test_help_names_values_without_none():

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -479,3 +480,42 @@ def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
     error = capsys.readouterr().err.splitlines()[-1]
     assert "No space left on device; there is no checkpoint yet; continue with: a2tg train" in error
     assert whole_run.how_to_go_on(RunFolder(tmp_path / "run")) in error
+
+
+LACKS = {
+    "the memory does not suffice (RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.): ": jax.errors.JaxRuntimeError(
+        "RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes."
+    ),
+    "the memory does not suffice (Unable to allocate 9 B): ": MemoryError("Unable to allocate 9 B"),
+    "the memory does not suffice: ": MemoryError(),
+}
+
+
+def raising(error):
+    def fail(*arguments, **options):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("told", LACKS)
+def test_a_lack_of_memory_in_training_tells_how_to_go_on(told, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run_training, "fit_stage", raising(LACKS[told]))
+    assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    how = whole_run.how_to_go_on(RunFolder(tmp_path / "run"))
+    assert error == f"a2tg: error: {told}{whole_run.LESS_MEMORY}; {how}"
+
+
+@pytest.mark.parametrize(("name", "advice"), [("render", "lower --size or --supersample"), ("info", "close other")])
+def test_a_lack_of_memory_outside_training_is_one_line(name, advice, monkeypatch, capsys):
+    for told, error in LACKS.items():
+        monkeypatch.setattr(cli.COMMANDS[name], "run", raising(error))
+        assert cli.main([name, "run"]) == 2
+        assert f"a2tg: error: {told}{advice}" in capsys.readouterr().err
+
+
+def test_an_error_of_the_program_itself_is_not_told_as_the_users(monkeypatch):
+    monkeypatch.setattr(cli.Info, "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
+        cli.main(["info", "run"])

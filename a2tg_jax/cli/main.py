@@ -25,6 +25,7 @@ from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.host import signals
+from a2tg_jax.host.memory import lack_of_memory
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
@@ -36,12 +37,18 @@ from a2tg_jax.results.lock import opened
 from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.summary import metrics_json
-from a2tg_jax.results.whole_run import measure
+from a2tg_jax.results.whole_run import LESS_MEMORY, measure
 from a2tg_jax.training import SYSTEMS
 
 BROKEN_PIPE = 128 + 13
 LONGEST_ERROR = 1000
 """Characters of the line that tells an error."""
+SMALLER = {
+    "train": LESS_MEMORY,
+    "render": "lower --size or --supersample",
+    "mesh": "lower --resolution, --radius or --texture-size",
+}
+"""Advice by command if the memory does not suffice; "close other programs" for the others."""
 OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
@@ -183,10 +190,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
     try:
         configure_cpu()
+        _find_own_systems()
     except ValueError as error:
         return _fail(str(error))
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # Users' own systems are modules there.
     try:
         with warnings.catch_warnings(), signals.raised():
             warnings.showwarning = functools.partial(_show_warning, arguments)
@@ -200,11 +206,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Python would otherwise flush the buffer again at exit and fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-    except (ValueError, OSError) as error:
-        if os.environ.get("A2TG_DEBUG"):
+    except Exception as error:
+        told = _told(name, error)
+        if told is None or os.environ.get("A2TG_DEBUG"):
             raise
-        return _fail(with_flags(str(error), arguments))
+        return _fail(with_flags(told, arguments))
     return 0
+
+
+def _find_own_systems() -> None:
+    """Have Python look for modules in the current folder, too: users' own systems are modules there."""
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:
+        raise ValueError("the current folder was deleted: change to one that exists") from None
+    if here not in sys.path:
+        sys.path.append(here)
+
+
+def _told(name: str, error: Exception) -> str | None:
+    """Return what to tell of a user's error, or of a lack of memory; None for an error of the program itself."""
+    lack = lack_of_memory(error)
+    if lack is not None:
+        return f"{lack}: {SMALLER.get(name, 'close other programs')}"
+    return str(error) if isinstance(error, ValueError | OSError) else None
 
 
 def _fail(message: str) -> int:

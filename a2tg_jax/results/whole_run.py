@@ -8,6 +8,7 @@ from pathlib import Path
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.machine import Devices
+from a2tg_jax.host.memory import lack_of_memory
 from a2tg_jax.host.processes import team
 from a2tg_jax.results.first_stage import GivenSplats, given_splats
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
@@ -22,6 +23,10 @@ from a2tg_jax.results.together import check_alike
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
+LESS_MEMORY = (
+    "close other programs, or start another run with a larger --downscale, or a smaller --memory-budget or --batch-size"
+)
+"""Advice of the command line for trainings that have run out of memory."""
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
 """Function that gives the watcher of a scene's training."""
 
@@ -58,7 +63,8 @@ def begin_run(
       tensorboard: write files of TensorBoard.
 
     Raises:
-      ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder.
+      ValueError, OSError: as `check_new_run` and `train_run` do, or if another process is at that folder or the memory
+        does not suffice.
       Stopped: if the process is asked to end; its `advice` tells how to go on.
     """
     given = given_splats(record)
@@ -148,10 +154,14 @@ def _advised(run: RunFolder, devices: Devices | None, *, is_replacing: bool) -> 
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
         raise signals.Stopped(number, advice()) from None
-    except (ValueError, OSError) as error:
+    except Exception as error:
+        lack = lack_of_memory(error)
+        if lack is None and not isinstance(error, ValueError | OSError):
+            raise
         if others is not None:
             others.told(error)
-        raise ValueError(f"{error}; {advice()}") from error
+        told = error if lack is None else f"{lack}: {LESS_MEMORY}"
+        raise ValueError(f"{told}; {advice()}") from error
 
 
 def _identity(path: Path) -> tuple[int, int]:
