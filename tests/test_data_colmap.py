@@ -252,6 +252,25 @@ def test_bad_input_is_named(tmp_path, spoil, error, message):
     assert "\n" not in str(caught.value)
 
 
+def test_names_with_spaces_need_a_binary_model(tmp_path):
+    """pycolmap ends names of text files at the first space."""
+    names = [f"my photo {index}.png" for index in range(4)]
+    write_scene(tmp_path / "binary", names=names)
+    assert [view.name for view in load_scene(tmp_path / "binary", test_every=0).train] == names
+    write_scene(tmp_path / "text", names=names, text=True)
+    with pytest.raises(ValueError, match=r"images\.txt: line \d+ has the image name 'my photo \d.png'.* as \.bin"):
+        load_scene(tmp_path / "text")
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_names_that_are_not_utf_8_are_told(tmp_path, text):
+    write_scene(tmp_path, text=text)
+    model = tmp_path / "sparse" / "0" / f"images{'.txt' if text else '.bin'}"
+    model.write_bytes(model.read_bytes().replace(b"img_03.png", b"img_\xe93.png"))
+    with pytest.raises(ValueError, match=r"images\.\w+: the image name img_\\xe93.png is not UTF-8; rename"):
+        load_scene(tmp_path)
+
+
 def test_panorama_is_refused(tmp_path):
     reconstruction = write_scene(tmp_path)
     for camera in reconstruction.cameras.values():

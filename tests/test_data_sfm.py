@@ -1,7 +1,9 @@
 """Plain photographs to a scene: on renders of the built-in scene, whose cameras are known."""
 
 import contextlib
+import os
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -261,6 +263,17 @@ def test_a_folder_of_photographs_is_told_a_command_that_works(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileNotFoundError, match="`a2tg sfm 'my photos' SCENE`"):
         load_scene(tmp_path / "my photos")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("name", [b"photo\xe9.png", b"caf\xe9/photo.png"])
+def test_names_that_are_not_utf_8_are_told(tmp_path, name):
+    for number in range(3):
+        file = tmp_path / "photos" / (f"{number}.png" if number else os.fsdecode(name))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.zeros((12, 16, 3), np.uint8)).save(file)
+    with pytest.raises(ValueError, match=r"\\xe9.*: its name is not UTF-8, .*; rename the photograph"):
+        run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
 
 
 def test_unreadable_photograph_is_named(tmp_path):

@@ -20,6 +20,7 @@ from typing import Any
 
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.text import shortened
 
 LONGEST_NAME = 4096
 COUNT, SHORT_COUNT = struct.Struct("<Q"), struct.Struct("<I")
@@ -50,11 +51,23 @@ class _Cursor:
         end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
         if end < 0:
             raise self.error("has a name that does not end")
+        check_name(self.path, self.data[self.at : end])
         self.skip(end + 1 - self.at)
 
     def error(self, what: str) -> ValueError:
         place = f"number {self.record} of {self.num_records} {self.path.stem}" if self.record else "the count"
         return ValueError(f"{self.path}: is cut off or damaged: {place} {what}; export the model again")
+
+
+def check_name(path: Path, name: bytes) -> None:
+    """Raise ValueError, naming the file, unless the name of an image is UTF-8, as pycolmap wants it."""
+    try:
+        name.decode()
+    except UnicodeDecodeError:
+        told = shortened(name.decode(errors="backslashreplace"))
+        raise ValueError(
+            f"{path}: the image name {told} is not UTF-8; rename the photograph, and export the model again"
+        ) from None
 
 
 def check_binary(path: Path, copy: Path | None = None) -> None:

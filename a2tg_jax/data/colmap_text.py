@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from a2tg_jax.data.colmap_binary import num_params_by_model
+from a2tg_jax.data.colmap_binary import check_name, num_params_by_model
 from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
@@ -40,6 +40,8 @@ def check_text(path: Path, copy: Path | None = None) -> None:
                 continue
             points = next(lines, (0, None))[1] if path.stem == "images" else b""
             _check_line(path, number, words, points)
+            if path.stem == "images":
+                _check_image_name(path, number, words[9:])
             found += 1
     if announced not in (None, found):
         message = f"{path}: says that it has {announced} {path.stem}, and has {found}: if it is cut off, export it"
@@ -78,6 +80,17 @@ def _check_image(words: Words) -> None:
     if len(words) < 10:
         raise ValueError(f"an image needs 10 words (id, pose, camera, name); got {len(words)}")
     _check_numbers((words[0], words[8]), words[1:8])
+
+
+def _check_image_name(path: Path, number: int, words: Words) -> None:
+    """Raise ValueError if an image's name is not UTF-8, or has spaces, at the first of which pycolmap ends it."""
+    name = b" ".join(words)
+    check_name(path, name)
+    if len(words) > 1:
+        raise ValueError(
+            f"{path}: line {number} has the image name '{shortened(name.decode())}', but names in COLMAP's text files "
+            "end at the first space; rename the photograph, or export the model as .bin"
+        )
 
 
 def _check_point(words: Words) -> None:

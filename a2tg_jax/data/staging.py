@@ -115,6 +115,8 @@ def stage(
                 )
             tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
         files += [(number, place / name, prefix + name) for name in find_photos(place, least)]
+    for _, file, name in files:
+        _check_name(file, name)
     photos = map_in_threads(lambda file: _look(*file, panorama), files)
     flat = [photo for photo in photos if not photo.is_panorama]
     groups = _stage_flat(flat, folder)
@@ -125,6 +127,15 @@ def stage(
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
     _warn_of_alpha(photos, sources)
     return Staged(folder, groups, rigs)
+
+
+def _check_name(file: Path, name: str) -> None:
+    """Raise ValueError unless COLMAP can keep a photograph's name."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:  # Bytes that are no UTF-8 are surrogates in Python's names of files.
+        told = os.fsencode(file).decode(errors="backslashreplace")
+        raise ValueError(f"{told}: its name is not UTF-8, as COLMAP wants it; rename the photograph") from None
 
 
 def _warn_of_alpha(photos: Sequence[_Photo], sources: Sequence[Path]) -> None:
