@@ -4,10 +4,12 @@ import json
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax.appearance import MovableKernels
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.gaussians import init_from_points
@@ -115,6 +117,27 @@ def test_a_file_is_not_replaced_unasked(tmp_path, capsys, command, name):
     assert out.read_text() == "mine"
     if name == "x.ply":
         assert cli.main([*words, "--overwrite"]) == 0 and out.read_bytes().startswith(b"ply")
+
+
+@pytest.mark.parametrize("words", ["--ply", "--single-file --web"])
+def test_export_does_not_replace_what_it_reads(tmp_path, capsys, words):
+    source = tmp_path / "scene.ply"
+    a2tg.save_ply(source, a_model())
+    before = source.read_bytes()
+    assert cli.main(["export", str(source), "--overwrite", *words.split(), str(source)]) == 2
+    assert f"scene.ply is the model itself; choose another {words.split()[-1]}" in capsys.readouterr().err
+    assert source.read_bytes() == before
+
+
+def test_export_tells_what_ply_does_not_keep(tmp_path, capsys):
+    params, layout = MovableKernels().allocate(jax.random.key(0), a_model().gaussians)
+    model = a2tg.Model(a_model().gaussians, params, layout, appearance=MovableKernels())
+    for name, given in (("kernels", model), ("plain", a_model())):
+        a2tg.save_model(tmp_path / f"{name}.npz", given)
+        out = tmp_path / f"{name}.compressed.ply"
+        assert cli.main(["export", str(tmp_path / f"{name}.npz"), "--ply", str(out)]) == 0
+        told = "not kept by this format: what MovableKernels shows beside Gaussians\n" * (given is model)
+        assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{told}"
 
 
 def test_a_page_in_a_folder_is_not_replaced_unasked(tmp_path):

@@ -12,7 +12,7 @@ from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.live import shown_live
-from a2tg_jax.results.output import check_new, check_output
+from a2tg_jax.results.output import check_new, check_not_source, check_output
 from a2tg_jax.results.ply_export import check_ply, export_ply
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import check_page, export_web, exported_text
@@ -91,9 +91,12 @@ class Export:
                 check_output(out)
         if self.web is not None:
             is_file = check_page(self.web, single_file=self.single_file, photographs=self.photographs)
-            check_new(self.web if is_file else self.web / "index.html", "--web", overwrite=self.overwrite)
+            page = self.web if is_file else self.web / "index.html"
+            check_not_source([page], self.source, "--web")
+            check_new(page, "--web", overwrite=self.overwrite)
         if self.ply is not None:
             check_ply(self.ply)
+            check_not_source([self.ply], self.source, "--ply")
             check_new(self.ply, "--ply", overwrite=self.overwrite)
         source = open_source(self.source, self.model)
         if self.ply is not None:

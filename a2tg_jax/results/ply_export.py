@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from a2tg_jax.io.formats import beside_gaussians
+from a2tg_jax.io.formats import lost_by
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.results.viewing import Source
 
@@ -16,7 +16,7 @@ def check_ply(out: Path) -> None:
 
 
 def export_ply(source: Source, out: Path) -> str:
-    """Write the Gaussians of a model as programs for 3DGS read them, and return a summary of the file.
+    """Write the Gaussians of a model as programs for 3DGS read them, and return a summary, with what PLY does not keep.
 
     Raises:
       ValueError: if `out` is a folder or has another suffix than ply.
@@ -24,6 +24,7 @@ def export_ply(source: Source, out: Path) -> str:
     check_ply(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     save_ply(out, source.model)
-    lost = beside_gaussians(source.model)
-    left_out = f", without their {lost}, which PLY cannot hold" if lost else ""
-    return f"file: {out}: {source.model.num:,} Gaussians{left_out}"
+    lines = [f"file: {out}: {source.model.num:,} Gaussians"]
+    if lost := lost_by(source.model, SUFFIX):  # --bake is an option of another command.
+        lines.append(f"not kept by this format: {', '.join(lost).replace('--bake', 'a2tg convert --bake')}")
+    return "\n".join(lines)
