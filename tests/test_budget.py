@@ -318,6 +318,21 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
         check_start(scene, system, num_given=most + 1)
 
 
+@pytest.mark.parametrize("is_enabled", [True, False])
+def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, is_enabled):
+    """120 Gaussians of 248 bytes: they do not grow in 10 iterations, or because growth is off."""
+    densify = {"is_enabled": is_enabled}
+    texture = {"select": "budget", "budget_mb": 0.0297}
+    system = smoke("a2tg", stage1_iterations=10, densify=densify, texture=texture)
+    option = "densify.cap" if is_enabled else "initial_gaussians"
+    for start in (check_start, lambda *it: a2tg.fit(*it, progress=False)):
+        with pytest.raises(ValueError, match=rf"but 120 Gaussians .* take 0\.030 MB: raise it, or lower {option}$"):
+            start(scene, system)
+    with pytest.raises(ValueError, match=r"but 120 Gaussians .*: raise it$"):
+        check_start(scene, system, num_given=120)
+    check_start(scene, with_changes(system, {"texture": {"budget_mb": 0.0298}}, "test"))
+
+
 @pytest.mark.parametrize(
     ("name", "size", "stage"),
     [("a2tg", 248, "textures"), ("textured-gaussians", 488, "textures"), ("bbsplat", 1252, "billboards")],

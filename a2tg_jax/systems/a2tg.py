@@ -166,9 +166,10 @@ class A2tg(System):
 
     def check_number(self, num: int) -> None:
         """Refuse a budget of textures that the Gaussians of the first stage already exhaust."""
+        option = "initial_gaussians"
         if self.densify.is_enabled:
-            num = Mcmc(self.densify.cap).grown(num, self.stage1_iterations)
-        self._check_budget(num, "raise it, or lower densify.cap")
+            option, num = "densify.cap", Mcmc(self.densify.cap).grown(num, self.stage1_iterations)
+        self._check_budget(num, f"raise it, or lower {option}")
 
     def check_given_number(self, num: int) -> None:
         """Refuse a memory budget, or a budget of textures, that the given Gaussians already exhaust."""
@@ -176,7 +177,7 @@ class A2tg(System):
         self._check_budget(num, "raise it")
 
     def _check_budget(self, num: int, remedy: str) -> None:
-        if self._texture().select != "budget" or self.memory_budget is not None or not self.densify.is_enabled:
+        if self._texture().select != "budget" or self.memory_budget is not None:
             return
         assert self.texture.budget_mb is not None
         needed = num * bytes_per_gaussian(self.sh_degree, FLOATS_PER_TEXEL) / MEGABYTE

@@ -55,7 +55,7 @@ class McmcConfig:
     cap: int = Mcmc.cap
     """Largest number of Gaussians; a memory_budget takes its place."""
     is_enabled: bool = True
-    """Whether Gaussians relocate and grow."""
+    """Whether Gaussians relocate and grow; off: their number stays that of initial_gaussians, and cap is not used."""
 
     def events(self, budget_cap: int | None = None) -> tuple[Event, ...]:
         """Return the events: noise after every iteration, relocation and growth at their times.

@@ -20,7 +20,7 @@ from a2tg_jax.training.options import System
 from a2tg_jax.training.resume import check_resume
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
-from a2tg_jax.training.start import initial_model
+from a2tg_jax.training.start import check_start, initial_model
 
 BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
 """Background of a finished model for each background of training."""
@@ -114,10 +114,13 @@ def fit(
     Raises:
       Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to go on from.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
-      ValueError: if options contradict each other or the checkpoint.
+      ValueError: if options contradict each other, the scene or the checkpoint.
     """
     _check_arguments(scene, system, resume)
-    if resume is not None:
+    if resume is None:
+        check_views(scene.train)
+        check_start(scene, system)
+    else:
         check_resume(resume, system, resume.stage)
     session = Session() if session is None else session
     first = 0 if resume is None else resume.stage
