@@ -1,6 +1,7 @@
 """The command `a2tg compress`, with and without tuning, on a tiny run."""
 
 import re
+import shutil
 
 import pytest
 from test_cli import TINY, fails
@@ -124,7 +125,33 @@ def test_a_diverged_tuning_keeps_what_was_found(run, tmp_path, monkeypatch, caps
     assert told in capsys.readouterr().out and load_compact(out).num == 60
 
 
-@pytest.mark.parametrize(("name", "told"), [("plain.a2tgz", ", which is compressed already"), ("scene.ply", "")])
+def test_only_a_file_that_the_run_wrote_is_replaced_unasked(run, tmp_path, monkeypatch, capsys):
+    """Nothing is computed before the refusal."""
+    written = []
+    monkeypatch.setattr(cli, "compress", lambda *a, **_: written.append(a))
+    monkeypatch.setattr(cli, "compression_text", lambda _: "")
+    model = tmp_path / "scene.npz"
+    model.write_bytes(run.model("a2tg-textures").read_bytes())
+    copy = RunFolder(tmp_path / "run")
+    shutil.copytree(run.path, copy.path)
+    for source, out in ((model, model), (copy.path, copy.model("a2tg-textures"))):
+        out.with_suffix(".a2tgz").unlink(missing_ok=True)
+        assert cli.main(["compress", str(source)]) == 0
+        out.with_suffix(".a2tgz").touch()
+    copy.marker.write_text(copy.marker.read_text().replace("models/a2tg-textures.a2tgz\n", ""))
+    written.clear()
+    for source in (model, copy.path):
+        assert ".a2tgz exists; add --overwrite to replace it" in fails(capsys, "compress", source)
+    assert not written
+    assert cli.main(["compress", str(model), "--overwrite"]) == 0
+    copy.own(copy.model("a2tg-textures").with_suffix(".a2tgz"))
+    assert cli.main(["compress", str(copy.path)]) == 0 and len(written) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("plain.a2tgz", ", which is compressed already"), *((f"c.{kind}", "") for kind in ("ply", "spz", "SOG", "pt"))],
+)
 def test_compress_tells_what_it_reads(name, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).touch()

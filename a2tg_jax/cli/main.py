@@ -29,8 +29,9 @@ from a2tg_jax.host.memory import lack_of_memory
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
-from a2tg_jax.io.suffixes import FORMATS
-from a2tg_jax.results.compression import SUFFIX, compress, compression_text
+from a2tg_jax.io.formats import FORMATS
+from a2tg_jax.io.model_file import load_model
+from a2tg_jax.results.compression import SUFFIX, compress, compression_text, default_output, is_written_by
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.lock import opened
@@ -43,6 +44,8 @@ from a2tg_jax.training import SYSTEMS
 BROKEN_PIPE = 128 + 13
 LONGEST_ERROR = 1000
 """Characters of the line that tells an error."""
+OTHER_SUFFIXES = tuple(suffix for suffix, kind in FORMATS.items() if kind.load is not load_model)
+"""Suffixes of files that are no models, which a2tg compress does not read."""
 SMALLER = {
     "train": LESS_MEMORY,
     "render": "lower --size or --supersample",
@@ -128,16 +131,17 @@ class Compress:
     times, for other bits each time: first those that lose 0.5 dB, or twice --max-loss if that is more. 0: numbers are
     only rounded."""
     overwrite: bool = False
-    """Replace the file that --out names."""
+    """Replace the output file. The default of a run is always replaced once a2tg compress has written it."""
 
     def run(self) -> None:
-        if self.out is not None:
-            check_output(self.out)
-            check_new(self.out, "--out", overwrite=self.overwrite)
-        suffix = self.source.suffix.lower()
-        if not self.source.is_dir() and FORMATS.get(suffix, "model") != "model":
-            told = ", which is compressed already" if suffix == SUFFIX else ""
+        name = self.source.name.lower()
+        if not self.source.is_dir() and name.endswith(OTHER_SUFFIXES):
+            told = ", which is compressed already" if name.endswith(SUFFIX) else ""
             raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(self.source))}{told}")
+        out = self.out or default_output(self.source)
+        check_output(out)
+        if self.out is not None or not is_written_by(self.source, out):
+            check_new(out, "--out", overwrite=self.overwrite)
         tell = functools.partial(print, flush=True)
         found = compress(
             self.source, self.out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell

@@ -62,6 +62,24 @@ class Compressed:
     """Error that ended the search for tuned files; None: there was none."""
 
 
+def default_output(source: Path) -> Path:
+    """Return the file that `compress` writes beside the model of a run folder, or beside a model's file.
+
+    Raises:
+      FileNotFoundError: if there is no such model.
+    """
+    if source.is_dir():
+        return _last_model(open_run(source))[0].with_suffix(SUFFIX)
+    if not is_regular(source):
+        raise FileNotFoundError(f"{source}: no such file or folder")
+    return source.with_suffix(SUFFIX)
+
+
+def is_written_by(source: Path, file: Path) -> bool:
+    """Return whether a file is one that the run in a folder wrote."""
+    return source.is_dir() and file.relative_to(source).as_posix() in RunFolder(source).written()
+
+
 def compress(
     source: Path,
     out: Path | None = None,
