@@ -318,6 +318,26 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
         check_start(scene, system, num_given=most + 1)
 
 
+@pytest.mark.parametrize(
+    ("texture", "name", "select"),
+    [
+        ({"budget_mb": 1.0}, "budget_mb", "budget"),
+        ({"select": "threshold", "threshold": 1e-5, "budget_mb": 1.0}, "budget_mb", "budget"),
+        ({"threshold": 1e-5}, "threshold", "threshold"),
+        ({"select": "budget", "budget_mb": 1.0, "threshold": 0.0}, "threshold", "threshold"),
+    ],
+)
+def test_numbers_of_a_rule_that_is_not_chosen_are_refused(texture, name, select):
+    message = rf"texture\.{name} is .* say texture\.select {select}, or leave texture\.{name} out$"
+    with pytest.raises(ValueError, match=message):
+        a2tg.A2tg.preset("quick", texture=texture).check()
+
+
+@pytest.mark.parametrize("changes", [{"texture": {"select": "fraction"}}, {"memory_budget": "90MB"}, {}])
+def test_the_threshold_of_a_preset_may_stay(changes):
+    a2tg.A2tg.preset("official", **changes).check()
+
+
 @pytest.mark.parametrize("is_enabled", [True, False])
 def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, is_enabled):
     """120 Gaussians of 248 bytes: they do not grow in 10 iterations, or because growth is off."""

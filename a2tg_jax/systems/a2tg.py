@@ -45,8 +45,8 @@ class TextureConfig(UpscaleChoices):
     select: Literal["fraction", "threshold", "budget"] = Upscale.select
     """Rule that chooses the Gaussians to upscale; a memory_budget sets "budget"."""
     budget_mb: float | None = Upscale.budget_mb
-    """Largest reported memory in MB (10^6 bytes); needed by select="budget". It bounds the textures alone, beside the
-    Gaussians of densify.cap; memory_budget chooses both."""
+    """Largest reported memory in MB (10^6 bytes); for select="budget" only, which needs it. It bounds the textures
+    alone, beside the Gaussians of densify.cap; memory_budget chooses both."""
     gradient: Statistic = Upscale.gradient
     """Gradient that chooses: by position in the world, or "screen" as in the authors' program."""
     moments: Literal["zero", "copied"] = Upscale.moments
@@ -61,6 +61,20 @@ class TextureConfig(UpscaleChoices):
     `rate`; 0: constant until they grow."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
     """Options of the texture lookup."""
+
+    def check(self) -> None:
+        """Refuse the number of a rule that is not chosen; the threshold of the preset "official" may stay.
+
+        Raises:
+          ValueError: naming the options.
+        """
+        for select, name, usual in (("budget", "budget_mb", None), ("threshold", "threshold", PAPER_THRESHOLD)):
+            number = getattr(self, name)
+            if self.select != select and number not in (None, usual):
+                raise ValueError(
+                    f"texture.{name} is {number}, but texture.select is {self.select!r}: say texture.select {select}, "
+                    f"or leave texture.{name} out"
+                )
 
     def event(self) -> Upscale:
         """Return the upscaling of these options.
@@ -163,6 +177,10 @@ class A2tg(System):
                 texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), **QUICK_TEXTURES),
             ),
         }  # fmt: skip
+
+    def check(self) -> None:
+        super().check()
+        self.texture.check()
 
     def check_number(self, num: int) -> None:
         """Refuse a budget of textures that the Gaussians of the first stage already exhaust."""
