@@ -1,6 +1,8 @@
 """`a2tg view` and `a2tg export`: what is served, to whom, and what a page holds."""
 
 import base64
+import contextlib
+import dataclasses
 import hashlib
 import http.client
 import importlib
@@ -26,8 +28,12 @@ from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
+from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.meshing import MeshOptions, write_mesh
+from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, routes_of
 from a2tg_jax.results.web_export import export_web, exported_text, loss_told
+from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, served
 
@@ -325,3 +331,30 @@ def test_photographs_are_those_of_the_cameras():
     found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
     by_name = {view.name: view for view in (*scene.train, *scene.test)}
     assert np.abs(found - by_name[origin.names[0]].image).mean() < 12
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(FileNotFoundError("no folder"), "photographs of"), (ValueError("a.png: is truncated"), r"a\.png: is truncated")],
+)
+def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkeypatch, error, told):
+    """The viewer and the page go on without them, with a warning; what needs them tells the error."""
+
+    def fail(self):
+        raise error
+
+    run, scene = create_run(tmp_path / "run"), synthetic_scene(num_views=4, width=24, height=16, num_points=20)
+    write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
+    save_model(run.model("a2tg-textures"), dataclasses.replace(textured(), origin=origin_of_scene(scene)))
+    monkeypatch.setattr(SceneSource, "load", fail)
+    source = open_source(run.path)
+    with pytest.raises(ValueError, match=told):
+        write_mesh(source, tmp_path / "a.glb", MeshOptions(texture="photographs"))
+    with pytest.raises(ValueError, match=told):
+        export_web(source, tmp_path / "site", photographs=True)
+    is_told = isinstance(error, ValueError)
+    warned = pytest.warns(UserWarning, match=told) if is_told else contextlib.nullcontext()
+    with warned:
+        assert json.loads(routes_of(source)["/photographs.json"].read()) == []
+    with warned:
+        assert list(export_web(source, tmp_path / "page.html").losses) == ["were it a model of 30 dB"]

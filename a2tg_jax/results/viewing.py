@@ -46,7 +46,7 @@ class Source:
     settings: RenderSettings = RenderSettings()  # noqa: RUF009 - frozen
     """Render settings."""
     load_scene: Callable[[], Scene | None] = lambda: None
-    """Loader of the photographs; None without photographs."""
+    """Loader of the photographs; None if they are missing. Raises ValueError or OSError if they cannot be read."""
     num_bytes: int = 0
     """Bytes of the file that it was read from."""
 
@@ -109,7 +109,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     def load_scene() -> Scene | None:
         try:
             return record.scene.load()
-        except (OSError, ValueError):
+        except FileNotFoundError:
             return None  # The photographs are gone; the model shows itself.
 
     title = f"{record.scene.name} · {planned.name}"
@@ -128,6 +128,15 @@ def _source_of_file(path: Path) -> Source:
 
 
 # Photographs
+
+
+def scene_or_warning(load_scene: Callable[[], Scene | None]) -> Scene | None:
+    """Return the scene of a loader; None if the photographs are missing or, with a warning, if they cannot be read."""
+    try:
+        return load_scene()
+    except (OSError, ValueError) as error:
+        warnings.warn(f"the photographs are left out: {error}", stacklevel=2)
+        return None
 
 
 class ServedPhotographs:
@@ -181,11 +190,12 @@ class ServedPhotographs:
 
 
 def routes_of(source: Source) -> dict[str, Route]:
-    """Return the routes of the viewer's server."""
+    """Return the routes of the viewer's server. Photographs that cannot be read are left out, with a warning."""
+    load_scene = functools.partial(scene_or_warning, source.load_scene)
     return {
         "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
-        **ServedPhotographs(source.model.origin, source.load_scene).routes,
+        **ServedPhotographs(source.model.origin, load_scene).routes,
     }
 
 

@@ -14,7 +14,7 @@ from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_o
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of
+from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of, scene_or_warning
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
@@ -110,7 +110,7 @@ def _losses_of(source: Source) -> dict[str, float]:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
     again = decode_web_scene(source.encoded).model
-    scene = source.load_scene()
+    scene = scene_or_warning(source.load_scene)
     if scene is not None:
         views = {"training views": scene.train, "test views": scene.test}
         chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
