@@ -14,7 +14,7 @@ from PIL import Image
 from a2tg_jax.data import decoding, run_sfm
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_facts, read_pixels
 from a2tg_jax.data.images import check_inside, locate_image
-from a2tg_jax.results.images import picture_names
+from a2tg_jax.results.images import picture_names, save_picture
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
 """Of the colour types of PNG."""
@@ -209,3 +209,15 @@ def test_results_never_share_a_file():
     assert found["d/e/f.png"] == "d_e_f.png" and found["c.jpg"] == "c.png" and found["c.png"] == "c-2.png"
     assert found == picture_names(reversed(names))
     assert not any("/" in name for name in found.values())
+
+
+def test_results_of_photographs_with_long_names_are_files(tmp_path):
+    """Of 79 letters with 3 bytes each, of folders, and of names that differ at their end alone."""
+    folders = "/".join(["f" * 80] * 3)
+    names = ["\u5834" * 79 + ".png", f"{folders}/a.png", f"{folders}/A.png", f"{folders}/b.png", "x" * 190 + ".jpg"]
+    found = picture_names(names)
+    assert len({name.casefold() for name in found.values()}) == len(names)
+    assert found[names[0]].startswith("\u5834" * 63 + "-") and found[names[-1]] == "x" * 190 + ".png"
+    for name in found.values():
+        save_picture(tmp_path / name, np.zeros((2, 2, 3), np.uint8))
+    assert {path.name for path in tmp_path.iterdir()} == set(found.values())

@@ -5,6 +5,7 @@ Images are uint8 [H, W, 3] unless said otherwise.
 
 import base64
 import dataclasses
+import hashlib
 import io
 import itertools
 import os
@@ -31,6 +32,8 @@ CHECKER = (0.75, 0.55)
 MARGIN, CAPTION_HEIGHT = 6, 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 """Font of captions; Pillow's own lacks × and ²."""
+LONGEST_STEM = 190
+"""Bytes that a file name takes of a view's; file systems take 255, of which `replacing` and numbers need some."""
 LONGEST_SIDE = 1280
 """Longest side of a picture in the report, in pixels."""
 
@@ -112,17 +115,26 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     """Return unique file names of the views' pictures, regardless of case; folders become part of the name.
 
-    If that name is taken, as with a/b.png and a_b.jpg, a number follows; names count in their sorted order.
+    Long names are cut and end in a hash. If a name is taken, as with a/b.png and a_b.jpg, a number follows; names count
+    in their sorted order.
     """
     names: dict[str, str] = {}
     taken: set[str] = set()
     for view_name in sorted(view_names):
-        stem = os.path.splitext(view_name)[0].replace("/", "_")
+        stem = _of_file(os.path.splitext(view_name)[0].replace("/", "_"))
         choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
         chosen = next(choice for choice in choices if choice.casefold() not in taken)
         taken.add(chosen.casefold())
         names[view_name] = f"{chosen}.png"
     return names
+
+
+def _of_file(stem: str) -> str:
+    """Return the stem of a file name that file systems take: a long one is cut, and told apart by a hash."""
+    data = stem.encode(errors="surrogatepass")
+    if len(data) <= LONGEST_STEM:
+        return stem
+    return f"{data[:LONGEST_STEM].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
 
 
 def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
