@@ -102,6 +102,7 @@ MISTAKES = {
     "finish photos --out new": "is not a run folder",
     "finish done --out done/new": "overlap: choose an output folder",
     "finish done --out photos": "not a run folder",
+    "finish done --out run": "error: run is not empty; choose another --out\n",
     "finish done --out new --max-loss -1": "--max-loss must be at least 0 dB",
     "finish done --out new --polish-steps -1": "--polish-steps must be at least 0",
     "finish done --out new --polish-steps 0": "nothing that these options can shrink or polish",

@@ -76,7 +76,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
       ValueError: if the model has nothing to shrink or polish, or an option is out of range.
     """
     options.check()
-    check_free(out)
+    check_free(out, in_use="is not empty; choose another --out")
     record = read_record(source)
     planned = record.plan[record.plan.main[-1]]
     path = source.model(planned.name)

@@ -42,6 +42,8 @@ from a2tg_jax.io.config_json import config_from_dict
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
+IN_USE = "is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
+"""What training tells of a folder that holds a run."""
 MOST_NAMES = 100_000
 """Largest number of files that a marker may list."""
 MOST_MARKER_BYTES = 1 << 24
@@ -201,8 +203,13 @@ def iteration_of(checkpoint: Path) -> int:
     return int(checkpoint.stem.rpartition("-")[2])
 
 
-def check_free(path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+def check_free(path: str | os.PathLike[str], *, overwrite: bool = False, in_use: str = IN_USE) -> None:
     """Raise if a new run must not be made in a folder. The folder is not touched.
+
+    Args:
+      path: the folder.
+      overwrite: whether a run that is in it may be replaced.
+      in_use: what is told of a folder that holds a run, with what the command at hand can do about it.
 
     Raises:
       FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a
@@ -218,9 +225,7 @@ def check_free(path: str | os.PathLike[str], *, overwrite: bool = False) -> None
     if not run.written():
         raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with --out")
     if not overwrite:
-        raise FileExistsError(
-            f"{path} is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
-        )
+        raise FileExistsError(f"{path} {in_use}")
 
 
 def create_run(path: str | os.PathLike[str]) -> RunFolder:
