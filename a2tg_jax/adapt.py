@@ -18,9 +18,18 @@ from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.spread_arrays import on_host, placed_like
-from a2tg_jax.events import Change, Due, HostEvent, Seen, Statistic, event, iterations_at, static
+from a2tg_jax.events import Change, Due, FieldError, HostEvent, Seen, Statistic, event, iterations_at, static
 from a2tg_jax.model import Model
-from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Shape, Textures, check_textures, plan_layout
+from a2tg_jax.texture import (
+    BYTES_PER_TEXEL,
+    MAX_SIDE,
+    NEUTRAL_TEXEL,
+    AtlasLayout,
+    Shape,
+    Textures,
+    check_textures,
+    plan_layout,
+)
 
 PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
@@ -84,12 +93,24 @@ class Upscale(UpscaleChoices, HostEvent):
         return self.gradient
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        self._check_choices()
         fractions = self.at
         if fractions is None:
             interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
         return iterations_at(fractions, num_iterations, of=self)
+
+    def _check_choices(self) -> None:
+        """Raise FieldError if a number is out of range, or missing for the rule."""
+        if not 1 <= self.cap <= MAX_SIDE:
+            raise FieldError(self, f"{{cap}} must lie in 1..{MAX_SIDE}; got {self.cap}")
+        if not 0 <= self.fraction <= 1:
+            raise FieldError(self, f"{{fraction}} must lie in [0, 1]; got {self.fraction}")
+        if self.select == "budget" and self.budget_mb is None:
+            raise FieldError(self, "{select} is 'budget', so {budget_mb} must say how many MB (10^6 bytes)")
+        if self.select == "threshold" and self.threshold is None:
+            raise FieldError(self, "{select} is 'threshold', so {threshold} must say which average gradient")
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         if self.select == "budget":

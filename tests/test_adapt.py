@@ -1,5 +1,6 @@
 """Adaptation: the table of the rule, the laws of the selection, the rebuild against a naive loop."""
 
+import dataclasses
 import time
 
 import jax
@@ -15,6 +16,7 @@ from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
+from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
@@ -236,6 +238,21 @@ def test_padding_is_neutral_and_has_no_moments():
 def test_upscalings_that_fall_together_are_one():
     assert Upscale(at=(0.1, 0.2, 0.9)).iterations(3) == (1, 3)
     assert Upscale(at=(0.1, 0.2, 0.9)).iterations(100) == (10, 20, 90)
+
+
+@pytest.mark.parametrize(
+    "event, message",
+    [
+        (Upscale("threshold"), "^select is 'threshold', so threshold must say which average gradient$"),
+        (Upscale("budget"), r"^select is 'budget', so budget_mb must say how many MB \(10\^6 bytes\)$"),
+        (Upscale(cap=32), r"^cap must lie in 1\.\.16; got 32$"),
+        (Upscale(fraction=1.5), r"^fraction must lie in \[0, 1\]; got 1\.5$"),
+    ],
+)
+def test_impossible_choices_are_refused_before_training(event, message):
+    stage = A2tg.preset("smoke").stages()[1]
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(stage, events=(event,)).check()
 
 
 @pytest.mark.parametrize("select, number", [("fraction", 0.5), ("budget", (2 * 248 + 48) / 1e6)])

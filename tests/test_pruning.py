@@ -120,11 +120,25 @@ def test_times_must_exist(at):
 
 @pytest.mark.parametrize(
     "event, message",
-    [(Prune(share=1.0), r"share must lie in \[0, 1\); got 1.0"), (Prune(share=-0.1), "share"), (Prune(keep=0), "keep")],
+    [
+        (Prune(share=1.0), r"^share must lie in \[0, 1\); got 1.0$"),
+        (Prune(share=-0.1), "^share"),
+        (Prune(keep=1), "^keep must be at least 2 Gaussians; got 1$"),
+    ],
 )
-def test_more_than_there_are_cannot_go(event, message):
+def test_impossible_numbers_are_refused_before_training(event, message):
+    stage = a2tg.Gaussians2dMcmc.preset("smoke").stages()[0]
     with pytest.raises(ValueError, match=message):
-        pruned(event)
+        dataclasses.replace(stage, events=(event,)).check()
+
+
+def test_two_gaussians_are_left_at_least():
+    """Of 300, a share of 0.993 leaves 2. One of 0.997 would leave 1, so all stay."""
+    assert pruned(Prune(share=0.993))[-1].model.num == 2
+    with pytest.warns(
+        UserWarning, match=r"^nothing is pruned, for 1 of 300 Gaussians .* needs 2: lower --prune\.share$"
+    ):
+        assert pruned(Prune(share=0.997))[-1].model.num == 300
 
 
 def test_what_has_no_row_for_each_gaussian_does_not_move_by_itself():

@@ -10,7 +10,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View
-from a2tg_jax.densify.pruning import kept_first, pruning_times, shown_in
+from a2tg_jax.densify.pruning import LEAST_LEFT, kept_first, pruning_times, shown_in
 from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, static
 from a2tg_jax.model import Model
 
@@ -66,10 +66,10 @@ class PruneFloaters(HostEvent):
             limits = np.maximum(limits, self.near_share * nearest)
         if self.near or self.near_share:
             is_kept &= ~are_near(means, due.views, limits)
-        if is_kept.sum() < 2:
+        if is_kept.sum() < LEAST_LEFT:
             warnings.warn(
                 f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "
-                "2: lower --floaters.near, --floaters.near-share or --floaters.min-views",
+                f"{LEAST_LEFT}: lower --floaters.near, --floaters.near-share or --floaters.min-views",
                 stacklevel=2,
             )
             is_kept[:] = True

@@ -7,6 +7,7 @@ events use statistics of the steps; this one renders, because a weight is no gra
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from jax import Array
 
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.spread_arrays import mesh_of, on_host, placed_like
@@ -31,6 +33,9 @@ from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 
+LEAST_LEFT = 2
+"""Smallest number of Gaussians that training needs."""
+
 
 @event
 class Prune(HostEvent):
@@ -40,15 +45,20 @@ class Prune(HostEvent):
     """
 
     share: float = 0.1
-    """Share of the Gaussians removed each time, in [0, 1); ignored if `keep` is given."""
+    """Share of the Gaussians removed each time, in [0, 1); ignored if `keep` is given. If fewer than 2 would be left,
+    none is removed, with a warning."""
     keep: int | None = static(default=None)
-    """Largest number of Gaussians left each time."""
+    """Largest number of Gaussians left each time, at least 2."""
     at: tuple[float, ...] = static(default=(1.0,))
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
     reads_whole = False
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        if self.keep is not None and self.keep < LEAST_LEFT:
+            raise FieldError(self, f"{{keep}} must be at least {LEAST_LEFT} Gaussians; got {self.keep}")
+        if self.keep is None and not 0 <= self.share < 1:
+            raise FieldError(self, f"{{share}} must lie in [0, 1); got {self.share}")
         return pruning_times(self, self.at, num_iterations)
 
     def num_after(self, num: int, num_iterations: int) -> int:
@@ -66,12 +76,16 @@ class Prune(HostEvent):
 
     def _num_left(self, num: int) -> int:
         if self.keep is not None:
-            if self.keep < 1:
-                raise FieldError(self, f"{{keep}} must be at least 1 Gaussian; got {self.keep}")
             return min(num, self.keep)
-        if not 0 <= self.share < 1:
-            raise FieldError(self, f"{{share}} must lie in [0, 1); got {self.share}")
-        return num - round(num * float(self.share))
+        left = num - round(num * float(self.share))
+        if left >= LEAST_LEFT:
+            return left
+        warnings.warn(
+            f"nothing is pruned, for {left} of {counted(num, 'Gaussian')} would be left, and training needs "
+            f"{LEAST_LEFT}: lower --prune.share",
+            stacklevel=3,
+        )
+        return num
 
 
 def pruning_times(of: HostEvent, at: tuple[float, ...], num_iterations: int) -> tuple[int, ...]:

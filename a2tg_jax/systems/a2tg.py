@@ -77,15 +77,7 @@ class TextureConfig(UpscaleChoices):
                 )
 
     def event(self) -> Upscale:
-        """Return the upscaling of these options.
-
-        Raises:
-          ValueError: if the option that `select` needs is missing.
-        """
-        if self.select == "budget" and self.budget_mb is None:
-            raise ValueError("texture.select is 'budget', so texture.budget_mb must say how many MB (10^6 bytes)")
-        if self.select == "threshold" and self.threshold is None:
-            raise ValueError("texture.select is 'threshold', so texture.threshold must say which average gradient")
+        """Return the upscaling of these options."""
         return from_options(Upscale, self, at=self.upscale_at)
 
     @staticmethod
