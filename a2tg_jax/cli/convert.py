@@ -45,5 +45,8 @@ class Convert:
     """Replace the output file."""
 
     def run(self) -> None:
-        baking = BakeOptions(self.bake_growth, self.bake_iterations) if self.bake else None
+        options = BakeOptions(self.bake_growth, self.bake_iterations)
+        if not self.bake and options != BakeOptions():
+            raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
+        baking = options if self.bake else None
         print(convert(self.source, self.out, self.model, baking=baking, overwrite=self.overwrite).text)

@@ -59,6 +59,8 @@ class Render:
         run = open_run(self.folder)
         out = self.out or run.path / "frames"
         check_rate(self.fps)
+        if self.path == "test" and (self.frames, self.fps) != (Render.frames, Render.fps):
+            raise ValueError("--frames and --fps are of a flight and have no effect on --path test: leave them out")
         size = None if self.size is None else parse_size(self.size)
         if self.supersample < 1:
             raise ValueError(f"--supersample must be at least 1; got {self.supersample}")

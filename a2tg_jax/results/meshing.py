@@ -83,6 +83,8 @@ class MeshOptions:
             if out.suffix.lower() == ".ply":
                 raise ValueError("a PLY file holds no texture: choose --out NAME.glb or NAME.obj, or --texture none")
             check_texture(self.texture_size)
+        elif self.texture_size != MeshOptions.texture_size:
+            raise ValueError("texture_size has no effect without a texture: add --texture renders or photographs")
         if self.most_faces is not None:
             check_simplifying(self.most_faces)
 
