@@ -194,6 +194,21 @@ def test_times_after_the_last_growth_are_refused():
     dataclasses.replace(a2tg.Gaussians2dMcmc(), prune=PruneConfig(share=0.3, at=(0.6, 0.7))).check()
 
 
+def test_times_after_the_last_growth_of_a_short_stage_are_refused():
+    """In a long stage the last growth is at 0.5; in 200 iterations it is at 90."""
+    pruning = {"prune": {"share": 0.5, "at": (0.49,)}}
+    message = r"^prune\.at must hold a fraction before the last growth, .* 90 of 200; got \(0\.49,\): lower the first"
+    with pytest.raises(ValueError, match=message):
+        a2tg.Gaussians2d.preset("smoke", stage1_iterations=200, **pruning).check()
+    a2tg.Gaussians2d.preset("smoke", stage1_iterations=30_000, **pruning).check()
+
+
+@pytest.mark.parametrize("iterations", [1, 10, 11, 12, 30, 60, 100])
+def test_default_times_suit_short_stages(iterations):
+    """Some have no growth, and then no pruning."""
+    a2tg.Bytewise.preset("smoke", stage1_iterations=iterations).check()
+
+
 def test_what_other_events_have_gathered_follows(scene):
     run = StageRun(scene, SYSTEM, 0, initial_model(scene, SYSTEM))
     first = SYSTEM.stages()[0].events[2].iterations(200)[0]

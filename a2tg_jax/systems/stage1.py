@@ -117,6 +117,9 @@ class PruneConfig:
         Args:
           num_iterations: length of the stage.
           growth: times of growth in a stage by its length.
+
+        Raises:
+          ValueError: if no fraction is left, though others grow.
         """
         if not self.share:
             return ()
@@ -131,7 +134,13 @@ class PruneConfig:
             raise ValueError(
                 f"prune.at must begin before the last growth, at {ends:.2g} of the stage; got {shortened(self.at)}"
             )
-        at = during_growth(self.at, num_iterations, growth(num_iterations))
+        times = growth(num_iterations)
+        at = during_growth(self.at, num_iterations, times)
+        if not at and times.num_times:
+            raise ValueError(
+                f"prune.at must hold a fraction before the last growth, which is at iteration {times.last_time:,} of "
+                f"{num_iterations:,}; got {shortened(self.at)}: lower the first, or set prune.share to 0"
+            )
         return (from_options(Prune, self, at=at),) if at else ()
 
 
