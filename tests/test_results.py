@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 import tomllib
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,6 +33,7 @@ from a2tg_jax.results.record import (
     SceneSource,
     changed_numbers,
     read_record,
+    read_run_file,
     repeating_command,
     write_record,
 )
@@ -247,6 +249,18 @@ def test_configuration_file_says_a_part(tmp_path):
     assert (record.system.stage1_iterations, record.system.densify.cap) == (2_000, 10_000)
     assert (record.system.texture.k_a, record.system.texture.upscale_at) == (9.0, (0.25, 0.5))
     assert all(isinstance(number, float) for number in (record.system.texture.k_a, *record.system.texture.upscale_at))
+
+
+@pytest.mark.parametrize("scene", ["../fox", "synthetic"])
+def test_paths_in_a_configuration_file_start_from_its_folder(tmp_path, monkeypatch, scene):
+    (tmp_path / "files").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for given in ("splats/fox.ply", str(tmp_path / "files/splats/fox.ply")):
+        (tmp_path / "files/mine.toml").write_text(f'scene = "{scene}"\ninit = "{given}"\n')
+        file = read_run_file(Path("../files/mine.toml"))
+        assert file.init == str(tmp_path / "files/splats/fox.ply")
+        assert file.scene == ("synthetic" if scene == "synthetic" else str(tmp_path / "fox"))
 
 
 @pytest.mark.parametrize(

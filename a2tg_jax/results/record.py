@@ -228,7 +228,7 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
 
 
 def read_run_file(path: Path) -> RunFile:
-    """Read a configuration file.
+    """Read a configuration file. Relative paths in it start from its folder.
 
     Raises:
       FileNotFoundError: if there is none.
@@ -242,6 +242,8 @@ def read_run_file(path: Path) -> RunFile:
     except ValueError as error:
         raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
     file = config_from_dict(RunFile, {**config_to_dict(RunFile()), **table}, f"{path}:")
+    if file.init is not None:
+        file = dataclasses.replace(file, init=os.path.realpath(path.parent / file.init))
     if file.scene is None or file.scene == SYNTHETIC:
         return file
     return dataclasses.replace(file, scene=scene_place(file.scene, path.parent))
