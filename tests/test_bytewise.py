@@ -104,6 +104,14 @@ def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
         system.check_given_number(most + 1)
 
 
+def test_textures_must_be_able_to_exceed_one_texel():
+    """Textures of 1×1 have a rate of 0, so that their bytes would be lost."""
+    with pytest.raises(ValueError, match=r"^texture\.cap must lie in 2\.\.16; got 1$"):
+        Bytewise.preset("quick", texture={"cap": 1}).check()
+    for texture in ({"cap": 2}, {"cap": 1, "share": 0.0}):
+        Bytewise.preset("quick", texture=texture).check()
+
+
 def test_given_gaussians_without_details_may_be_any_number():
     Bytewise.preset("quick", view_dependence={"share": 0.0}, texture={"share": 0.0}).check_given_number(100_000)
 
@@ -145,7 +153,7 @@ def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():
         ({"view_dependence": {"share": -0.1}}, "view_dependence.share must lie in 0..1; got -0.1"),
         ({"texture": {"rate": -1.0}}, "texture.rate must lie in 0..inf"),
         ({"kernel": {"rate": -1.0}}, "kernel.rate must lie in 0..inf"),
-        ({"texture": {"cap": 32}}, "texture.cap must lie in 1..16; got 32"),
+        ({"texture": {"cap": 32}}, "texture.cap must lie in 2..16; got 32"),
         ({"view_dependence": {"idle": -1.0}}, "view_dependence.idle must lie in 0..inf"),
         ({"sh_degree": 4}, "sh_degree must lie in 0..3"),
         ({"base_degree": 2, "sh_degree": 1}, "base_degree must lie in 0..1; got 2"),

@@ -82,7 +82,7 @@ class DetailTextureConfig:
     rate: float = 2.5e-3
     """Adam's learning rate of the texels."""
     cap: int = Upscale.cap
-    """Largest texture side in texels (at most 16)."""
+    """Largest texture side in texels, 2 to 16; textures of one texel are not trained."""
     at: tuple[float, ...] = (0.1, 0.2, 0.3)
     """Fractions of the second stage at which textures grow."""
     lookup: TextureOptions = dataclasses.field(default_factory=TextureOptions)
@@ -215,7 +215,7 @@ class Bytewise(System):
             "view_dependence.idle": (view.idle, 0, math.inf),
             "texture.share": (texture.share, 0, 1),
             "texture.rate": (texture.rate, 0, math.inf),
-            "texture.cap": (texture.cap, 1, MAX_SIDE),
+            "texture.cap": (texture.cap, 2 if texture.share else 1, MAX_SIDE),
         }
         for name, (value, least, most) in ranges.items():
             if not least <= value <= most:
