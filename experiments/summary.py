@@ -1,7 +1,7 @@
 """Gains at equal bytes with 95 % intervals over scenes: the two tables of docs/results.md."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from equal_bytes import GRIDS, at_budget, on_scene, told_gain, unique
 from lab import tables
@@ -12,12 +12,14 @@ from lab.versions import is_from_before
 BYTEWISE, TEXTURED, PLAIN = "Bytewise", "A²TG, as quick has it", "2DGS*-MCMC"
 GAUSSIAN = f"{BYTEWISE}, Gaussian kernels"
 MCMC_0 = f"{PLAIN}, degree 0"
-PLAIN_METHODS = (MCMC_0, "2DGS*, degree 0", f"{MCMC_0}, pruned", "2DGS*, degree 0, pruned")
+UNPRUNED_METHODS = (MCMC_0, "2DGS*, degree 0")
+PLAIN_METHODS = (*UNPRUNED_METHODS, *(f"{label}, pruned" for label in UNPRUNED_METHODS))
 """Plain methods of which a cell must have all before its best one is named."""
-BEST = "the best plain method"
+BEST, BEST_UNPRUNED = "the best plain method", "the best plain method without pruning"
 OTHERS = {
     f"{BYTEWISE} less {BEST}": (BYTEWISE, BEST),
     f"{GAUSSIAN}, less {BEST}": (GAUSSIAN, BEST),
+    f"{BYTEWISE} less {BEST_UNPRUNED}": (BYTEWISE, BEST_UNPRUNED),
     f"{BYTEWISE} less the same with Gaussian kernels": (BYTEWISE, GAUSSIAN),
     f"{BYTEWISE} less MCMC of degree 0": (BYTEWISE, MCMC_0),
     f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
@@ -42,7 +44,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 def bytes_table(results: Sequence[tables.Result]) -> str:
     """Return the gains of `bytewise`: by scene over the best plain method, on average over others."""
-    results = [*results, *best_plain(results)]
+    best = [*best_plain(results, PLAIN_METHODS, BEST), *best_plain(results, UNPRUNED_METHODS, BEST_UNPRUNED)]
+    results = [*results, *best]
     budgets = sorted({result.run.cell.budget or 0.0 for result in results})
     found = [at_budget(results, budget) for budget in budgets]
     scenes, rows = sorted({result.run.cell.scene.label for result in results}), []
@@ -54,14 +57,14 @@ def bytes_table(results: Sequence[tables.Result]) -> str:
     return tables.markdown(["", *(f"{budget:g} MB: dB · LPIPS" for budget in budgets)], rows)
 
 
-def best_plain(results: Sequence[tables.Result]) -> list[tables.Result]:
-    """Return the plain result of the highest PSNR of each cell that has the methods to compare, as one method."""
+def best_plain(results: Sequence[tables.Result], methods: Collection[str], label: str) -> list[tables.Result]:
+    """Return the result of the highest PSNR of each cell that has all of some methods, as one method of that label."""
     best = []
     for _, block in tables.grouped(results, lambda result: result.run.cell):
-        plain = [result for result in block if result.label in PLAIN_METHODS]
-        if {result.label for result in plain} == set(PLAIN_METHODS):
+        plain = [result for result in block if result.label in methods]
+        if {result.label for result in plain} == set(methods):
             highest = max(plain, key=lambda result: result["psnr"])
-            method = dataclasses.replace(highest.run.method, label=BEST)
+            method = dataclasses.replace(highest.run.method, label=label)
             best.append(dataclasses.replace(highest, run=dataclasses.replace(highest.run, method=method)))
     return best
 

@@ -44,11 +44,12 @@ def test_the_best_plain_method_is_that_of_each_cell_which_has_all():
     results = [result(label, 20.0 + place) for place, label in enumerate([first, *reversed(others)])]
     results += [result(label, 24.0 - place, 1) for place, label in enumerate([first, *others])]
     results += [result(first, 30.0, 2), result(summary.BYTEWISE, 24.0), result(summary.BYTEWISE, 26.0, 1)]
-    best = summary.best_plain(results)
+    best = summary.best_plain(results, summary.PLAIN_METHODS, summary.BEST)
     assert [(one.run.cell.seed, one["psnr"]) for one in best] == [(0, 23), (1, 24)]
     assert {one.label for one in best} == {summary.BEST}
     told = summary.bytes_table([dataclasses.replace(one, run=with_budget(one.run, 0.3)) for one in results])
     assert "Bytewise less the best plain method: fox | +1.50" in told
+    assert "less the best plain method without pruning: mean** | +1.50" in told
     assert "less MCMC of degree 0: mean** | +3.00" in told
 
 
