@@ -1,6 +1,7 @@
 """Gains at equal bytes with 95 % intervals over scenes: the two tables of docs/results.md."""
 
 import dataclasses
+import re
 from collections.abc import Collection, Mapping, Sequence
 
 from equal_bytes import GRIDS, at_budget, on_scene, told_gain, unique
@@ -25,7 +26,7 @@ OTHERS = {
     f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
 }
 """Differences of means: what they are called, and the two methods."""
-BRACKETS = "\nA number of scenes in brackets stands where not all were run.\n"
+BRACKETS = "\nA number in brackets is the number of scenes, where not all were run.\n"
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -39,7 +40,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         "summary-textures": f"# Textures at equal bytes\n\n{textures_table(results, claimed)}",
     }
     for name, text in tables_of_pages.items():
-        lab.write(name, f"{text}{BRACKETS}", has_old_rows=False)
+        lab.write(name, text + (BRACKETS if re.search(r" \(\d+\)", text) else ""), has_old_rows=False)
 
 
 def bytes_table(results: Sequence[tables.Result]) -> str:
