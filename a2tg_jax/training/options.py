@@ -41,7 +41,8 @@ class System:
     where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
     left out. `gaussians-2d` and `supergaussians` refuse it: they prune splats of that size."""
     initial_opacity: float = 0.1
-    """Opacity of the Gaussians that training starts from."""
+    """Opacity of the Gaussians that training starts from. The pictures of `bbsplat` start as their authors' do, half
+    opaque in the middle, whatever it is."""
     memory_budget: float | str | None = None
     """Memory budget of the model: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The model stays within it at every
     iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, in place of densify.cap."""
