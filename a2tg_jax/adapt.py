@@ -112,9 +112,14 @@ class Upscale(UpscaleChoices, HostEvent):
         if self.select == "threshold" and self.threshold is None:
             raise FieldError(self, "{select} is 'threshold', so {threshold} must say which average gradient")
 
+    @property
+    def _budget_bytes(self) -> int:
+        assert self.budget_mb is not None, "refused by `iterations`"
+        return bytes_of(self.budget_mb)
+
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         if self.select == "budget":
-            return max(num_bytes, bytes_of(self.budget_mb or 0.0))
+            return max(num_bytes, self._budget_bytes)
         # Most who grow have grown before; how many pass a threshold is not known.
         share = self.fraction if self.select == "fraction" else USUAL_SHARE
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
@@ -171,7 +176,7 @@ class Upscale(UpscaleChoices, HostEvent):
     def _how_to_select(self, used_bytes: int, due: Due) -> dict[str, float]:
         """Return the keyword that tells `select` how to choose."""
         if self.select == "budget":
-            return {"budget_bytes": event_budget(bytes_of(self.budget_mb or 0.0), used_bytes, due.index, due.count)}
+            return {"budget_bytes": event_budget(self._budget_bytes, used_bytes, due.index, due.count)}
         return {self.select: getattr(self, self.select)}
 
 

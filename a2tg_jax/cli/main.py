@@ -25,12 +25,11 @@ from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
 from a2tg_jax.cli.view import Export, View
 from a2tg_jax.host import signals
-from a2tg_jax.host.memory import lack_of_memory
+from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import FORMATS
-from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results.compression import SUFFIX, compress, compression_text, default_output, is_written_by
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
@@ -44,14 +43,12 @@ from a2tg_jax.training import SYSTEMS
 BROKEN_PIPE = 128 + 13
 LONGEST_ERROR = 1000
 """Characters of the line that tells an error."""
-OTHER_SUFFIXES = tuple(suffix for suffix, kind in FORMATS.items() if kind.load is not load_model)
-"""Suffixes of files that are no models, which a2tg compress does not read."""
 SMALLER = {
     "train": LESS_MEMORY,
     "render": "lower --size or --supersample",
     "mesh": "lower --resolution, --radius or --texture-size",
 }
-"""Advice by command if the memory does not suffice; "close other programs" for the others."""
+"""Advice by command for a lack of memory; other commands say "close other programs"."""
 OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
@@ -135,7 +132,7 @@ class Compress:
 
     def run(self) -> None:
         name = self.source.name.lower()
-        if not self.source.is_dir() and name.endswith(OTHER_SUFFIXES):
+        if not self.source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
             told = ", which is compressed already" if name.endswith(SUFFIX) else ""
             raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(self.source))}{told}")
         out = self.out or default_output(self.source)
@@ -143,9 +140,7 @@ class Compress:
         if self.out is not None or not is_written_by(self.source, out):
             check_new(out, "--out", overwrite=self.overwrite)
         tell = functools.partial(print, flush=True)
-        found = compress(
-            self.source, self.out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell
-        )
+        found = compress(self.source, out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell)
         print(compression_text(found))
 
 
@@ -211,7 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except Exception as error:
-        told = _told(name, error)
+        told = error_text(error, SMALLER.get(name, "close other programs"))
         if told is None or os.environ.get("A2TG_DEBUG"):
             raise
         return _fail(with_flags(told, arguments))
@@ -226,14 +221,6 @@ def _find_own_systems() -> None:
         raise ValueError("the current folder was deleted: change to one that exists") from None
     if here not in sys.path:
         sys.path.append(here)
-
-
-def _told(name: str, error: Exception) -> str | None:
-    """Return what to tell of a user's error, or of a lack of memory; None for an error of the program itself."""
-    lack = lack_of_memory(error)
-    if lack is not None:
-        return f"{lack}: {SMALLER.get(name, 'close other programs')}"
-    return str(error) if isinstance(error, ValueError | OSError) else None
 
 
 def _fail(message: str) -> int:

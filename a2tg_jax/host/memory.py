@@ -6,7 +6,6 @@ import jax
 
 from a2tg_jax.host.control_groups import group_folders
 from a2tg_jax.host.operating_system import machine_memory, memory_mappings, memory_numbers, trim_heap
-from a2tg_jax.host.text import shortened
 
 LARGEST_SHARE = 0.6
 """Share of the memory mappings allowed to a process beyond which compiled programs are dropped."""
@@ -45,15 +44,6 @@ def _left_in(folder: Path) -> int | None:
         except (OSError, ValueError):
             continue  # of the other version, or "max"
     return None
-
-
-def lack_of_memory(error: BaseException) -> str | None:
-    """Return the words of an error that says that the machine or a device has run out of memory; None for others."""
-    is_of_device = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
-    if not is_of_device and not isinstance(error, MemoryError):
-        return None
-    details = shortened(str(error), 120)
-    return f"the memory does not suffice ({details})" if details else "the memory does not suffice"
 
 
 def tidy_memory() -> None:

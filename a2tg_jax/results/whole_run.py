@@ -7,8 +7,8 @@ from pathlib import Path
 
 from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
+from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices
-from a2tg_jax.host.memory import lack_of_memory
 from a2tg_jax.host.processes import team
 from a2tg_jax.results.first_stage import GivenSplats, given_splats
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
@@ -155,12 +155,11 @@ def _advised(run: RunFolder, devices: Devices | None, *, is_replacing: bool) -> 
         number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
         raise signals.Stopped(number, advice()) from None
     except Exception as error:
-        lack = lack_of_memory(error)
-        if lack is None and not isinstance(error, ValueError | OSError):
+        told = error_text(error, LESS_MEMORY)
+        if told is None:
             raise
         if others is not None:
             others.told(error)
-        told = error if lack is None else f"{lack}: {LESS_MEMORY}"
         raise ValueError(f"{told}; {advice()}") from error
 
 

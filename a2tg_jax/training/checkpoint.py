@@ -119,7 +119,7 @@ class Checkpoint:
     devices: Devices = ALONE
     """Devices that trained it; it can go on with others."""
     num_refused: int = 0
-    """Number of times so far that there was no room for a Gaussian which should have been added."""
+    """Number of Gaussians so far that were not added for lack of room."""
 
     @property
     def iteration(self) -> int:
@@ -217,12 +217,12 @@ def _checkpoint_of(
     state, history = TrainState(model, moments, *others), History(**columns)
     check_state(state, wanted, stage)
     check_history(history)
-    counts = [header.get(name, 0) for name in ("num_restored", "num_refused")]
-    check_count("num_restored", counts[0], MOST_COUNTED)
-    check_count("num_refused", counts[1], MOST_COUNTED)
+    counts = {name: header.get(name, 0) for name in ("num_restored", "num_refused")}
+    for name, count in counts.items():
+        check_count(name, count, MOST_COUNTED)
     machine = config_from_dict(Machine, header["machine"], "machine") if "machine" in header else None
     devices = config_from_dict(Devices, header.get("devices", {}), "devices")
-    return Checkpoint(options, header["stage"], state, history, counts[0], machine, devices, counts[1])
+    return Checkpoint(options, header["stage"], state, history, machine=machine, devices=devices, **counts)
 
 
 MOST_COUNTED = 2**31 - 1

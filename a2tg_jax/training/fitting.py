@@ -118,7 +118,6 @@ def fit(
     """
     _check_arguments(scene, system, resume)
     if resume is None:
-        check_views(scene.train)
         check_start(scene, system)
     else:
         check_resume(resume, system, resume.stage)
@@ -145,7 +144,7 @@ def fit(
 
 
 def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
-    """Raise ValueError unless the arguments are of their classes and the options are valid."""
+    """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     is_path = str, os.PathLike
     check_kind("scene", scene, Scene, f"say load_scene({shortened(scene)!r})" if isinstance(scene, is_path) else "")
     if isinstance(system, str):
@@ -155,6 +154,7 @@ def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) ->
     if resume is not None:
         check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
     system.check()
+    check_views(scene.train)
 
 
 def fit_stage(
@@ -189,7 +189,6 @@ def fit_stage(
         raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
-    check_views(scene.train)
     if system.stages()[index].has_depths:
         check_depths(scene.train)
     if start is None and resume is None:
