@@ -93,7 +93,7 @@ def test_without_a_budget_the_cap_says_how_many_bytes():
 @pytest.mark.parametrize("limit", [{"densify": {"cap": 1_000}}, {"memory_budget": "56kB"}])
 @pytest.mark.parametrize(("shares", "most"), [((0.1, 0.02), 980), ((0.0, 0.02), 1_000), ((0.1, 0.0), 1_000)])
 def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
-    """At 56 bytes each. Degrees must leave the share of textures; textures take what is left."""
+    """A Gaussian takes 56 bytes. Degrees must leave the share of textures; textures take the rest."""
     changes = {"view_dependence": {"share": shares[0]}, "texture": {"share": shares[1]}}
     system = Bytewise.preset("quick", **changes, **limit)
     system.check_given_number(most)

@@ -93,7 +93,7 @@ def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_pat
 
 
 def test_tables_without_rows_are_finite():
-    """As those of `bytewise` are while no Gaussian has a degree."""
+    """The tables of `bytewise` have no rows until a Gaussian gets a degree."""
     gaussians = init_from_points(np.eye(3), np.zeros((3, 3)), sh_degree=0)
     tables, _ = Banded().allocate(jax.random.key(0), gaussians)
     assert not jax.tree.leaves(tables)[0].size and not list(_not_finite((gaussians, tables, ())))

@@ -212,7 +212,7 @@ def test_results_never_share_a_file():
 
 
 def test_results_of_photographs_with_long_names_are_files(tmp_path):
-    """Of 79 letters with 3 bytes each, of folders, and of names that differ at their end alone."""
+    """The names have 79 letters of 3 bytes, lie in nested folders, or differ only at their end."""
     folders = "/".join(["f" * 80] * 3)
     names = ["\u5834" * 79 + ".png", f"{folders}/a.png", f"{folders}/A.png", f"{folders}/b.png", "x" * 190 + ".jpg"]
     found = picture_names(names)

@@ -133,7 +133,7 @@ def test_impossible_numbers_are_refused_before_training(event, message):
 
 
 def test_two_gaussians_are_left_at_least():
-    """Of 300, a share of 0.993 leaves 2. One of 0.997 would leave 1, so all stay."""
+    """Pruning 0.993 of 300 Gaussians leaves 2. Pruning 0.997 would leave 1, so none is pruned."""
     assert pruned(Prune(share=0.993))[-1].model.num == 2
     with pytest.warns(
         UserWarning, match=r"^nothing is pruned, for 1 of 300 Gaussians .* needs 2: lower --prune\.share$"
@@ -195,7 +195,7 @@ def test_times_after_the_last_growth_are_refused():
 
 
 def test_times_after_the_last_growth_of_a_short_stage_are_refused():
-    """In a long stage the last growth is at 0.5; in 200 iterations it is at 90."""
+    """The last growth comes halfway through a long stage, but at iteration 90 of 200."""
     pruning = {"prune": {"share": 0.5, "at": (0.49,)}}
     message = r"^prune\.at must hold a fraction before the last growth, .* 90 of 200; got \(0\.49,\): lower the first"
     with pytest.raises(ValueError, match=message):

@@ -269,7 +269,7 @@ def test_gaussians_that_find_no_room_are_counted_and_said(scene):
 
 
 def test_a_resumed_training_says_what_found_no_room_before(scene, tmp_path):
-    """Nothing is added in the second half of the stage, from which it goes on."""
+    """The resumed part of the stage adds no Gaussians."""
     system = tiny("gaussians-2d", densify={"cap": 61, "threshold": 1e-9})
 
     def keep(checkpoint):

@@ -132,10 +132,10 @@ def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
-    They have the SH degree of the file, at most 3; a warning tells that higher ones are left out, as are further
-    attributes. The third scale (scale_2) of a file that
-    says that its splats are flat is dropped. Any other holds ellipsoids: the thinnest axis of each becomes the normal
-    and its scale is dropped, with a warning if that is more than a thousandth of the others.
+    They have the SH degree of the file. Degrees above 3 are left out with a warning; further attributes are ignored.
+    The third scale (scale_2) of a file that says that its splats are flat is dropped. Any other holds ellipsoids: the
+    thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
+    of the others.
 
     Returns:
       float32 Gaussians in the world of the file.

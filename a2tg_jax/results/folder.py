@@ -43,7 +43,7 @@ KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
 IN_USE = "is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
-"""What training tells of a folder that holds a run."""
+"""Error text of training for a folder that already holds a run."""
 MOST_NAMES = 100_000
 """Largest number of files that a marker may list."""
 MOST_MARKER_BYTES = 1 << 24
@@ -209,7 +209,7 @@ def check_free(path: str | os.PathLike[str], *, overwrite: bool = False, in_use:
     Args:
       path: the folder.
       overwrite: whether a run that is in it may be replaced.
-      in_use: what is told of a folder that holds a run, with what the command at hand can do about it.
+      in_use: error text for a folder that holds a run. It says what the command at hand can do.
 
     Raises:
       FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a

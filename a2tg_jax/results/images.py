@@ -33,7 +33,7 @@ MARGIN, CAPTION_HEIGHT = 6, 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 """Font of captions; Pillow's own lacks × and ²."""
 LONGEST_STEM = 190
-"""Bytes that a file name takes of a view's; file systems take 255, of which `replacing` and numbers need some."""
+"""Largest number of bytes of a view's name in a file name. File systems allow 255; `replacing` and numbers add some."""
 LONGEST_SIDE = 1280
 """Longest side of a picture in the report, in pixels."""
 

@@ -33,7 +33,7 @@ class RobustPhotometric:
     start: float = 0.25
     """Share of the stage after which something is left out; before, much is outlying that is not learned yet."""
     has_ssim: bool = static(default=True)
-    """Whether SSIM is computed; False where its weight is 0, for images smaller than its window."""
+    """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
 
     has_geometry = False
 
