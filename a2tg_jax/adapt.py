@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.core.budget import bytes_of, event_budget, within_budget
+from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
@@ -27,8 +27,10 @@ from a2tg_jax.texture import (
     AtlasLayout,
     Shape,
     Textures,
+    bucket_capacity,
     check_textures,
     plan_layout,
+    shape_of,
 )
 
 PAPER_ITERATIONS = 30_000
@@ -125,6 +127,20 @@ class Upscale(UpscaleChoices, HostEvent):
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
         return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
+    def with_room(
+        self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
+    ) -> tuple[Model, AdamState]:
+        if model.textures is None or self.select != "budget":
+            return model, moments
+        textures, layout = model.textures
+        present = BYTES_PER_TEXEL * layout.count_texels(model.num)
+        left = self._budget_bytes - max(num_bytes, model.num_bytes) + present
+        room = most_textures(layout.sizes, left, self.cap)
+        if BYTES_PER_TEXEL * room.num_texels > MOST_ROOM * self._budget_bytes:
+            return model, moments
+        rebuilt = reallocate(textures, layout, layout.sizes, moments, room=room)
+        return model.with_textures(rebuilt.textures, rebuilt.layout), rebuilt.moments
+
     def init(self, model: Model) -> GradientStatistics:
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
@@ -151,8 +167,9 @@ class Upscale(UpscaleChoices, HostEvent):
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
-        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(due.shapes), kept)
-        due.shapes.add(Shape(rebuilt.layout.resolutions, tuple(map(len, rebuilt.textures.buckets))))
+        present = shape_of(textures, layout)
+        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(due.shapes), kept, present)
+        due.shapes.add(shape_of(rebuilt.textures, rebuilt.layout))
         model = model.with_textures(rebuilt.textures, rebuilt.layout)
         return Change(model, rebuilt.moments, self.init(model))
 
@@ -223,6 +240,35 @@ def next_sizes(
     return np.where(doubles, np.maximum(present, np.minimum(2 * present, cap)), present)
 
 
+def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
+    """Return a shape with room for all textures that `next_sizes` can make of some within a number of bytes (host).
+
+    Args:
+      sizes: [N, 2] present (Tv, Tu).
+      num_bytes: of all textures, at most.
+      cap: largest side.
+    """
+    present = {(int(height), int(width)) for height, width in np.unique(sizes, axis=0)}
+    reached, added = set(present), set(present)
+    while added:
+        larger = (_doubled(size, axes, cap) for size in added for axes in ((1, 2), (2, 1), (2, 2)))
+        added = set(larger) - reached
+        reached |= added
+    counts = {}
+    for height, width in sorted(reached):
+        area = height * width
+        count = int(min(len(sizes), num_bytes // (BYTES_PER_TEXEL * area))) if area else len(sizes)
+        if count > 0:
+            counts[height, width] = bucket_capacity(count)
+    return Shape(tuple(counts), tuple(counts.values()))
+
+
+def _doubled(size: tuple[int, int], factors: tuple[int, int], cap: int) -> tuple[int, int]:
+    """Return a size with each side multiplied by its factor, up to the cap; an empty one grows as 1×1 does."""
+    height, width = (max(1, side) for side in size)
+    return max(height, min(height * factors[0], cap)), max(width, min(width * factors[1], cap))
+
+
 def select(
     statistic: ArrayLike,
     sizes: ArrayLike,
@@ -280,6 +326,7 @@ def reallocate(
     moments: Any = None,
     known: Sequence[Shape] = (),
     kept: ArrayLike | None = None,
+    room: Shape | None = None,
 ) -> ReallocateResult:
     """Rebuild the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
@@ -293,6 +340,7 @@ def reallocate(
       moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay as they are.
       known: shapes of buckets to prefer (`texture.plan_layout`).
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
+      room: shape of the buckets, if the textures fit; None: as small as possible, or one of `known`.
 
     Raises:
       ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
@@ -300,7 +348,7 @@ def reallocate(
     new_sizes = np.asarray(new_sizes)
     check_textures(textures, layout, layout.num)
     check_shape("new_sizes", new_sizes, (layout.num, 2))
-    new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket)
+    new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket, room=room)
     texel_moves = moment_moves = _plan_moves(layout, new_layout)
     if kept is not None:
         check_shape("kept", kept, (layout.num,))

@@ -246,6 +246,20 @@ class HostEvent(Event):
         """Return the number of programs compiled because of it, about, for forecasts: one each time (host)."""
         return len(self.iterations(num_iterations))
 
+    def with_room(
+        self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
+    ) -> tuple[Model, AdamState]:
+        """Return model and moments with padding that the event will fill, so that its changes keep all shapes and no
+        step is compiled anew (host). The default adds none.
+
+        Args:
+          model: before the stage, or when it goes on.
+          moments: of the model.
+          num_bytes: bytes of the model when the event first happens, about.
+          num_iterations: length of the stage.
+        """
+        return model, moments
+
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event (host)."""
         raise NotImplementedError(f"{type(self).__name__} must say what it does")

@@ -129,8 +129,13 @@ class Shape(NamedTuple):
         return sum(capacity * area for capacity, area in zip(self.capacities, areas, strict=True))
 
 
+def shape_of(textures: Textures, layout: AtlasLayout) -> Shape:
+    """Return the shape of buckets."""
+    return Shape(layout.resolutions, tuple(map(len, textures.buckets)))
+
+
 def plan_layout(
-    sizes: ArrayLike, known: Sequence[Shape] = (), like: Array | None = None
+    sizes: ArrayLike, known: Sequence[Shape] = (), like: Array | None = None, room: Shape | None = None
 ) -> tuple[AtlasLayout, tuple[int, ...]]:
     """Return the layout for textures of the given sizes, and the capacity of each bucket (host).
 
@@ -139,6 +144,7 @@ def plan_layout(
       known: shapes with compiled programs. One is taken if the textures fit and it has at most `KNOWN_SLACK` times
         the texels.
       like: array over whose devices the rows of the layout are spread as its own; None: they lie on one.
+      room: shape that is taken if the textures fit, however large it is.
 
     Raises:
       ValueError: if a size is out of range.
@@ -156,20 +162,23 @@ def plan_layout(
     row = np.empty(len(sizes), np.int32)
     row[order] = np.arange(len(sizes)) - starts
     needed = {(int(code) // 64, int(code) % 64): int(count) for code, count in zip(codes, counts, strict=True)}
-    shape = _choose_shape(needed, known)
+    shape = _choose_shape(needed, known, room)
     place = np.asarray([shape.resolutions.index(resolution) for resolution in needed], np.int32)
     buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
     return AtlasLayout(placed_like(buckets, like), placed_like(row, like), shape.resolutions), shape.capacities
 
 
-def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape]) -> Shape:
-    """Return the smallest known shape with room for the needed textures of each resolution, or a new one."""
+def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape], wanted: Shape | None) -> Shape:
+    """Return the wanted shape if it has room for the needed textures of each resolution, else the smallest known one
+    that has, or a new one."""
     new = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
 
     def has_room(shape: Shape) -> bool:
         room = dict(zip(*shape, strict=True))
         return all(room.get(resolution, 0) >= count for resolution, count in needed.items())
 
+    if wanted is not None and has_room(wanted):
+        return wanted
     fitting = [shape for shape in known if has_room(shape) and shape.num_texels <= KNOWN_SLACK * new.num_texels]
     return min(fitting, key=lambda shape: shape.num_texels, default=new)
 

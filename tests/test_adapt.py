@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.adapt import Upscale, next_sizes, reallocate, select
+from a2tg_jax.adapt import Upscale, most_textures, next_sizes, reallocate, select
 from a2tg_jax.appearance import Textured
 from a2tg_jax.core.budget import event_budget
 from a2tg_jax.core.gaussians import init_from_points
@@ -17,7 +17,7 @@ from a2tg_jax.core.optim import adam_init
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
 from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
+from a2tg_jax.texture import Shape, allocate_textures, plan_layout, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
 
@@ -153,6 +153,39 @@ def test_events_never_exceed_the_budget_and_end_near_it():
             sizes = np.where(mask[:, None], proposed, sizes)
         used = 16 * np.prod(sizes, 1).sum()
         assert used <= total and total - used < cost[~mask & (cost > 0)].min()
+
+
+@pytest.mark.parametrize(
+    "cap, anisotropic, start", [(4, True, (0, 0)), (8, True, (1, 1)), (8, False, (0, 0)), (3, True, (1, 2))]
+)
+def test_there_is_room_for_all_that_textures_can_become(cap, anisotropic, start):
+    """Whole stages from one size: whatever is chosen within the bytes fits the buckets that are planned before."""
+    rng = np.random.default_rng(cap)
+    sizes = np.tile(start, (200, 1))
+    budget = 16 * (int(np.prod(sizes, 1).sum()) + 500)
+    planned = most_textures(sizes, budget, cap)
+    room = dict(zip(*planned, strict=True))
+    assert list(room) == sorted(room), "resolutions ascend"
+    for event in range(1, 6):
+        scales = np.exp(rng.normal(-5, 1.5, (200, 2)))
+        proposed = next_sizes(sizes, scales, k_a=4, k_s=1.0, cap=cap, anisotropic=anisotropic)
+        left = event_budget(budget, 16 * np.prod(sizes, 1).sum(), event, 5)
+        sizes = np.where(
+            select(rng.exponential(size=200), sizes, proposed, budget_bytes=left)[:, None], proposed, sizes
+        )
+        _, counts = np.unique(sizes, axis=0, return_counts=True)
+        needed = dict(zip(map(tuple, np.unique(sizes, axis=0).tolist()), counts, strict=True))
+        assert all(room[size] >= count for size, count in needed.items())
+        layout, capacities = plan_layout(sizes, room=planned)
+        assert (layout.resolutions, capacities) == planned
+        np.testing.assert_array_equal(layout.sizes, sizes)
+    assert len(needed) > 3 - 2 * (not anisotropic) and np.prod(sizes, 1).sum() > 0.9 * budget / 16
+
+
+def test_textures_that_outgrow_their_room_get_more():
+    sizes = np.array([[1, 1]] * 6 + [[2, 2]] * 3)
+    layout, capacities = plan_layout(sizes, room=Shape(((1, 1), (2, 2)), (6, 2)))
+    assert layout.resolutions == ((1, 1), (2, 2)) and capacities == (6, 3)
 
 
 def random_textures(seed, num=40, dtype=np.float32):

@@ -9,10 +9,13 @@ import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.densify.view_dependence import AdaptDegrees
+from a2tg_jax.events import HostEvent
 from a2tg_jax.io.config_json import config_to_dict
 from a2tg_jax.results.record import RunFile, compared_system
 from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import system_from_dict, system_to_dict, with_changes, with_earlier_options
+from a2tg_jax.training.step import jitted_step
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,53 @@ def test_every_mix_fills_its_bytes(scene, base_degree, shares):
     assert (model.textures is not None) == (texture > 0)
     if texture:
         assert 0 < (model.textures[1].sizes > 0).any(axis=1).sum() < model.num
+
+
+def assert_same(model, other):
+    """Padding may differ."""
+    arrays = [one.appearance.arrays(one.params, one.layout) | vars(one.gaussians) for one in (model, other)]
+    assert arrays[0].keys() == arrays[1].keys()
+    for name, array in arrays[0].items():
+        np.testing.assert_array_equal(array, arrays[1][name], err_msg=name)
+
+
+def test_details_have_their_room_before_they_come(scene, monkeypatch):
+    """The second stage compiles one step for each capacity of the tile lists. Without room it compiles one after each
+    event, and the model is the same."""
+
+    def details():
+        system = smoke(stage2_iterations=30, texture={"share": 0.02}, view_dependence={"share": 0.1})
+        first = a2tg.fit_stage(scene, system, 0, progress=False).model
+        before = jitted_step().num_compiled()
+        result = a2tg.fit_stage(scene, system, 1, first, progress=False)
+        return result.model, jitted_step().num_compiled() - before - result.num_regrown
+
+    model, num_compiled = details()
+    assert num_compiled == 1
+    for event in (AdaptDegrees, Upscale):
+        monkeypatch.setattr(event, "with_room", HostEvent.with_room)
+    other, num_compiled = details()
+    assert num_compiled > 3
+    assert_same(model, other)
+    assert model.num_padding_bytes < 0.05 * model.num_bytes, "a finished model holds no room"
+
+
+def test_what_goes_on_has_its_room_again(scene, tmp_path):
+    """A checkpoint holds no room. Training that goes on from it compiles one step and ends as if never stopped."""
+    system = smoke(stage2_iterations=30, texture={"share": 0.02}, view_dependence={"share": 0.1})
+    first = a2tg.fit_stage(scene, system, 0, progress=False).model
+    stops = []
+
+    def keep(checkpoint):
+        save_checkpoint(tmp_path / f"{checkpoint.iteration}.npz", checkpoint)
+        stops.append(load_checkpoint(tmp_path / f"{checkpoint.iteration}.npz"))
+
+    whole = a2tg.fit_stage(scene, system, 1, first, progress=False, on_checkpoint=keep, checkpoint_every=4)
+    for stop in stops[:3]:
+        before = jitted_step().num_compiled()
+        rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
+        assert jitted_step().num_compiled() - before - rest.num_regrown <= 1, stop.iteration
+        assert_same(rest.model, whole.model)
 
 
 def test_the_highest_degree_is_kept(scene):

@@ -13,11 +13,18 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Model, load_model, load_ply, plan_render, save_model, save_ply
 from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels, Plain, Shaped, Textured
 from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.appearance.sh_bands import allocate_bands, dense_sh, gather_bands, reallocate_bands, split_sh
+from a2tg_jax.appearance.sh_bands import (
+    allocate_bands,
+    dense_sh,
+    floats_of_band,
+    gather_bands,
+    reallocate_bands,
+    split_sh,
+)
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.densify.view_dependence import AdaptDegrees, ViewDependence, raised, without_idle
+from a2tg_jax.densify.view_dependence import AdaptDegrees, ViewDependence, most_rows, raised, without_idle
 from a2tg_jax.events import Due, Seen
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
@@ -216,6 +223,28 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
     after = event.apply(Due(), base, adam_init((base.gaussians, base.params)), state).model
     assert 1e6 * budget_mb - 36 < after.num_bytes <= 1e6 * budget_mb
     np.testing.assert_allclose(after.render(camera).color, base.render(camera).color, atol=1e-6)
+
+
+@pytest.mark.parametrize("base, highest, num_bytes", [(0, 2, 5_000), (1, 3, 900), (0, 3, 100_000)])
+def test_there_is_room_for_all_degrees_that_fit(base, highest, num_bytes):
+    """Any degrees within the bytes fit the tables that are planned before, and no table has a row too many."""
+    rng = np.random.default_rng(highest)
+    rows = most_rows(num_bytes, base, highest, NUM)
+    bands = range(base + 1, 4)
+    for favourite in range(base + 1, highest + 1):  # As many of one degree as fit.
+        cost = 4 * sum(floats_of_band(band) for band in bands if band <= favourite)
+        count = min(NUM, num_bytes // cost)
+        wanted = [count if band <= favourite else 0 for band in bands]
+        assert all(room >= need for room, need in zip(rows, wanted, strict=True))
+        assert rows[favourite - base - 1] == count
+    assert all(room == 0 for room, band in zip(rows, bands, strict=True) if band > highest)
+    degrees = rng.integers(base, highest + 1, NUM)
+    empty, layout = allocate_bands(np.full(NUM, base), base)
+    tables, owners, _ = reallocate_bands(empty, layout, degrees, None, [NUM] * len(layout.owners))
+    assert [len(table) for table in tables.tables] == [NUM] * len(bands)
+    np.testing.assert_array_equal(owners.degrees, degrees)
+    tables, owners, _ = reallocate_bands(tables, owners, degrees, None, [1] * len(bands))
+    np.testing.assert_array_equal(owners.degrees, degrees)
 
 
 @pytest.mark.parametrize("damage", ["bands", "inner", "degree"])

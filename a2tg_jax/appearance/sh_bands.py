@@ -96,21 +96,23 @@ def allocate_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.
     return Bands(tables), BandLayout(tuple(map(jnp.asarray, owners)), len(degrees))
 
 
-def _owners(degrees: np.ndarray, base_degree: int) -> list[np.ndarray]:
-    """Return the owners of the rows of each table for Gaussians of the given degrees."""
+def _owners(degrees: np.ndarray, base_degree: int, room: Sequence[int] = ()) -> list[np.ndarray]:
+    """Return the owners of the rows of each table, at least `room` rows, for Gaussians of the given degrees."""
     if degrees.size and not base_degree <= degrees.min() <= degrees.max() <= MAX_DEGREE:
         raise ValueError(f"degrees must lie in {base_degree}..3; got {degrees.min()}..{degrees.max()}")
     found = []
-    for degree in range(base_degree + 1, MAX_DEGREE + 1):
+    least = room or [0] * (MAX_DEGREE - base_degree)
+    for degree, spared in zip(range(base_degree + 1, MAX_DEGREE + 1), least, strict=True):
         rows = np.flatnonzero(degrees >= degree)
-        owners = np.full(bucket_capacity(len(rows)), len(degrees), np.int32)
+        capacity = spared if spared >= len(rows) else bucket_capacity(len(rows))
+        owners = np.full(capacity, len(degrees), np.int32)
         owners[: len(rows)] = rows
         found.append(owners)
     return found
 
 
 def reallocate_bands(
-    bands: Bands, layout: BandLayout, degrees: np.ndarray, moments: Any = None
+    bands: Bands, layout: BandLayout, degrees: np.ndarray, moments: Any = None, room: Sequence[int] = ()
 ) -> tuple[Bands, BandLayout, Any]:
     """Return tables for other degrees (host): kept coefficients stay unchanged, new ones are 0.
 
@@ -119,11 +121,12 @@ def reallocate_bands(
       layout: owners of the coefficients.
       degrees: [N] integers, the layout's base degree to 3.
       moments: any pytree; all `Bands` in it are rebuilt as well, other leaves stay unchanged.
+      room: number of rows of each table, unless it needs more; empty: as many as it needs, rounded up.
     """
     check_shape("degrees", degrees, (layout.num,))
 
     def rebuilt(old: Bands) -> tuple[Bands, BandLayout]:
-        return _packed(_dense_tables(old, layout), degrees, layout.base_degree, like=layout.owners)
+        return _packed(_dense_tables(old, layout), degrees, layout.base_degree, like=layout.owners, room=room)
 
     def is_bands(node: Any) -> bool:
         return isinstance(node, Bands)
@@ -227,13 +230,14 @@ def _dense_tables(bands: Bands, layout: BandLayout) -> Iterator[np.ndarray]:
 
 
 def _packed(
-    dense: Iterable[np.ndarray], degrees: ArrayLike, base_degree: int, like: Sequence[Array] | None = None
-) -> tuple[Bands, BandLayout]:
+    dense: Iterable[np.ndarray], degrees: ArrayLike, base_degree: int, like: Sequence[Array] | None = None,
+    room: Sequence[int] = (),
+) -> tuple[Bands, BandLayout]:  # fmt: skip
     """Pack dense tables, one after the other, for Gaussians of these degrees; tables of bands without owners may lack
     columns. `like` are arrays over whose devices the rows are spread as their own; None: they lie on one."""
     degrees = np.asarray(degrees)
     tables, placed_owners = [], []
-    owners = _owners(degrees, base_degree)
+    owners = _owners(degrees, base_degree, room)
     bands = range(base_degree + 1, MAX_DEGREE + 1)
     former: Sequence[Array | None] = like or [None] * len(owners)
     for values, own, degree, old in zip(dense, owners, bands, former, strict=True):

@@ -18,6 +18,9 @@ MEGABYTES = {
     "": "1", "kb": "1e-3", "mb": "1", "gb": "1e3", "kib": "0.001024", "mib": "1.048576", "gib": "1073.741824",
 }  # fmt: skip
 """Megabytes of each unit; a number without a unit is in megabytes."""
+MOST_ROOM = 0.5
+"""Largest tables of degrees or textures, padding included, as a share of the budget, that are allocated before a stage
+so that its programs need not be compiled again when they fill."""
 LARGEST_SHORTFALL = 0.005
 """Largest unused fraction of a budget without a warning."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.sh_bands import MAX_DEGREE, BandLayout, Bands, floats_of_band, reallocate_bands
-from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_of, event_budget, within_budget
+from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
@@ -86,6 +86,22 @@ class AdaptDegrees(HostEvent):
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         return max(num_bytes, bytes_of(self.budget_mb))
 
+    def with_room(
+        self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
+    ) -> tuple[Model, AdamState]:
+        if model.bands is None:
+            return model, moments
+        bands, layout = model.bands
+        budget = bytes_of(self.budget_mb)
+        left = budget - model.num_bytes + BYTES_PER_FLOAT * layout.count_floats(model.num)
+        highest = min(self.highest, layout.base_degree + len(self.iterations(num_iterations)))
+        room = most_rows(left, layout.base_degree, highest, model.num)
+        floats = sum(rows * floats_of_band(band) for rows, band in zip(room, layout.bands, strict=True))
+        if BYTES_PER_FLOAT * floats > MOST_ROOM * budget:
+            return model, moments
+        bands, layout, moments = reallocate_bands(bands, layout, layout.degrees, moments, room)
+        return model.with_bands(bands, layout), moments
+
     def init(self, model: Model) -> ViewDependence:
         return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
@@ -101,9 +117,22 @@ class AdaptDegrees(HostEvent):
         used = model.num_bytes - saved_bytes(layout, degrees, num)
         budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
         degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget, self.highest)
-        bands, layout, moments = reallocate_bands(bands, layout, degrees, moments)
+        room = [len(owners) for owners in layout.owners]
+        bands, layout, moments = reallocate_bands(bands, layout, degrees, moments, room)
         model = model.with_bands(bands, layout)
         return Change(model, moments, self.init(model))
+
+
+def most_rows(num_bytes: float, base_degree: int, highest: int, num: int) -> list[int]:
+    """Return the largest number of rows that the table of each band above `base_degree` can need within some bytes.
+
+    A row of a band comes with one of each band below it. Bands above `highest` need none.
+    """
+    rows, cost = [], 0
+    for degree in range(base_degree + 1, MAX_DEGREE + 1):
+        cost += BYTES_PER_FLOAT * floats_of_band(degree)
+        rows.append(min(num, int(num_bytes // cost)) if degree <= highest else 0)
+    return rows
 
 
 def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:

@@ -49,6 +49,8 @@ from a2tg_jax.training.step import (
 LAUNCHED = 10
 """Number of steps between two waits for the device; fewer if their photographs take too much memory."""
 LOG_EVERY = 10
+WORTH_COMPILING = 1_000
+"""Iterations for which a step without statistics that nothing reads any more is worth its compilation."""
 
 OnCheckpoint = Callable[[Checkpoint], None]
 OnLog = Callable[[Mapping[str, float]], object]
@@ -128,6 +130,7 @@ class StageRun:
             self.state = spread(self.exchange, state)
         else:
             raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
+        self._make_room()
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
@@ -150,6 +153,16 @@ class StageRun:
         self.started = time.perf_counter()
         self.num_regrown = self.num_compiled = 0
         self.num_refused = resume.num_refused if resume else 0
+
+    def _make_room(self) -> None:
+        """Pad the state for what events on the host will add, so that steps need not be compiled anew."""
+        model, moments = self.state.model, self.state.moments
+        num, num_bytes = model.num, float(model.num_bytes)
+        for event, state in zip(self.stage.events, self.state.events, strict=True):
+            if isinstance(event, HostEvent) and state is not None:
+                model, moments = event.with_room(model, moments, num_bytes, self.stage.iterations)
+            num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
+        self.state = dataclasses.replace(self.state, model=model, moments=moments)
 
     def _copied(self, tree: Any) -> Any:
         """Return copies of arrays, for steps take over the buffers they are given: on the device, or on the host if
@@ -255,13 +268,13 @@ class StageRun:
         return min(stops)
 
     def _due_on_host(self) -> list[int]:
-        """Return the iterations of all host events, and the last one of each step event."""
+        """Return the iterations of all host events, and the last one of each step event whose statistic is dropped."""
         count = self.stage.iterations
         due: list[int] = []
         for event, times in zip(self.stage.events, self.clock.times, strict=True):
             if isinstance(event, HostEvent):
                 due += event.iterations(count)
-            elif times is not None and event.observes and times.last < count:
+            elif times is not None and event.observes and self._is_worth_dropping(times.last):
                 due.append(times.last)
         return due
 
@@ -359,6 +372,10 @@ class StageRun:
             elif times is not None and event.observes and iteration == times.last:
                 self._keep(place, None)
 
+    def _is_worth_dropping(self, iteration: int) -> bool:
+        """Return whether statistics that nothing reads after an iteration are dropped, for which a step is compiled."""
+        return self.stage.iterations - iteration >= WORTH_COMPILING
+
     def _apply(self, place: int, event: HostEvent, iteration: int) -> None:
         """Apply a host event: to arrays that are spread over the devices, or on one device if it wants them whole."""
         if event.reads_whole:
@@ -369,7 +386,8 @@ class StageRun:
         self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
         if change.rows is not None:
             self._move_rows(change.rows)
-        self._keep(place, None if iteration == due[-1] else change.state)
+        is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
+        self._keep(place, None if is_dropped else change.state)
         # What lies on the devices of all processes was compared when it was placed there.
         own = [leaf for leaf in jax.tree.leaves(self.state) if mesh_of(leaf) is None]
         check_same(self.exchange, own, f"the events at iteration {iteration} of stage {self.stage.name}")
