@@ -83,6 +83,9 @@ class AdaptDegrees(HostEvent):
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return iterations_at(self.at, num_iterations, of=self)
 
+    def num_programs(self, num_iterations: int) -> int:
+        return 0  # `with_room`, unless the degrees may take most of the budget.
+
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         return max(num_bytes, bytes_of(self.budget_mb))
 
