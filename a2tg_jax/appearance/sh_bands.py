@@ -97,14 +97,15 @@ def allocate_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.
 
 
 def _owners(degrees: np.ndarray, base_degree: int, room: Sequence[int] = ()) -> list[np.ndarray]:
-    """Return the owners of the rows of each table, at least `room` rows, for Gaussians of the given degrees."""
+    """Return the owners of the rows of each table, which has `room` rows if they suffice, for Gaussians of the given
+    degrees."""
     if degrees.size and not base_degree <= degrees.min() <= degrees.max() <= MAX_DEGREE:
         raise ValueError(f"degrees must lie in {base_degree}..3; got {degrees.min()}..{degrees.max()}")
     found = []
-    least = room or [0] * (MAX_DEGREE - base_degree)
-    for degree, spared in zip(range(base_degree + 1, MAX_DEGREE + 1), least, strict=True):
+    wanted = room or [0] * (MAX_DEGREE - base_degree)
+    for degree, capacity in zip(range(base_degree + 1, MAX_DEGREE + 1), wanted, strict=True):
         rows = np.flatnonzero(degrees >= degree)
-        capacity = spared if spared >= len(rows) else bucket_capacity(len(rows))
+        capacity = capacity if capacity >= len(rows) else bucket_capacity(len(rows))
         owners = np.full(capacity, len(degrees), np.int32)
         owners[: len(rows)] = rows
         found.append(owners)

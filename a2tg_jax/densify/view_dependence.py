@@ -84,7 +84,7 @@ class AdaptDegrees(HostEvent):
         return iterations_at(self.at, num_iterations, of=self)
 
     def num_programs(self, num_iterations: int) -> int:
-        return 0  # `with_room`, unless the degrees may take most of the budget.
+        return 0  # Tables have room, unless degrees may take more than half of the budget.
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         return max(num_bytes, bytes_of(self.budget_mb))
@@ -134,7 +134,7 @@ def most_rows(num_bytes: float, base_degree: int, highest: int, num: int) -> lis
     rows, cost = [], 0
     for degree in range(base_degree + 1, MAX_DEGREE + 1):
         cost += BYTES_PER_FLOAT * floats_of_band(degree)
-        rows.append(min(num, int(num_bytes // cost)) if degree <= highest else 0)
+        rows.append(min(num, max(0, int(num_bytes // cost))) if degree <= highest else 0)
     return rows
 
 
