@@ -238,3 +238,9 @@ ROWS = {
 def test_rows_models_and_backgrounds_of_a_wrong_form_are_named(message):
     with pytest.raises(ValueError, match=re.escape(message)):
         ROWS[message]()
+
+
+def test_an_unknown_statistic_is_refused():
+    model, camera = some_model(), a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50).test[0].camera
+    with pytest.raises(ValueError, match=r"^statistic must be one of position, screen, center; got 'foo'$"):
+        a2tg.view_gradients(lambda model, output: output.color.sum(), model, camera, statistic="foo")

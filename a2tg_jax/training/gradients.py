@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -74,8 +74,10 @@ def view_gradients(
       statistic: kind of position that it differentiates by (`rasterize.pixel.positional_gradient`).
 
     Raises:
-      ValueError: if an argument has a wrong shape, or under jit without a capacity.
+      ValueError: if an argument has a wrong shape, if there is no such statistic, or under jit without a capacity.
     """
+    if statistic not in get_args(Statistic):
+        raise ValueError(f"statistic must be one of {', '.join(get_args(Statistic))}; got {statistic!r}")
     background = model.background if background is None else background
     check_gaussians(model.gaussians, "model.gaussians")
     check_camera(camera)
