@@ -134,7 +134,7 @@ class Upscale(UpscaleChoices, HostEvent):
             return model, moments
         textures, layout = model.textures
         present = BYTES_PER_TEXEL * layout.count_texels(model.num)
-        left = self._budget_bytes - max(num_bytes, model.num_bytes) + present
+        left = self._budget_bytes - num_bytes + present
         room = most_textures(layout.sizes, left, self.cap)
         if BYTES_PER_TEXEL * room.num_texels > MOST_ROOM * self._budget_bytes:
             return model, moments
@@ -248,25 +248,21 @@ def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
       num_bytes: of all textures, at most.
       cap: largest side.
     """
-    present = {(int(height), int(width)) for height, width in np.unique(sizes, axis=0)}
-    reached, added = set(present), set(present)
-    while added:
-        larger = (_doubled(size, axes, cap) for size in added for axes in ((1, 2), (2, 1), (2, 2)))
-        added = set(larger) - reached
-        reached |= added
+    reached, num_before = np.unique(sizes, axis=0), 0
+    while len(reached) > num_before:
+        num_before = len(reached)
+        larger = [
+            next_sizes(reached, np.broadcast_to(scales, reached.shape), k_a=1.0, k_s=math.inf, cap=cap)
+            for scales in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0))  # Round; thin along each axis.
+        ]
+        reached = np.unique(np.concatenate([reached, *larger]), axis=0)
     counts = {}
-    for height, width in sorted(reached):
+    for height, width in reached.tolist():
         area = height * width
         count = int(min(len(sizes), num_bytes // (BYTES_PER_TEXEL * area))) if area else len(sizes)
         if count > 0:
             counts[height, width] = bucket_capacity(count)
     return Shape(tuple(counts), tuple(counts.values()))
-
-
-def _doubled(size: tuple[int, int], factors: tuple[int, int], cap: int) -> tuple[int, int]:
-    """Return a size with each side multiplied by its factor, up to the cap; an empty one grows as 1×1 does."""
-    height, width = (max(1, side) for side in size)
-    return max(height, min(height * factors[0], cap)), max(width, min(width * factors[1], cap))
 
 
 def select(

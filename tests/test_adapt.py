@@ -173,8 +173,8 @@ def test_there_is_room_for_all_that_textures_can_become(cap, anisotropic, start)
         sizes = np.where(
             select(rng.exponential(size=200), sizes, proposed, budget_bytes=left)[:, None], proposed, sizes
         )
-        _, counts = np.unique(sizes, axis=0, return_counts=True)
-        needed = dict(zip(map(tuple, np.unique(sizes, axis=0).tolist()), counts, strict=True))
+        resolutions, counts = np.unique(sizes, axis=0, return_counts=True)
+        needed = dict(zip(map(tuple, resolutions.tolist()), counts, strict=True))
         assert all(room[size] >= count for size, count in needed.items())
         layout, capacities = plan_layout(sizes, room=planned)
         assert (layout.resolutions, capacities) == planned

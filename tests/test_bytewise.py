@@ -69,13 +69,19 @@ def assert_same(model, other):
         np.testing.assert_array_equal(array, arrays[1][name], err_msg=name)
 
 
-def test_details_have_their_room_before_they_come(scene, monkeypatch):
+@pytest.fixture(scope="module")
+def before_details(scene):
+    """A system, and the model of its first stage."""
+    system = smoke(stage2_iterations=30, texture={"share": 0.02}, view_dependence={"share": 0.1})
+    return system, a2tg.fit_stage(scene, system, 0, progress=False).model
+
+
+def test_details_have_their_room_before_they_come(scene, before_details, monkeypatch):
     """The second stage compiles one step for each capacity of the tile lists. Without room it compiles one after each
     event, and the model is the same."""
+    system, first = before_details
 
     def details():
-        system = smoke(stage2_iterations=30, texture={"share": 0.02}, view_dependence={"share": 0.1})
-        first = a2tg.fit_stage(scene, system, 0, progress=False).model
         before = jitted_step().num_compiled()
         result = a2tg.fit_stage(scene, system, 1, first, progress=False)
         return result.model, jitted_step().num_compiled() - before - result.num_regrown
@@ -90,10 +96,9 @@ def test_details_have_their_room_before_they_come(scene, monkeypatch):
     assert model.num_padding_bytes < 0.05 * model.num_bytes, "a finished model holds no room"
 
 
-def test_what_goes_on_has_its_room_again(scene, tmp_path):
+def test_what_goes_on_has_its_room_again(scene, before_details, tmp_path):
     """A checkpoint holds no room. Training that goes on from it compiles one step and ends as if never stopped."""
-    system = smoke(stage2_iterations=30, texture={"share": 0.02}, view_dependence={"share": 0.1})
-    first = a2tg.fit_stage(scene, system, 0, progress=False).model
+    system, first = before_details
     stops = []
 
     def keep(checkpoint):

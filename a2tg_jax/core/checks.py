@@ -4,7 +4,7 @@ Checks read only `shape` and `dtype`, so that tracers pass and nothing is comput
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,12 @@ def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str =
         return
     kinds = kind if isinstance(kind, tuple) else (kind,)
     raise ValueError(f"{name} must be {' or '.join(map(_noun, kinds))}; got {_kind_of(value)}{hint and f': {hint}'}")
+
+
+def check_literal(name: str, value: Any, literal: Any) -> None:
+    """Raise ValueError unless a value is one of those of a `Literal`."""
+    if value not in get_args(literal):
+        raise ValueError(f"{name} must be one of {', '.join(get_args(literal))}; got {value!r}")
 
 
 def _noun(kind: type) -> str:

@@ -4,8 +4,9 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
+from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.colmap import find_model, load_colmap
 from a2tg_jax.data.division import Division, among_processes, sharing_errors
 from a2tg_jax.data.frames import Frames, load_frames
@@ -82,10 +83,8 @@ def load_scene(
         if division is not None:
             options = {"downscale": downscale, "test_every": test_every, "alpha": alpha, "lens": lens}
             division.check_same([f"{name}={value}" for name, value in options.items()], "options of the scene")
-        if alpha not in get_args(AlphaMeaning):
-            raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaMeaning))}; got {alpha!r}")
-        if lens not in get_args(LensUse):
-            raise ValueError(f"lens must be one of {', '.join(get_args(LensUse))}; got {lens!r}")
+        check_literal("alpha", alpha, AlphaMeaning)
+        check_literal("lens", lens, LensUse)
         try:
             scene = _load(located(path), downscale, test_every, room, lens, division)
         finally:

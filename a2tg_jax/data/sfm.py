@@ -7,8 +7,9 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
+from a2tg_jax.core.checks import check_literal
 from a2tg_jax.core.display import counted
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
@@ -85,14 +86,9 @@ def run_sfm(
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
     """
-    choices = (
-        ("matching", matching, Matching),
-        ("panorama", panorama, Panorama),
-        ("camera_model", camera_model, CameraModel),
-    )
-    for name, value, known in choices:
-        if value not in get_args(known):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {value!r}")
+    check_literal("matching", matching, Matching)
+    check_literal("panorama", panorama, Panorama)
+    check_literal("camera_model", camera_model, CameraModel)
     if frames < LEAST_PHOTOS:
         raise ValueError(f"frames must be at least {LEAST_PHOTOS}; got {frames}")
     sources = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(source) for source in photos]

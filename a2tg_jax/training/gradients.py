@@ -2,14 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_kind
+from a2tg_jax.core.checks import check_kind, check_literal
 from a2tg_jax.core.display import short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
@@ -76,8 +76,7 @@ def view_gradients(
     Raises:
       ValueError: if an argument has a wrong shape, if there is no such statistic, or under jit without a capacity.
     """
-    if statistic not in get_args(Statistic):
-        raise ValueError(f"statistic must be one of {', '.join(get_args(Statistic))}; got {statistic!r}")
+    check_literal("statistic", statistic, Statistic)
     background = model.background if background is None else background
     check_gaussians(model.gaussians, "model.gaussians")
     check_camera(camera)
