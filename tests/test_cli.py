@@ -12,6 +12,7 @@ import stat
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -28,6 +29,7 @@ from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import finishing, frames, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.frame_folder import LIST
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.record import SceneSource, read_record, write_record
@@ -605,14 +607,35 @@ def test_a_shorter_flight_leaves_no_frames_of_a_longer_one(tiny_run, tmp_path, m
         (tmp_path / name).touch()
     for num, names in ((4, others | {"frame_0002.png", "frame_0003.png"}), (2, others)):
         assert cli.main(["render", str(run.path), "--frames", str(num), "--out", str(tmp_path), "--size", "12x8"]) == 0
-        assert {path.name for path in tmp_path.iterdir()} == names | {"frame_0000.png", "frame_0001.png", "flight.webp"}
+        made = {"frame_0000.png", "frame_0001.png", "flight.webp", LIST}
+        assert {path.name for path in tmp_path.iterdir()} == names | made
+
+
+@pytest.mark.parametrize("name", ["frame_0001.png", "flight.webp"])
+def test_render_replaces_only_what_it_wrote(tiny_run, tmp_path, monkeypatch, capsys, name):
+    """Neither files of somebody else nor frames that were changed since, unless asked to; it deletes none of them."""
+    run, *_ = tiny_run
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    command = ["render", str(run.path), "--frames", "2", "--out", str(tmp_path), "--size", "12x8"]
+    (tmp_path / "frame_0007.png").write_text("mine")
+    (tmp_path / name).write_text("mine")
+    assert f"{name} exists; add --overwrite to replace it, or choose another --out" in fails(capsys, *command)
+    assert {path.name for path in tmp_path.iterdir()} == {name, "frame_0007.png"}
+    assert (tmp_path / name).read_text() == "mine"
+    assert cli.main([*command, "--overwrite"]) == 0 and cli.main(command) == 0
+    capsys.readouterr()
+    (tmp_path / name).write_text("changed")
+    assert f"{name} exists" in fails(capsys, *command)
+    assert (tmp_path / name).read_text() == "changed" and (tmp_path / "frame_0007.png").read_text() == "mine"
 
 
 def test_render_tells_ffmpeg_the_rate_and_the_frames(tmp_path, monkeypatch):
     asked, paths = [], [tmp_path / f"frame_{index:04d}.png" for index in range(5)]
     monkeypatch.setattr(shutil, "which", lambda name: name)
     monkeypatch.setattr(
-        subprocess, "run", lambda command, **_: asked.append(command) or subprocess.CompletedProcess([], 0)
+        subprocess,
+        "run",
+        lambda command, **_: asked.append(command) or Path(command[-1]).touch() or subprocess.CompletedProcess([], 0),
     )
     assert frames.write_video(paths, tmp_path / "flight.mp4", frames_per_second=12)
     words = dict(itertools.pairwise(asked[0]))

@@ -9,12 +9,14 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.core.display import counted
 from a2tg_jax.results.folder import open_run
+from a2tg_jax.results.frame_folder import FrameFolder
 from a2tg_jax.results.frames import (
     FRAMES_PER_SECOND,
     Route,
     check_rate,
     parse_size,
     render_frames,
+    video_name,
     write_animation,
     write_video,
 )
@@ -54,6 +56,9 @@ class Render:
     """Output folder."""
     model: LastModel = None
     """Name of the model, as a2tg info prints it."""
+    overwrite: bool = False
+    """Replace files that exist. What earlier renders wrote is always replaced, and frames of a longer flight are
+    deleted."""
 
     def run(self) -> None:
         run = open_run(self.folder)
@@ -65,8 +70,17 @@ class Render:
         if self.supersample < 1:
             raise ValueError(f"--supersample must be at least 1; got {self.supersample}")
         check_output(out)
+        if self.path != "test":
+            FrameFolder(out).check([video_name()], overwrite=self.overwrite)
         paths = render_frames(
-            run, out, route=self.path, num_frames=self.frames, name=self.model, size=size, supersample=self.supersample
+            run,
+            out,
+            route=self.path,
+            num_frames=self.frames,
+            name=self.model,
+            size=size,
+            supersample=self.supersample,
+            overwrite=self.overwrite,
         )
         print(f"wrote {counted(len(paths), 'frame')} to {out}/")
         if self.path != "test":

@@ -13,7 +13,6 @@ from PIL import Image
 from a2tg_jax.core.cameras import Camera, crop_camera
 from a2tg_jax.core.capture import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
-from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.bars import progress_over
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import load_model
@@ -21,7 +20,8 @@ from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder, resuming_command
-from a2tg_jax.results.images import picture_names, save_picture, to_uint8
+from a2tg_jax.results.frame_folder import FRAME_NAME, FrameFolder
+from a2tg_jax.results.images import picture_names, to_uint8
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 
@@ -29,8 +29,6 @@ Route = Literal["test", "smooth", "orbit"]
 FRAMES_PER_SECOND = 30
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
-FRAME_NAME = "frame_%04d.png"
-"""File name of a flight's frame by its number, as Python and ffmpeg write it."""
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -57,23 +55,25 @@ def render_frames(
     name: str | None = None,
     size: tuple[int, int] | None = None,
     supersample: int = 1,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write one PNG per frame and return their paths. The photographs are not needed: a model knows its cameras.
 
     Args:
       run: an opened run folder.
-      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. Frames that a
-        longer path left there are deleted.
+      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. What earlier
+        renders wrote there is replaced, and frames that a longer path left are deleted.
       route: the test views, a smooth path past all cameras, an orbit around the subject, or a file of views that the
         viewer saved, through which a path goes.
       num_frames: length of the path.
       name: whose model is drawn; None: the last stage of the run's main system.
       size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' own.
       supersample: factor by which frames are drawn larger and averaged (`RenderSettings.supersample`).
+      overwrite: whether files are replaced that no render wrote.
 
     Raises:
       FileNotFoundError: if that stage is not finished, or there is no such path.
-      FileExistsError: if `out` is a file.
+      FileExistsError: if `out` is a file, or a file would be replaced unasked.
       ValueError: if no frame is wanted, the run has no such stage, or there are no test views and these are wanted.
     """
     if num_frames < 1:
@@ -88,21 +88,16 @@ def render_frames(
     cameras = dict(_cameras(model, route, num_frames))
     if size is not None:
         cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
+    folder = FrameFolder(out)
+    folder.check(cameras, overwrite=overwrite)
     settings = dataclasses.replace(settings_of(planned.system), supersample=supersample)
     renderer = Renderer(model, cameras=cameras.values(), settings=settings, has_geometry=False)
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
-        save_picture(out / file_name, to_uint8(renderer(camera).color))
+        with folder.writing(file_name) as temporary:
+            Image.fromarray(to_uint8(renderer(camera).color)).save(temporary, "PNG", optimize=True)
     if route != "test":
-        _drop_frames_from(out, num_frames)
+        folder.drop_frames(cameras)
     return [out / file_name for file_name in cameras]
-
-
-def _drop_frames_from(folder: Path, number: int) -> None:
-    """Delete the frames of an earlier flight from a number on."""
-    for path in folder.glob("frame_*.png"):
-        match = re.fullmatch(r"frame_(\d+)\.png", path.name)
-        if match and int(match[1]) >= number and path.name == FRAME_NAME % int(match[1]):
-            path.unlink()
 
 
 def check_rate(frames_per_second: float) -> None:
@@ -111,11 +106,16 @@ def check_rate(frames_per_second: float) -> None:
         raise ValueError(f"the number of frames per second must lie in 1..1000; got {frames_per_second}")
 
 
+def video_name() -> str:
+    """Return the file name of a flight's video: an MP4 with ffmpeg, and otherwise an animated WebP."""
+    return "flight.mp4" if shutil.which("ffmpeg") else "flight.webp"
+
+
 def write_animation(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> None:
     """Make an animated WebP of some frames, which loops. Memory holds one frame at a time."""
     first, *others = frames
     duration = round(1000 / frames_per_second)
-    with replacing(path) as temporary, Image.open(first) as image:
+    with FrameFolder(path.parent).writing(path.name) as temporary, Image.open(first) as image:
         image.save(
             temporary,
             "WEBP",
@@ -149,11 +149,12 @@ def write_video(frames: Sequence[Path], path: Path, *, frames_per_second: float 
         return False
     even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
     source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
-    made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", str(path)]
-    command = [program, "-y", "-loglevel", "error", *source, *made]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise ValueError(f"ffmpeg could not make {path}: {done.stderr.strip()}")
+    made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]
+    with FrameFolder(path.parent).writing(path.name) as temporary:
+        command = [program, "-y", "-loglevel", "error", *source, *made, str(temporary)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise ValueError(f"ffmpeg could not make {path}: {done.stderr.strip()}")
     return True
 
 
