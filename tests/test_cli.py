@@ -520,6 +520,9 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
     assert re.search(r"\d\.\d{3} dB of PSNR (lost|gained), test views\n", capsys.readouterr().out)
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
+    (tmp_path / "site" / "photographs" / "mine.jpg").touch()
+    assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
+    assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))
     assert decode_web_scene(routes["/scene.a2tgw"].read()).header["num_texels"] is None
     assert json.loads(routes["/photographs.json"].read()) == listed

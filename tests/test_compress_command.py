@@ -52,8 +52,9 @@ def test_compress(run, tmp_path, monkeypatch, capsys):
     out = tmp_path / "other.a2tgz"
     assert cli.main(["compress", str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
     assert "dB lost, if 30 dB" in capsys.readouterr().out and load_compact(out).num == 60
-    assert "--tune-iterations needs the photographs of" in fails(capsys, *TUNE, str(run.path), "--out", tmp_path / "no")
-    assert not (tmp_path / "no").exists()
+    out = tmp_path / "no.a2tgz"
+    assert "--tune-iterations needs the photographs of" in fails(capsys, *TUNE, str(run.path), "--out", out)
+    assert not out.exists()
 
 
 def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):

@@ -140,6 +140,18 @@ def test_export_tells_what_ply_does_not_keep(tmp_path, capsys):
         assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{told}"
 
 
+@pytest.mark.parametrize("name", ["scene.a2tgw", "photographs.json"])
+def test_no_file_of_a_page_is_replaced_unasked(tmp_path, capsys, name):
+    """Nor is another output of the same command written then."""
+    model, site = tmp_path / "model.npz", tmp_path / "site"
+    a2tg.save_model(model, a_model())
+    site.mkdir()
+    (site / name).write_text("mine")
+    assert cli.main(["export", str(model), "--ply", str(site / "x.ply"), "--web", str(site)]) == 2
+    assert f"{name} exists; add --overwrite to replace it, or choose another --web" in capsys.readouterr().err
+    assert [(path.name, path.read_text()) for path in site.iterdir()] == [(name, "mine")]
+
+
 def test_a_page_in_a_folder_is_not_replaced_unasked(tmp_path):
     check_new(tmp_path / "index.html", "--web", overwrite=False)
     (tmp_path / "index.html").touch()

@@ -30,7 +30,14 @@ from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import FORMATS
-from a2tg_jax.results.compression import SUFFIX, compress, compression_text, default_output, is_written_by
+from a2tg_jax.results.compression import (
+    SUFFIX,
+    check_compact,
+    compress,
+    compression_text,
+    default_output,
+    is_written_by,
+)
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.lock import opened
@@ -120,7 +127,7 @@ class Compress:
     source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
     """Model file (*.npz), or run folder, whose last model is taken."""
     out: Annotated[Path | None, defaulting_to("NAME.a2tgz beside the model", "FILE")] = None
-    """Output file."""
+    """Output file, *.a2tgz."""
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
     tune_iterations: int = 0
@@ -135,9 +142,11 @@ class Compress:
         if not self.source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
             told = ", which is compressed already" if name.endswith(SUFFIX) else ""
             raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(self.source))}{told}")
-        out = self.out or default_output(self.source)
+        default = default_output(self.source)
+        out = self.out or default
+        check_compact(out)
         check_output(out)
-        if self.out is not None or not is_written_by(self.source, out):
+        if out.resolve() != default.resolve() or not is_written_by(self.source, default):
             check_new(out, "--out", overwrite=self.overwrite)
         tell = functools.partial(print, flush=True)
         found = compress(self.source, out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell)

@@ -12,10 +12,10 @@ from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.live import shown_live
-from a2tg_jax.results.output import check_new, check_not_source, check_output
+from a2tg_jax.results.output import check_new, check_not_source, check_output, check_separate
 from a2tg_jax.results.ply_export import check_ply, export_ply
 from a2tg_jax.results.viewing import open_source, routes_of
-from a2tg_jax.results.web_export import check_page, export_web, exported_text
+from a2tg_jax.results.web_export import check_page, export_web, exported_text, page_files
 from a2tg_jax.training.loop import Watch
 from a2tg_jax.web.server import LOOPBACK, serve
 
@@ -86,24 +86,39 @@ class Export:
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
             raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
-        for out in (self.web, self.ply):
-            if out is not None:
-                check_output(out)
-        if self.web is not None:
-            is_file = check_page(self.web, single_file=self.single_file, photographs=self.photographs)
-            page = self.web if is_file else self.web / "index.html"
-            check_not_source([page], self.source, "--web")
-            check_new(page, "--web", overwrite=self.overwrite)
         if self.ply is not None:
-            check_ply(self.ply)
-            check_not_source([self.ply], self.source, "--ply")
-            check_new(self.ply, "--ply", overwrite=self.overwrite)
+            self._check_ply(self.ply)
+        if self.web is not None:
+            self._check_web(self.web)
         source = open_source(self.source, self.model)
+        if self.web is not None:
+            result = export_web(
+                source,
+                self.web,
+                single_file=self.single_file,
+                photographs=self.photographs,
+                overwrite=self.overwrite,
+            )
+            print(exported_text(result))
         if self.ply is not None:
             print(export_ply(source, self.ply))
-        if self.web is not None:
-            result = export_web(source, self.web, single_file=self.single_file, photographs=self.photographs)
-            print(exported_text(result))
+
+    def _check_ply(self, ply: Path) -> None:
+        check_output(ply)
+        check_ply(ply)
+        check_not_source([ply], self.source, "--ply")
+        check_new(ply, "--ply", overwrite=self.overwrite)
+
+    def _check_web(self, web: Path) -> None:
+        check_output(web)
+        is_file = check_page(web, single_file=self.single_file, photographs=self.photographs)
+        if self.ply is not None:
+            # A PLY file may lie in the folder of a page.
+            check_separate(web if is_file else web / "index.html", self.ply, "--web and --ply")
+        files = page_files(web, single_file=is_file)
+        check_not_source(files, self.source, "--web")
+        for file in files:
+            check_new(file, "--web", overwrite=self.overwrite)
 
 
 def in_browser(scene: Scene) -> AbstractContextManager[Watch]:

@@ -80,6 +80,12 @@ def is_written_by(source: Path, file: Path) -> bool:
     return source.is_dir() and file.relative_to(source).as_posix() in RunFolder(source).written()
 
 
+def check_compact(out: Path) -> None:
+    """Raise ValueError if `out` is a folder or has another suffix than a2tgz."""
+    if out.is_dir() or out.suffix.lower() != SUFFIX:
+        raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
+
+
 def compress(
     source: Path,
     out: Path | None = None,
@@ -95,7 +101,7 @@ def compress(
 
     Args:
       source: a run folder, of which the last model is taken; or a model, *.npz.
-      out: the file; None is beside the model.
+      out: the file, *.a2tgz; None is beside the model.
       max_loss: in dB.
       tune_iterations: iterations of training with rounding for each choice of bits that is tried so
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
@@ -103,8 +109,8 @@ def compress(
 
     Raises:
       FileNotFoundError: if there is no such model, or no photographs to tune it with.
-      ValueError: if a compact file cannot hold it, nothing loses so little, `out` is a folder or the model, or a
-        model's file is to be tuned.
+      ValueError: if a compact file cannot hold it, nothing loses so little, `out` is a folder or has another suffix
+        than a2tgz, or a model's file is to be tuned.
     """
     run = open_run(source) if source.is_dir() else None
     path, settings = (source, RenderSettings()) if run is None else _last_model(run)
@@ -113,8 +119,7 @@ def compress(
     out = path.with_suffix(SUFFIX) if out is None else out
     if not 0 <= max_loss < math.inf:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
-    if out.is_dir() or out.resolve() == path.resolve():
-        raise ValueError(f"out must be a new file, or one other than the model; got {out}")
+    check_compact(out)
     scene = None if run is None else _scene_of(run)
     tune = _tune(source, run, scene, tune_iterations) if tune_iterations else None
     losses = _losses(model, scene, settings)

@@ -6,6 +6,8 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from a2tg_jax.results.folder import RunFolder
+
 
 def check_output(path: Path) -> None:
     """Raise if a file or folder cannot be made.
@@ -33,10 +35,34 @@ def check_output(path: Path) -> None:
         print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
 
 
+def check_separate(first: Path, second: Path, flags: str) -> None:
+    """Raise ValueError if two outputs are one path, or one lies in the other, naming their flags."""
+    one, other = first.resolve(), second.resolve()
+    if one.is_relative_to(other) or other.is_relative_to(one):
+        raise ValueError(f"{flags} must lie apart; got {first} and {second}")
+
+
 def check_new(path: Path, flag: str, *, overwrite: bool) -> None:
-    """Raise FileExistsError if a file would be replaced without --overwrite, naming it and the flag it comes from."""
-    if path.is_file() and not overwrite:
+    """Raise if a file must not be replaced, naming it and the flag it comes from.
+
+    Raises:
+      FileExistsError: if it exists, and `overwrite` is not set.
+      ValueError: if it is one that a run wrote into its folder.
+    """
+    if not path.is_file():
+        return
+    run = _run_that_wrote(path)
+    if run is not None:
+        raise ValueError(f"{path} belongs to the run in {run}; choose another {flag}")
+    if not overwrite:
         raise FileExistsError(f"{path} exists; add --overwrite to replace it, or choose another {flag}")
+
+
+def _run_that_wrote(path: Path) -> Path | None:
+    """Return the folder of the run that lists a file as its own, or None."""
+    path = path.resolve()
+    names = {folder: path.relative_to(folder).as_posix() for folder in path.parents}
+    return next((folder for folder, name in names.items() if name in RunFolder(folder).written()), None)
 
 
 def check_not_source(files: Iterable[Path], source: Path, flag: str) -> None:

@@ -14,6 +14,9 @@ from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_o
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
+from a2tg_jax.results.folder import read_json
+from a2tg_jax.results.output import check_new
+from a2tg_jax.results.replacement import remove_if_empty
 from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of, scene_or_warning
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
@@ -38,7 +41,9 @@ class Exported:
     """Loss of the scene file in dB of PSNR, by what it is measured on."""
 
 
-def export_web(source: Source, out: Path, *, single_file: bool = False, photographs: bool = False) -> Exported:
+def export_web(
+    source: Source, out: Path, *, single_file: bool = False, photographs: bool = False, overwrite: bool = False
+) -> Exported:
     """Write a page that shows a model: a folder for any web server, or one file that opens from the disk.
 
     Args:
@@ -46,14 +51,21 @@ def export_web(source: Source, out: Path, *, single_file: bool = False, photogra
       out: the folder, which is made; or the file. A name that ends in .html is a file's, unless a folder lies there.
       single_file: one file, whatever its name.
       photographs: into the folder go the cameras' photographs too.
+      overwrite: whether existing files are replaced. Photographs of an earlier page that this one lacks are deleted.
 
     Raises:
-      FileExistsError: if a folder is wanted where a file lies, or a file where a folder lies.
+      FileExistsError: if a folder is wanted where a file lies, or a file where a folder lies, or a file exists.
       ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
     """
     single_file = check_page(out, single_file=single_file, photographs=photographs)
     data = source.encoded
     files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
+    for path in files:
+        check_new(path, "--web", overwrite=overwrite)
+    for path in () if single_file else _photographs_in(out):
+        if path not in files:
+            path.unlink(missing_ok=True)
+            remove_if_empty(path.parent, out)
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -73,6 +85,19 @@ def check_page(out: Path, *, single_file: bool, photographs: bool) -> bool:
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
     return single_file
+
+
+def page_files(out: Path, *, single_file: bool) -> list[Path]:
+    """Return the files of a page, photographs left out."""
+    return [out] if single_file else [out / name for name in ("index.html", SCENE_NAME, PHOTOGRAPHS_NAME)]
+
+
+def _photographs_in(folder: Path) -> list[Path]:
+    """Return the photographs that the page in a folder lists; none without a page."""
+    try:
+        return [folder / photograph_name(int(index)) for index in read_json(folder / PHOTOGRAPHS_NAME)]
+    except (OSError, ValueError, TypeError):
+        return []
 
 
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
