@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -577,6 +578,32 @@ def test_finish(tiny_run, tmp_path, monkeypatch, capsys):
     assert again in new.record.read_text()
     assert cli.main(["info", str(new.path)]) == 0 and again in capsys.readouterr().out
     assert "is not empty" in fails(capsys, *command)
+
+
+@pytest.mark.parametrize("killed_in", ["write_json", "write_record", "evaluate_run"])
+def test_a_killed_finish_goes_on_by_the_same_command(tiny_run, tmp_path, monkeypatch, capsys, killed_in):
+    """With the evaluation once the model is written; another finish does not go on there."""
+    run, *_ = tiny_run
+    polished, new = [], RunFolder(tmp_path / "new")
+    monkeypatch.setattr(SceneSource, "load", lambda self: SimpleNamespace(train=()))
+    monkeypatch.setattr(finishing, "_measured", lambda model, *_: finishing.Measured(model.num_bytes, 20.0, None))
+    monkeypatch.setattr(finishing, "polish", lambda model, *_, **__: polished.append(1) or model)
+    monkeypatch.setattr(finishing, "evaluate_run", lambda run, *_, **__: run.own(run.report).touch())
+    command = ["finish", str(run.path), "--out", str(new.path), "--max-loss", "0"]
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(finishing, killed_in, stop)
+        assert cli.main(command) == 130 and capsys.readouterr().err == "a2tg: interrupted\n"
+        new.finish.with_name(".finish.json.1.partial").touch()
+        if killed_in != "write_json":
+            assert "is not empty; choose another --out" in fails(capsys, *command, "--polish-steps", "2")
+    assert cli.main(command) == 0 and len(polished) == (1 if killed_in == "evaluate_run" else 2)
+    assert load_model(new.model("a2tg-textures")).num_bytes == load_model(run.model("a2tg-textures")).num_bytes
+    assert read_record(new) == read_record(run) and not list(new.path.glob(".*.partial"))
+    assert "is not empty; choose another --out" in fails(capsys, *command)
 
 
 def test_what_polishing_spoils_is_left_out():

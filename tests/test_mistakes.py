@@ -109,6 +109,8 @@ MISTAKES = {
     "finish done --out new --polish-steps -1": "--polish-steps must be at least 0",
     "finish done --out new --polish-steps 0": "nothing that these options can shrink or polish",
     "finish run --out new": "has no finished",
+    "finish done --out new": "a2tg-gaussians.npz is missing, and a later model of the run is there: put it back, or ",
+    "eval done": "a2tg-gaussians.npz is missing, and a later model of the run is there: put it back, or ",
     "eval run": "no finished stage",
     "info": "RUN is missing: run folder",
     "info photo.png": "is not a run folder",

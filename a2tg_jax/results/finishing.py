@@ -2,23 +2,26 @@
 
 import dataclasses
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
-from a2tg_jax.data import Scene, View
+from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.finish_options import FinishOptions
-from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command, write_json
+from a2tg_jax.results.folder import RunFolder, check_free, create_run, read_json, resuming_command, write_json
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, read_record, write_record
-from a2tg_jax.results.run_evaluation import evaluate_run, settings_of
+from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, settings_of
 from a2tg_jax.results.summary import RunResult, aligned
 from a2tg_jax.training.registry import system_to_dict
 
@@ -62,7 +65,8 @@ class Finished:
 def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_weights: Path | None = None) -> Finished:
     """Finish the last model of a run's main system, and evaluate it in a new run folder.
 
-    Choices are made on training views; held-out views are only measured.
+    Choices are made on training views; held-out views are only measured. If the same finishing was killed in that
+    folder, it goes on: with the evaluation if the model was written, otherwise from its beginning.
 
     Args:
       source: the run; it is not changed.
@@ -71,12 +75,11 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
       lpips_weights: a weights file for LPIPS; None leaves it out.
 
     Raises:
-      FileNotFoundError: if the stage is not finished, or the photographs are missing.
+      FileNotFoundError: if the stage is not finished, or an earlier model or the photographs are missing.
       FileExistsError: if `out` is in use.
       ValueError: if the model has nothing to shrink or polish, or an option is out of range.
     """
     options.check()
-    check_free(out, in_use="is not empty; choose another --out")
     record = read_record(source)
     planned = record.plan[record.plan.main[-1]]
     path = source.model(planned.name)
@@ -84,21 +87,47 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
         raise FileNotFoundError(
             f"{source.path} has no finished {planned.name}; continue with: {resuming_command(source)}"
         )
+    run, told = RunFolder(out), _told(source, planned, options)
+    is_begun = _is_begun(run, told)
+    if not is_begun:
+        check_free(out, in_use="is not empty; choose another --out")
     model, scene = load_model(path), record.scene.load()
     _check(model, planned, options)
+    finished_stages(source, record.plan)
+    is_written = is_begun and run.record.is_file()
+    changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
     steps = {"before": (model, _measured(model, scene, planned))}
-    for name, changed in _changed(model, refined_views(scene.train, model), options):
-        steps[name] = changed, _measured(changed, scene, planned)
+    for name, after in changed:
+        steps[name] = after, _measured(after, scene, planned)
     last, _ = steps[kept_step({name: found for name, (_, found) in steps.items()})]
-    run = RunFolder(out)
     with claimed(run):
-        _write_run(create_run(out), source, record, planned, last, options)
+        if is_begun and not is_written:
+            run.clear()
+        if not is_written:
+            _write_run(create_run(out), source, record, planned, last, told)
         result = evaluate_run(run, scene, lpips_weights=lpips_weights)
     return Finished({name: found for name, (_, found) in steps.items()}, result)
 
 
-def _changed(model: Model, views: Sequence[View], options: FinishOptions) -> Iterator[tuple[str, Model]]:
+def _told(source: RunFolder, planned: PlannedStage, options: FinishOptions) -> dict[str, Any]:
+    """Return the content of finish.json: from which model of which run the new one is made, and how."""
+    origin = {"source": str(source.path.resolve()), "model": planned.name}
+    return {**origin, "sha256": sha256_of(source.model(planned.name)), **dataclasses.asdict(options)}
+
+
+def _is_begun(run: RunFolder, told: Mapping[str, Any]) -> bool:
+    """Return whether a process was killed in a folder while it did the same."""
+    if run.report.is_file() or run.finish.name not in run.written() or not is_regular(run.finish):
+        return False
+    try:
+        return bool(read_json(run.finish) == told)
+    except ValueError:
+        return False
+
+
+def _changed(model: Model, scene: Scene, options: FinishOptions) -> Iterator[tuple[str, Model]]:
     """Yield the name of each step and the model after it."""
+    views = refined_views(scene.train, model)
     if options.max_loss and can_shrink(model):
         some = views[:: -(-len(views) // MOST_VIEWS)]
         model = shrink_textures(model, some, max_loss=options.max_loss)
@@ -133,17 +162,19 @@ def _measured(model: Model, scene: Scene, planned: PlannedStage) -> Measured:
 
 
 def _write_run(
-    run: RunFolder, source: RunFolder, record: RunRecord, planned: PlannedStage, model: Model, options: FinishOptions
+    run: RunFolder,
+    source: RunFolder,
+    record: RunRecord,
+    planned: PlannedStage,
+    model: Model,
+    told: Mapping[str, Any],
 ) -> None:
-    """Write models, histories and record of the new run; the record last, which makes it one."""
+    """Write finish.json, models, histories and record of the new run; the record last, which makes it one."""
+    write_json(run.own(run.finish), told)
     for name in record.plan.names:
         for find in (RunFolder.model, RunFolder.history):
             if find(source, name).is_file() and (find is RunFolder.history or name != planned.name):
-                copy = run.own(find(run, name))
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(find(source, name), copy)
+                with replacing(run.own(find(run, name))) as copy:
+                    shutil.copyfile(find(source, name), copy)
     save_model(run.own(run.model(planned.name)), model, {"system": system_to_dict(planned.system)})
-    origin = {"source": str(source.path.resolve()), "model": planned.name}
-    told = {**origin, "sha256": sha256_of(source.model(planned.name)), **dataclasses.asdict(options)}
-    write_json(run.own(run.finish), told)
     write_record(run, record)

@@ -32,7 +32,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import left_over, replacing
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -220,6 +220,7 @@ def check_free(path: str | os.PathLike[str], *, overwrite: bool = False, in_use:
         raise FileExistsError(f"{path} is a file; choose another folder with --out")
     run = RunFolder(path)
     unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
+    unused |= {partial.name for partial, whole in left_over(path).items() if whole.name in run.written()}
     if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):
         return
     if not run.written():

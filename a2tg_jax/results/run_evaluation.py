@@ -51,14 +51,12 @@ def evaluate_run(
       lpips_weights: a weights file for LPIPS; None keeps what was measured of the same models earlier, if anything.
 
     Raises:
-      FileNotFoundError: if no stage is finished, or the scene or the weights are missing.
+      FileNotFoundError: as `finished_stages` does, or if the scene or the weights are missing.
       ValueError: if a model was trained on views that the scene holds out.
     """
     record = read_record(run)
     plan = record.plan
-    models = {name: load_model(run.model(name)) for name in plan.names if run.model(name).is_file()}
-    if not models:
-        raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
+    models = {name: load_model(run.model(name)) for name in finished_stages(run, plan)}
     scene = scene or record.scene.load()
     for name, model in models.items():
         check_held_out(model, scene, run.model(name))
@@ -85,6 +83,23 @@ def evaluate_run(
     figures = write_figures(run, main, camera, settings_of(plan[result.main].system), histories, starts)
     write_report(run, result, _write_pictures(run, result, models, scene), figures)
     return result
+
+
+def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
+    """Return the names of the stages that have their models.
+
+    Raises:
+      FileNotFoundError: if there are none, or a model is missing from which a later stage was trained.
+    """
+    names = [name for name in plan.names if run.model(name).is_file()]
+    if not names:
+        raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
+    needed = {plan.main[0], *(plan[name].start for name in names)}
+    for name in plan.names:
+        if name in needed and name not in names:
+            again = f"put it back, or train it again with: {resuming_command(run)}"
+            raise FileNotFoundError(f"{run.model(name)} is missing, and a later model of the run is there: {again}")
+    return names
 
 
 def _write_viewer(run: RunFolder, model: Model, title: str) -> None:
