@@ -5,6 +5,7 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -103,6 +104,33 @@ def test_left_over_partial_files_go_and_others_stay(tmp_path):
         path.write_text("half")
     with opened(run.path):
         assert not left.exists() and all(path.is_file() for path in others)
+
+
+def test_a_write_deletes_old_partial_files_of_the_same_file(tmp_path):
+    """A young one may be that of a living process."""
+    old, young, other = (tmp_path / f".{name}.partial" for name in ("a.npz.1", "a.npz.2", "a.npz.txt.1"))
+    for path in (old, young, other):
+        path.touch()
+    for path in (old, other):
+        os.utime(path, (0, 0))
+    with replacing(tmp_path / "a.npz") as temporary:
+        temporary.touch()
+    assert {path.name for path in tmp_path.iterdir()} == {"a.npz", young.name, other.name}
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="/dev/full is Linux's")
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_a_full_disk_is_told_with_the_file_and_what_to_do(tmp_path, monkeypatch, capsys, is_ours):
+    def write(self):
+        writing = replacing(tmp_path / "x.npz") if is_ours else contextlib.nullcontext()
+        with writing, open("/dev/full", "wb", buffering=0) as file:
+            file.write(b"x")
+
+    monkeypatch.setattr(cli.Info, "run", write)
+    assert cli.main(["info", "run"]) == 2
+    told = rf"{tmp_path / 'x.npz'}: the disk is full, \d+\.\d MB are free" if is_ours else "the disk is full"
+    error = capsys.readouterr().err
+    assert re.fullmatch(f"a2tg: error: {told}: make room, or write to another disk\n", error)
 
 
 def test_names_of_checkpoints_sort_by_iteration(tmp_path):
@@ -478,7 +506,8 @@ def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_training, "save_checkpoint", full)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "No space left on device; there is no checkpoint yet; continue with: a2tg train" in error
+    told = "the disk is full: make room, or write to another disk"
+    assert f"{told}; there is no checkpoint yet; continue with: a2tg train" in error
     assert whole_run.how_to_go_on(RunFolder(tmp_path / "run")) in error
 
 

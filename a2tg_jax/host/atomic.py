@@ -1,8 +1,10 @@
 """Atomic writes: files appear whole or not at all, and reach the disk before they replace others."""
 
 import contextlib
+import errno
 import os
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +12,10 @@ from a2tg_jax.host.operating_system import flush_folder
 
 PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 """Name pattern of a partial file: the name of the final file, and the process."""
+STALE_SECONDS = 3600.0
+"""Age without a change after which a partial file counts as that of a killed process."""
+NO_ROOM = frozenset({errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)})
+"""Errors of a full disk and of a used-up quota."""
 
 
 @contextlib.contextmanager
@@ -17,18 +23,34 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
-    folders are made.
+    folders are made. Partial files that killed processes left of the same file are deleted after an hour.
+
+    Raises:
+      OSError: as the block does. The error of a full disk names the file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _drop_stale(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        yield temporary
-        _flush(temporary)
-        os.replace(temporary, path)
-        flush_folder(path.parent)
+        with named_if_full(path):
+            yield temporary
+            _flush(temporary)
+            os.replace(temporary, path)
+            flush_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def named_if_full(path: Path) -> Iterator[None]:
+    """Have the error of a full disk name a file that is written in the block."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            error.filename = os.fspath(path)
+        raise
 
 
 def left_over(folder: Path) -> dict[Path, Path]:
@@ -37,6 +59,17 @@ def left_over(folder: Path) -> dict[Path, Path]:
         return {}
     names = {entry: PARTIAL.fullmatch(entry.name) for entry in folder.iterdir()}
     return {entry: folder / match[1] for entry, match in names.items() if match}
+
+
+def _drop_stale(path: Path) -> None:
+    """Delete the partial files of killed processes of one file."""
+    start = f".{path.name}."
+    for name in os.listdir(path.parent):
+        if name.startswith(start) and re.fullmatch(r"\d+\.partial", name.removeprefix(start)):
+            partial = path.with_name(name)
+            with contextlib.suppress(FileNotFoundError):  # Another process may delete it.
+                if time.time() - partial.stat().st_mtime > STALE_SECONDS:
+                    partial.unlink()
 
 
 def _flush(path: Path) -> None:

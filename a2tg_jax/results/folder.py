@@ -32,7 +32,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.host.atomic import left_over, replacing
+from a2tg_jax.host.atomic import left_over, named_if_full, replacing
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -71,7 +71,7 @@ class RunFolder:
         if not lines:
             return
         self.path.mkdir(parents=True, exist_ok=True)
-        with open(self.marker, "a", encoding="utf-8") as file:
+        with named_if_full(self.marker), open(self.marker, "a", encoding="utf-8") as file:
             file.writelines(lines if os.fstat(file.fileno()).st_size else [f"{MARKER}\n", *lines])
             file.flush()
             os.fsync(file.fileno())
