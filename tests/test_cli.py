@@ -28,7 +28,7 @@ from a2tg_jax.host import startup
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import finishing, frames, run_training
+from a2tg_jax.results import finishing, frames, run_training, web_export
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.frame_folder import LIST
 from a2tg_jax.results.history import read_history
@@ -514,7 +514,7 @@ def test_render_a_path_that_was_kept_in_the_viewer(tiny_run, tmp_path, capsys):
     assert f"wrote 2 frames to {out}/\n" in capsys.readouterr().out
 
 
-def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
+def test_export_and_what_view_would_serve(tiny_run, tmp_path, monkeypatch, capsys):
     """With the run's photographs; a model of the run by its name."""
     run, *_ = tiny_run
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--photographs"]) == 0
@@ -522,6 +522,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, capsys):
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
     (tmp_path / "site" / "photographs" / "mine.jpg").touch()
+    monkeypatch.setattr(web_export, "_losses_of", lambda source: {})
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
     assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))

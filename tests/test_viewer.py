@@ -296,7 +296,7 @@ def test_a_folder_and_a_single_file(tmp_path):
     assert exported_text(result).endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 2 files beside it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
     for _ in range(2):  # The second time, it replaces the first.
-        one = export_web(source, tmp_path / "one.html")
+        one = export_web(source, tmp_path / "one.html", overwrite=True)
     assert exported_text(one).endswith(f"one.html: {in_bytes(one.path.stat().st_size)}")
     assert one.path.read_text(encoding="utf-8") == viewer_html_with(scene)
     with pytest.raises(ValueError, match="no photographs"):
