@@ -110,7 +110,7 @@ class Renderer:
           capacities: initial capacities, such as those of the renderer of a similar model.
           background: [3] colour; None is the model's own, or black.
           settings: static options; the renderer finds the capacity.
-          has_geometry: if False, depth, normal and distortion are zeros and cost nothing.
+          has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
 
         Raises:
           ValueError: if a rule is given beside a model, or an argument has a wrong shape.

@@ -19,11 +19,16 @@ Wanted = tuple[int | str, ...]
 
 
 def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str = "") -> None:
-    """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several."""
+    """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several.
+
+    Without a hint, a class in place of its instance is told so.
+    """
     if isinstance(value, kind):
         return
+    if not hint and isinstance(value, type) and issubclass(value, kind):
+        hint = f"say {value.__name__}(…)"
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    raise ValueError(f"{name} must be {' or '.join(map(_noun, kinds))}; got {_kind_of(value)}{hint and f': {hint}'}")
+    raise ValueError(f"{name} must be {' or '.join(map(_noun, kinds))}; got {kind_of(value)}{hint and f': {hint}'}")
 
 
 def check_literal(name: str, value: Any, literal: Any) -> None:
@@ -34,11 +39,11 @@ def check_literal(name: str, value: Any, literal: Any) -> None:
 
 def _noun(kind: type) -> str:
     """Return the name of a class with its article; a plural, such as Gaussians, has none."""
-    article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOU" else "a "
+    article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOUaeiou" else "a "
     return f"{article}{kind.__name__}"
 
 
-def _kind_of(value: Any) -> str:
+def kind_of(value: Any) -> str:
     """Return the class of a value in errors; a class itself by its name."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 

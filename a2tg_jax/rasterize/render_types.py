@@ -1,7 +1,7 @@
 """Options of a rendering and its images: what `render_image` takes and returns."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jax import Array
@@ -15,6 +15,8 @@ from a2tg_jax.rasterize.splats import Wanted
 
 IMAGES = ("color", "alpha", "depth", "normal", "distortion")
 """Fields of `RenderOutput` that are images."""
+GEOMETRY = IMAGES[2:]
+"""Images that are rendered on demand (`has_geometry`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +70,11 @@ class RenderSettings:
 
 
 class RenderOutput(NamedTuple):
-    """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background."""
+    """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background.
+
+    A render with `has_geometry=False` has None in place of depth, normal and distortion, and reading them raises
+    ValueError.
+    """
 
     color: Array
     """[H, W, 3], background included, not clipped; or [H, W, D] features."""
@@ -83,6 +89,15 @@ class RenderOutput(NamedTuple):
     warn of it (`CapacityWarning`), jitted ones cannot."""
     distortion: Array
     """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
+
+    def __getattribute__(self, name: str) -> Any:
+        value = tuple.__getattribute__(self, name)
+        if value is None and name in GEOMETRY:
+            raise ValueError(
+                f"{name} was not rendered: say has_geometry=True, as in Term(function, has_geometry=True) for a loss "
+                "term of your own"
+            )
+        return value
 
     def __repr__(self) -> str:
         return short_tuple_repr(self)

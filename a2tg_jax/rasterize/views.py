@@ -17,7 +17,7 @@ from a2tg_jax.rasterize.exchange import composite_in_bands
 from a2tg_jax.rasterize.kernels.choice import choose, instead_of
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.rasterize.render_types import IMAGES, RenderOutput, RenderSettings
+from a2tg_jax.rasterize.render_types import GEOMETRY, IMAGES, RenderOutput, RenderSettings
 from a2tg_jax.rasterize.splats import CompositingSettings, Compositor, Splats, project_gaussians
 from a2tg_jax.rasterize.supersampling import box_mean, finer
 from a2tg_jax.rasterize.tile_pixels import pixels_of
@@ -45,7 +45,7 @@ def render_traced(
       gaussians, camera, rule: as for `render_appearance`.
       background: [3] colour, or as many numbers as the rule has colours.
       settings: static options, with a capacity.
-      has_geometry: if False, depth, normal and distortion are zeros and cost nothing.
+      has_geometry: if False, depth, normal and distortion are None, cost nothing, and reading them raises ValueError.
       sh_degree: replaces that of the settings; may be traced.
       num_live: number of rows that exist; may be traced.
       probe: [N, 4] zeros, at which the gradient is the statistic and the number of pixels (`compositor.composite`).
@@ -62,7 +62,8 @@ def render_traced(
             gaussians, finer(camera, factor), rule, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live,
         )  # fmt: skip
-        images = {name: box_mean(getattr(output, name), factor) for name in IMAGES}
+        rendered = IMAGES if has_geometry else [name for name in IMAGES if name not in GEOMETRY]
+        images = {name: box_mean(getattr(output, name), factor) for name in rendered}
         return output._replace(**images), num_pairs
     options: dict[str, Any] = {
         "has_geometry": has_geometry, "sh_degree": sh_degree, "num_live": num_live, "statistic": statistic,
@@ -227,9 +228,8 @@ def _output(
     color = jnp.moveaxis(channels[:first], 0, -1) + transmittance[..., None] * background[None, None, :]
     alpha = 1 - transmittance
     if not compositing.has_geometry:
-        nothing = jnp.zeros_like(alpha)
-        no_normal = jnp.zeros((*alpha.shape, 3), alpha.dtype)
-        return RenderOutput(color, alpha, nothing, no_normal, overflow, nothing)
+        nothing: Any = None
+        return RenderOutput(color, alpha, nothing, nothing, overflow, nothing)
     depth, squared = channels[first], channels[first + 1]
     normal = jnp.moveaxis(channels[first + 2 :], 0, -1)
     return RenderOutput(color, alpha, depth, normal, overflow, distortion=alpha * squared - depth * depth)

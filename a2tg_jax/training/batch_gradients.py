@@ -15,6 +15,7 @@ from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import corrected_color, penalties
 from a2tg_jax.training.gradients import Differentiated, View, differentiate, differentiate_together
+from a2tg_jax.training.returned import check_scalar
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 
@@ -61,7 +62,7 @@ def batch_gradients(
     highest = settings.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
     options: dict[str, Any] = {
-        "has_geometry": any(term.has_geometry for term in stage.losses), "sh_degree": degree,
+        "has_geometry": stage.has_geometry, "sh_degree": degree,
         "statistic": stage.statistic, "has_probe": is_gathering,
     }  # fmt: skip
 
@@ -72,6 +73,8 @@ def batch_gradients(
         color = corrected_color(seen.corrections, seen.rows, output.color)
         output = output._replace(color=_black_outside(mask, color))
         terms = [term(shown, target, output) for term in stage.losses]
+        for index, term in enumerate(terms):
+            check_scalar(f"stage {stage.name!r}: losses[{index}]", term)
         value = functools.reduce(jnp.add, [*terms, *penalties(seen.corrections, seen.rows)])
         error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
         return value, (error, output.overflow)

@@ -162,7 +162,7 @@ def stage_bytes(
     images = at_once * (num_devices if jax.default_backend() == "cpu" else 1)
     is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
     largest, batch = largest_view(scene.train), system.batch_size
-    per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * any(term.has_geometry for term in stage.losses)
+    per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * stage.has_geometry
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
     of_step = STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num)

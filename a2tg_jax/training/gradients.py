@@ -69,7 +69,7 @@ def view_gradients(
       camera: the view.
       background: [3] colour; None is the model's own.
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
-      has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
+      has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
       sh_degree: degree in place of that of the settings; may be traced.
       statistic: kind of position that it differentiates by (`rasterize.pixel.positional_gradient`).
 
@@ -181,7 +181,7 @@ def differentiate(
       model: differentiated in its Gaussians and parameters.
       view: differentiated in its rows.
       settings: with a capacity under jit.
-      has_geometry: without, depth, normal and distortion are zeros, and cost nothing.
+      has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
       sh_degree: overrides the settings'; may be traced.
       statistic: of which position the probe tells; None without a probe.
       has_probe: gather the statistic.

@@ -30,6 +30,7 @@ from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
 from a2tg_jax.training.resume import check_resume, warn_of_uneven_rows
+from a2tg_jax.training.returned import check_change
 from a2tg_jax.training.room import Size, StageRoom
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import padded
@@ -383,6 +384,7 @@ class StageRun:
         due, agreed = event.iterations(self.stage.iterations), functools.partial(of_first, self.exchange)
         told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes, agreed)
         change = event.apply(told, self.state.model, self.state.moments, self.state.events[place])
+        check_change(f"stage {self.stage.name!r}: {type(event).__name__}.apply", change)
         self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
         if change.rows is not None:
             self._move_rows(change.rows)

@@ -35,8 +35,6 @@ class RobustPhotometric:
     has_ssim: bool = static(default=True)
     """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
 
-    has_geometry = False
-
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)
         counts = inliers(residual, self.share, self.factor, target.mask) | (target.progress < self.start)

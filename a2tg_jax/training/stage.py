@@ -1,18 +1,24 @@
 """A stage: an appearance, events, loss terms, rates and a length. A system is a sequence of stages."""
 
 import dataclasses
+import inspect
 import math
+import numbers
 import re
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.core.checks import check_kind, kind_of
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times, static
+from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -24,12 +30,11 @@ Background = Literal["black", "white", "random"]
 
 
 class LossTerm(Protocol):
-    """A part of the loss, a pytree of its numbers. One that reads depth maps has `has_depths = True`, too."""
+    """A part of the loss, a pytree of its numbers.
 
-    @property
-    def has_geometry(self) -> bool:
-        """Whether it reads depth, normals or distortion."""
-        ...
+    One that reads the render's depth, normal or distortion has `has_geometry = True`; one that reads the depth maps of
+    the photographs has `has_depths = True`.
+    """
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         """Its value, the weight included."""
@@ -70,6 +75,11 @@ class Stage:
         return next(iter(wanted), None)
 
     @property
+    def has_geometry(self) -> bool:
+        """Whether a loss term reads depth, normal or distortion of the render."""
+        return any(getattr(term, "has_geometry", False) for term in self.losses)
+
+    @property
     def has_depths(self) -> bool:
         """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
         return any(getattr(term, "has_depths", False) for term in self.losses)
@@ -90,13 +100,15 @@ class Stage:
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
+        self._check_kinds()
         if not re.fullmatch(r"[A-Za-z0-9_-]+", self.name):
             raise ValueError(
                 f"a stage's name must be letters, digits, - and _, for files are called so; got {self.name!r}"
             )
-        if not 1 <= self.iterations < 2**31:
+        if not isinstance(self.iterations, int | np.integer) or not 1 <= self.iterations < 2**31:
             raise ValueError(
-                f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
+                "a stage must have at least 1 iteration, and fewer than 2^31, in an integer; "
+                f"{self.name!r} has {self.iterations!r}"
             )
         if not 0 <= self.jitter <= 1:
             raise ValueError(f"jitter must lie in 0..1; that of the stage {self.name!r} is {self.jitter}")
@@ -104,11 +116,24 @@ class Stage:
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must want one statistic; those of {self.name!r} want {kinds}")
         for event in self.events:
-            if isinstance(event, HostEvent):
-                event.iterations(self.iterations)
+            _check_times(f"stage {self.name!r}: {type(event).__name__}", event, self.iterations)
         names = [correction.name for correction in self.corrections]
         if len(set(names)) < len(names):
             raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
+
+    def _check_kinds(self) -> None:
+        """Refuse fields of another kind than they must have."""
+        check_kind("name of a stage", self.name, str)
+        where = f"stage {self.name!r}:"
+        check_kind(f"{where} appearance", self.appearance, Appearance)
+        check_kind(f"{where} rates", self.rates, LearningRates)
+        for name in ("events", "losses", "corrections"):
+            several = getattr(self, name)
+            check_kind(f"{where} {name}", several, (tuple, list), "one of them stands in (…,)")
+            for index, one in enumerate(several):
+                _check_part(f"{where} {name}[{index}]", one, PARTS.get(name, ()))
+        if not self.losses:
+            raise ValueError(f"{where} losses must have a term, such as Term(function)")
 
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""
@@ -139,6 +164,37 @@ class Clock(NamedTuple):
     def progress(self, iteration: Array) -> Array:
         """Return the share of the stage that so many finished iterations are; traced."""
         return jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)
+
+
+PARTS: dict[str, tuple[type, ...]] = {"events": (StepEvent, HostEvent), "corrections": (Correction,)}
+"""Classes of what stands in the tuples of a stage."""
+
+
+def _check_part(name: str, part: Any, kinds: tuple[type, ...]) -> None:
+    """Raise ValueError unless an event, a correction or, without kinds, a loss term is a pytree of numbers."""
+    is_function = inspect.isroutine(part)
+    if kinds:
+        check_kind(name, part, kinds)
+    elif isinstance(part, type) or is_function or not callable(part):
+        hint = f": say Term({part.__name__})" if is_function else ""
+        raise ValueError(f"{name} must be a loss term, such as Term(function); got {kind_of(part)}{hint}")
+    for leaf in jax.tree.leaves(part):
+        if leaf is part:
+            raise ValueError(f"{name} must be a pytree; got {kind_of(part)}: decorate this class by @a2tg_jax.event")
+        if not isinstance(leaf, numbers.Number | np.ndarray | np.generic | jax.Array):
+            kind = type(part).__name__
+            raise ValueError(f"{name} must hold numbers; got {leaf!r}: make fields of {kind} that hold other static()")
+
+
+def _check_times(name: str, event: Event, num_iterations: int) -> None:
+    """Raise ValueError unless the times of an event are such."""
+    if isinstance(event, StepEvent):
+        check_kind(f"{name}.times: the result", event.times(num_iterations), Times)
+    elif isinstance(event, HostEvent):
+        found = event.iterations(num_iterations)
+        is_integers = isinstance(found, Sequence) and all(isinstance(number, int | np.integer) for number in found)
+        if not is_integers or list(found) != sorted(set(found)):
+            raise ValueError(f"{name}.iterations must return ascending integers in a tuple; got {shortened(found)}")
 
 
 def _times(event: Event, num_iterations: int) -> Times | None:

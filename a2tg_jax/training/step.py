@@ -6,7 +6,7 @@ values, and its status makes all further steps idle, so that the host may look a
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +28,7 @@ from a2tg_jax.training.batch_gradients import BatchGradients, batch_gradients, d
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import CorrectionState, corrected_camera, initial_corrections, rows_of, updated
 from a2tg_jax.training.jitter import jittered
+from a2tg_jax.training.returned import check_change, check_kept
 from a2tg_jax.training.stage import Background, Clock, Stage
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
@@ -236,35 +237,48 @@ def _events(
     known = due or (None,) * len(stage.events)
     for event, times, state, is_due in zip(stage.events, clock.times, states, known, strict=True):
         if state is not None and event.observes:
-            state = event.observe(state, model, seen)
+            before, state = state, event.observe(state, model, seen)
+            check_kept(f"stage {stage.name!r}: {type(event).__name__}.observe", state, before)
         if isinstance(event, StepEvent):
             own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
             at += event.num_keys
-            model, moments, state, info = _at_its_times(event, times, is_due, own, model, moments, state)
+            apply = functools.partial(_applied, stage.name, event, own)
+            model, moments, state, info = _at_its_times(apply, times, is_due, own.iteration, model, moments, state)
             possible = infos.is_possible & info.is_possible
             infos = EventInfo(possible, infos.num_refused + info.num_refused)
         left.append(state)
     return model, moments, tuple(left), infos
 
 
-def _at_its_times(
-    event: StepEvent, times: Times | None, is_due: bool | None, now: Now, model: Model, moments: AdamState, state: Any
+def _applied(
+    stage_name: str, event: StepEvent, now: Now, model: Model, moments: AdamState, state: Any
 ) -> tuple[Model, AdamState, Any, EventInfo]:
+    """Return the change by an event, which must keep all shapes."""
+    change, name = event.apply(now, model, moments, state), f"stage {stage_name!r}: {type(event).__name__}.apply"
+    check_change(name, change)
+    check_kept(f"{name}: model", change.model, model)
+    check_kept(f"{name}: state", change.state, state)
+    info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))
+    return change.model, change.moments, change.state, info
+
+
+def _at_its_times(
+    apply: Callable[..., tuple[Model, AdamState, Any, EventInfo]], times: Times | None, is_due: bool | None,
+    iteration: Array, model: Model, moments: AdamState, state: Any,
+) -> tuple[Model, AdamState, Any, EventInfo]:  # fmt: skip
     """Return the change by an event if it is due; events that are past make none.
 
     Args:
+      apply: `_applied` of the event.
       is_due: whether it is, if the host knows.
     """
     if times is None:
-        change = event.apply(now, model, moments, state)
-        return change.model, change.moments, change.state, change.info
+        return apply(model, moments, state)
     if state is None:
         return model, moments, state, EventInfo()
 
     def happen(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
-        change = event.apply(now, *carry)
-        info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))
-        return change.model, change.moments, change.state, info
+        return apply(*carry)
 
     def wait(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
         return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
@@ -272,7 +286,7 @@ def _at_its_times(
     if is_due is not None:
         return (happen if is_due else wait)((model, moments, state))
     changed: tuple[Model, AdamState, Any, EventInfo]
-    changed = jax.lax.cond(times.is_due(now.iteration), happen, wait, (model, moments, state))
+    changed = jax.lax.cond(times.is_due(iteration), happen, wait, (model, moments, state))
     return changed
 
 

@@ -14,6 +14,7 @@ from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
+from a2tg_jax.training.returned import check_scalar
 
 
 class Target(NamedTuple):
@@ -37,15 +38,24 @@ LossFunction = Callable[[Model, Target, RenderOutput], Array]
 
 @event
 class Term:
-    """Function of model, target and render, times a weight."""
+    """Function of model, target and render, times a weight.
+
+    def roughness(model, target, output):
+        return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
+
+    Term(roughness, weight=0.1, has_geometry=True)
+    """
 
     function: LossFunction = static()
     weight: float = 1.0
     has_geometry: bool = static(default=False)
-    """Whether the function reads depth, normals or distortion, which are composited only on demand."""
+    """Whether the function reads `output.depth`, `normal` or `distortion`, which are rendered only on demand: unless a
+    term of the stage asks for them, reading them raises ValueError."""
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
-        return self.weight * self.function(model, target, output)
+        value = self.function(model, target, output)
+        check_scalar(f"the loss function {getattr(self.function, '__name__', self.function)!r}", value)
+        return self.weight * value
 
 
 @event
@@ -53,8 +63,6 @@ class Photometric:
     """(1 − w)·L1 + w·(1 − SSIM), the loss of 3DGS."""
 
     ssim_weight: float = 0.2
-
-    has_geometry = False
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         return photometric_loss(output.color, target.image, ssim_weight=self.ssim_weight)

@@ -1,0 +1,41 @@
+"""Checks of what loss functions and events return, traced or not: kinds, shapes and dtypes only."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.checks import check_kind, described, dtype_of
+from a2tg_jax.core.gaussians import check_gaussians
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.events import Change
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io.validate import check_like
+from a2tg_jax.model import Model
+
+
+def check_scalar(name: str, value: Any) -> None:
+    """Raise ValueError unless what a loss function or term of that name returned is a scalar of floats."""
+    is_array = isinstance(value, float | np.ndarray | np.generic | jax.Array)
+    if not is_array or np.shape(value) != () or not jnp.issubdtype(dtype_of(value), jnp.floating):
+        raise ValueError(f"{name} must return a scalar of floats, such as jnp.mean(…); got {described(value)}")
+
+
+def check_change(name: str, change: Any) -> None:
+    """Raise ValueError unless what an event returned is a change whose moments fit its model."""
+    check_kind(f"{name}: the result", change, Change, "say Change(model, moments, state)")
+    check_kind(f"{name}: model", change.model, Model)
+    check_kind(f"{name}: moments", change.moments, AdamState)
+    check_gaussians(change.model.gaussians, f"{name}: model.gaussians")
+    floats = change.model.gaussians, change.model.params
+    for field in ("mu", "nu"):
+        check_kept(f"{name}: moments.{field}", getattr(change.moments, field), floats)
+
+
+def check_kept(name: str, found: Any, wanted: Any) -> None:
+    """Raise ValueError, naming the leaf, unless a pytree has the structure, shapes and dtypes of another."""
+    before, after = (str(jax.tree.structure(tree)) for tree in (wanted, found))
+    if after != before:
+        raise ValueError(f"{name} must keep its structure, {shortened(before)}; got {shortened(after)}")
+    check_like(name, jax.tree.map(jnp.asarray, found), wanted)

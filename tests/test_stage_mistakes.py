@@ -1,0 +1,163 @@
+"""Mistakes in stages, events and loss terms of one's own: each is an error that names the stage and the part."""
+
+import dataclasses
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import a2tg_jax as a2tg
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.training.terms import Photometric
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Own(a2tg.System):
+    """One stage, some of whose fields are given."""
+
+    given: Any = None
+
+    def stages(self):
+        first = a2tg.Stage("own", a2tg.Plain(), (), (Photometric(),), self.rates, 2)
+        return (dataclasses.replace(first, **self.given),)
+
+
+def own(**given):
+    return Own(given=given, loss=a2tg.LossConfig(ssim_weight=0))
+
+
+def roughness(model, target, output):
+    return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
+
+
+def each_pixel(model, target, output):
+    return jnp.abs(output.color - target.image)
+
+
+class Undecorated(a2tg.StepEvent):
+    pass
+
+
+@a2tg.event
+class Named(a2tg.StepEvent):
+    title: str = "a"
+
+
+@a2tg.event
+class Never(a2tg.HostEvent):
+    def iterations(self, num_iterations):
+        return (0.5,)
+
+
+@a2tg.event
+class Returning(a2tg.StepEvent):
+    """Returns one of several things."""
+
+    what: str = a2tg.static(default="tuple")
+
+    def apply(self, now, model, moments, state):
+        halved = dataclasses.replace(model, gaussians=model.gaussians[::2])
+        results = {
+            "tuple": (model, moments, state),
+            "model": a2tg.Change(model.gaussians, moments, state),
+            "half": a2tg.Change(halved, moments, state),
+            "state": a2tg.Change(model, moments, (now.iteration,)),
+        }
+        return results[self.what]
+
+
+@a2tg.event
+class OnHost(a2tg.HostEvent):
+    def iterations(self, num_iterations):
+        return (1,)
+
+    def apply(self, due, model, moments, state):
+        return model
+
+
+@a2tg.event
+class Observing(a2tg.StepEvent):
+    observes = True
+
+    def observe(self, state, model, seen):
+        return seen.colors
+
+    def apply(self, now, model, moments, state):
+        return a2tg.Change(model, moments, state)
+
+
+GIVEN = {
+    "stage 'own': appearance must be an Appearance; got the class Plain: say Plain(…)": {"appearance": a2tg.Plain},
+    "stage 'own': rates must be LearningRates; got float": {"rates": 0.1},
+    "a stage must have at least 1 iteration, and fewer than 2^31, in an integer; 'own' has '30'": {"iterations": "30"},
+    "stage 'own': events must be a tuple or a list; got Noise: one of them stands in (…,)": {"events": a2tg.Noise()},
+    "stage 'own': events[1] must be a StepEvent or a HostEvent; got the class Noise: say Noise(…)": {
+        "events": (a2tg.Noise(), a2tg.Noise)
+    },
+    "stage 'own': events[0] must be a pytree; got Undecorated: decorate": {"events": (Undecorated(),)},
+    "stage 'own': events[0] must hold numbers; got 'a': make fields of Named": {"events": (Named(),)},
+    "stage 'own': Never.iterations must return ascending integers in a tuple; got (0.5,)": {"events": (Never(),)},
+    "stage 'own': losses must be a tuple or a list; got function": {"losses": roughness},
+    "stage 'own': losses must have a term": {"losses": ()},
+    "stage 'own': losses[0] must be a loss term, such as Term(function); got function: say Term(roughness)": {
+        "losses": (roughness,)
+    },
+    "stage 'own': losses[0] must be a loss term, such as Term(function); got the class": {"losses": (Photometric,)},
+    "stage 'own': corrections[0] must be a Correction; got str": {"corrections": ("exposure",)},
+}
+
+
+@pytest.mark.parametrize("message", GIVEN)
+def test_a_part_of_the_wrong_kind_is_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        own(**GIVEN[message]).stages()[0].check()
+
+
+RETURNED = {
+    "stage 'own': Returning.apply: the result must be a Change; got tuple": {"events": (Returning(),)},
+    "stage 'own': Returning.apply: model must be a Model; got Gaussians": {"events": (Returning("model"),)},
+    "stage 'own': Returning.apply: moments.mu[0].means must be [": {"events": (Returning("half"),)},
+    "stage 'own': Returning.apply: state must keep its structure": {"events": (Returning("state"),)},
+    "stage 'own': Observing.observe must keep its structure": {"events": (Observing(),)},
+    "stage 'own': OnHost.apply: the result must be a Change; got Model": {"events": (OnHost(),)},
+    "the loss function 'each_pixel' must return a scalar of floats, such as jnp.mean(…); got float32[16, 16, 3]": {
+        "losses": (a2tg.Term(each_pixel),)
+    },
+    "the loss function '<lambda>' must return a scalar of floats, such as jnp.mean(…); got None": {
+        "losses": (a2tg.Term(lambda *_: None),)
+    },
+    "depth was not rendered: say has_geometry=True, as in Term(function, has_geometry=True)": {
+        "losses": (Photometric(), a2tg.Term(roughness))
+    },
+}
+
+
+@pytest.mark.parametrize("message", RETURNED)
+def test_a_wrong_result_is_named(scene, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        a2tg.fit(scene, own(**RETURNED[message]), progress=False)
+
+
+def test_depth_that_was_not_rendered_is_no_zero(scene):
+    model, camera = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors)), scene.test[0].camera
+    settings = a2tg.RenderSettings(capacity=64, compositor="xla", supersample=2)
+
+    def shown(has_geometry):
+        arguments = model.gaussians, camera, model.rule, jnp.zeros(3), settings
+        return render_traced(*arguments, has_geometry=has_geometry)[0]
+
+    assert jax.eval_shape(lambda: roughness(model, None, shown(True))).shape == ()
+    with pytest.raises(ValueError, match="depth was not rendered: say has_geometry=True"):
+        jax.eval_shape(lambda: roughness(model, None, shown(False)))
+    output = jax.eval_shape(lambda: shown(False))
+    assert output.alpha.shape == (16, 16) and "normal=None" in repr(output)
+    for name in ("depth", "normal", "distortion"):
+        with pytest.raises(ValueError, match=f"{name} was not rendered"):
+            getattr(output, name)
