@@ -1,7 +1,9 @@
 """Photographs that do not fit into memory: the same bits from disk, read ahead, and named where they are gone."""
 
+import copy
 import dataclasses
 import json
+import pickle
 import threading
 import time
 
@@ -256,3 +258,21 @@ def test_a_view_takes_pixels_and_pictures():
     np.testing.assert_array_equal(changed.image, pixels[..., :3])
     np.testing.assert_array_equal(changed.alpha, pixels[..., 3])
     assert dataclasses.replace(changed, name="other").picture is changed.picture
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("room", [None, 0])
+def test_a_scene_is_pickled_and_copied(tmp_path, kind, room):
+    """Photographs that are read from their files as they are stay there; all others travel with the pickle."""
+    told = dict(KINDS[kind])
+    downscale = told.pop("downscale", 1)
+    scene = load(write_scene(tmp_path / "scene", **told), room, downscale=downscale)
+    scene = dataclasses.replace(scene, test=(dataclasses.replace(scene.test[0], depth=np.full((2, 3), 0.5)),))
+    again = pickle.loads(pickle.dumps(scene))
+    for before, after in zip((*scene.train, *scene.test), (*again.train, *again.test), strict=True):
+        np.testing.assert_array_equal(after.picture.read(), before.picture.read())
+        assert_same(after.camera, before.camera)
+    np.testing.assert_array_equal(again.test[0].depth.read(), scene.test[0].depth.read())
+    is_left = room == 0 and kind in ("as in their files", "with opacity")
+    assert again.train[0].picture.is_held != is_left
+    assert copy.deepcopy(scene).train[0].picture is scene.train[0].picture

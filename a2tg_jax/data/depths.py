@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,14 @@ class DepthMap:
             raise ValueError(f"a depth map must be floats [H, W]; got {values.dtype} {list(values.shape)}")
         height, width = values.shape
         return DepthMap((height, width), lambda: values)
+
+    def __deepcopy__(self, memo: Any) -> "DepthMap":
+        """Return the map itself, which nothing changes."""
+        return self
+
+    def __reduce__(self) -> Any:
+        """Pickle the numbers that `read` returns."""
+        return DepthMap.of, (self.read(),)
 
     def read(self) -> np.ndarray:
         """Return [H, W] float32, NaN where unknown, its largest magnitude 1 (scales are unknown anyway)."""

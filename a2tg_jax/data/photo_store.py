@@ -9,7 +9,7 @@ import weakref
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -46,6 +46,16 @@ class Picture:
     def of(pixels: "np.ndarray | Picture") -> "Picture":
         """Return a picture of pixels held in memory; a picture is returned unchanged."""
         return pixels if isinstance(pixels, Picture) else Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
+
+    def __deepcopy__(self, memo: Any) -> "Picture":
+        """Return the picture itself, which nothing changes."""
+        return self
+
+    def __reduce__(self) -> Any:
+        """Pickle the pixels; of a photograph that is read from its file as it is, only the place."""
+        if isinstance(self.read, _FileRead) and self.read.view is None:
+            return Picture, tuple(getattr(self, field.name) for field in dataclasses.fields(self))
+        return Picture.of, (self.read(),)
 
     def __repr__(self) -> str:
         return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {self._place})"
@@ -193,12 +203,20 @@ def _free_disk() -> int:
 def _decoded_again(source: Path, pixels: np.ndarray, view: Processing | None) -> Picture:
     """Return the picture in an image file, which must not change, or what a function makes of it."""
     checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
+    return Picture(pixels.shape, _FileRead(source, view, checksum), is_remote=is_remote(source))
 
-    def read() -> np.ndarray:
-        stored = read_pixels(source)
-        again = np.ascontiguousarray(stored if view is None else view(stored))
-        if zlib.crc32(again.data) != checksum:
-            raise ValueError(f"{source}: has changed since the scene was loaded; restore it or start again")
-        return again
 
-    return Picture(pixels.shape, read, is_remote=is_remote(source))
+@dataclasses.dataclass(frozen=True)
+class _FileRead:
+    """Function that reads the pixels in an image file, or what `view` makes of them."""
+
+    source: Path
+    view: Processing | None
+    checksum: int
+
+    def __call__(self) -> np.ndarray:
+        stored = read_pixels(self.source)
+        pixels = np.ascontiguousarray(stored if self.view is None else self.view(stored))
+        if zlib.crc32(pixels.data) != self.checksum:
+            raise ValueError(f"{self.source}: has changed since the scene was loaded; restore it or start again")
+        return pixels
