@@ -221,6 +221,8 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
       [N] int32 rows for which `is_host` holds; all 0 if there are none.
     """
     num = opacities.shape[0]
+    if num == 0:
+        return jnp.zeros(0, jnp.int32)
     width = 2 ** math.ceil(math.log2(num) / 2)
     num_blocks = -(-num // width)
     num_hosts = jnp.sum(is_host, dtype=jnp.int32)

@@ -238,6 +238,13 @@ def test_a_single_row_is_its_own_host():
     assert draw_hosts(KEY, jnp.asarray([0.5]), jnp.asarray([True])) == 0
 
 
+@pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, 0)], ids=["relocate", "grow"])
+def test_no_rows_stay_none(step):
+    none = random_gaussians(0)
+    moved = step(KEY, none, ones_like_moments(none), 0)
+    assert moved.gaussians.num == 0 and int(moved.num_live) == 0
+
+
 def test_noise_lies_in_the_plane_with_the_splats_covariance(x64):
     """Many copies of one transparent splat: covariance Σ·Σᵀ times the squared strength; none along its normal."""
     num = 20_000
