@@ -20,6 +20,7 @@ from a2tg_jax.render import RenderOutput
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.fitting import FitResult, StageResult
+from a2tg_jax.training.step import TrainState
 
 CAMERA = as_camera(draw_scene(0, width=21, height=13), "float32")
 MASK = np.arange(13 * 21).reshape(13, 21) % 2 == 0
@@ -108,6 +109,18 @@ def some_output(*views: int) -> RenderOutput:
     plane = jnp.zeros((13, 21))
     output = RenderOutput(color, plane, plane, jnp.zeros((13, 21, 3)), jnp.asarray(False), plane)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (*views, *x.shape)), output)
+
+
+def test_a_checkpoint_whose_buffers_are_reused_says_so():
+    num_live = jnp.int32(5)
+    model = dataclasses.replace(some_model(), num_live=num_live)
+    state = TrainState(model, None, (), jnp.int32(7), jnp.int32(0))
+    checkpoint = Checkpoint(A2tg(), 0, state, History.empty())
+    assert repr(checkpoint) == "Checkpoint(A2tg, stage 1, iteration 7, 5 Gaussians)"
+    num_live.delete()
+    state.iteration.delete()
+    assert repr(checkpoint) == "Checkpoint(A2tg, stage 1, its arrays reused by the next iteration)"
+    assert repr(model).startswith("Model(gaussians=Gaussians(means=float32[")
 
 
 def test_render_is_a_picture():

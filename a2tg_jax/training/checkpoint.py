@@ -132,7 +132,10 @@ class Checkpoint:
         return self.state.model.live
 
     def __repr__(self) -> str:
-        at = f"stage {self.stage + 1}, iteration {self.iteration:,}"
+        at = f"stage {self.stage + 1}"
+        if isinstance(self.state.iteration, jax.Array) and self.state.iteration.is_deleted():
+            return f"Checkpoint({type(self.system).__name__}, {at}, its arrays reused by the next iteration)"
+        at = f"{at}, iteration {self.iteration:,}"
         return f"Checkpoint({type(self.system).__name__}, {at}, {counted(self.state.model.num, 'Gaussian')})"
 
 

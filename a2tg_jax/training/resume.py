@@ -18,7 +18,7 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
     if resume.system != system:
         raise ValueError(
             f"the checkpoint was made with another configuration ({_differing(resume.system, system)}): resume with "
-            "checkpoint.system"
+            f"checkpoint.system{_or_anew(resume.system, system)}"
         )
     found, wanted = resume.state.model.gaussians.sh_degree, system.initial_sh_degree
     if found != wanted:
@@ -40,8 +40,23 @@ def warn_of_uneven_rows(resume: Checkpoint, num_devices: int) -> None:
         )
 
 
+def _is_defined_anew(before: System, now: System) -> bool:
+    """Return whether the classes of two systems are of one name and module, as when a notebook's cell runs twice."""
+    kinds = type(before), type(now)
+    return kinds[0] is not kinds[1] and len({(kind.__module__, kind.__qualname__) for kind in kinds}) == 1
+
+
+def _or_anew(before: System, now: System) -> str:
+    """Return what leads to the new class, for advice; empty if it is the same one."""
+    if not _is_defined_anew(before, now):
+        return ""
+    return f", or with load_checkpoint(path, {type(now).__name__}) of what save_checkpoint wrote, for the new class"
+
+
 def _differing(before: System, now: System) -> str:
     """Return the options in which two systems differ, in a few words."""
+    if _is_defined_anew(before, now):
+        return f"the class {type(now).__name__} as it was before it was defined anew"
     if type(before) is not type(now):
         return f"{type(before).__name__}, not {type(now).__name__}"
     values, others = flatten_config(before), flatten_config(now)
