@@ -68,7 +68,8 @@ def save_ply(
         as 2DGS does.
 
     Raises:
-      ValueError: if a field of the Gaussians has another shape than it must have.
+      ValueError: if a field of the Gaussians has another shape than it must have, or `load_ply` would refuse them, as
+        it does numbers that are not finite.
     """
     check_suffix(path, "save_ply")
     gaussians = plain_gaussians(gaussians, transform)
@@ -95,7 +96,12 @@ def plain_gaussians(
 
 
 def encode_ply(gaussians: Gaussians, third: np.ndarray | None) -> bytes:
-    """Return a PLY file of Gaussians, with the logarithms [N, 1] of third scales, or without a third scale."""
+    """Return a PLY file of Gaussians, with the logarithms [N, 1] of third scales, or without a third scale.
+
+    Raises:
+      ValueError: if `load_ply` would refuse the Gaussians, as it does numbers that are not finite.
+    """
+    _check(gaussians)
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, 3 * (sh.shape[1] - 1))
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
@@ -173,8 +179,7 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Gaussian
         sh=jnp.asarray(_sh_of(vertices, path)),
     )
     try:
-        _check_rows(gaussians)
-        check_model(Model(gaussians))
+        _check(gaussians)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return gaussians
@@ -187,8 +192,8 @@ def _is_marked(file: BinaryIO, path: Path) -> bool:
     return FLAT_MARK.lower() in lines
 
 
-def _check_rows(gaussians: Gaussians) -> None:
-    """Raise ValueError, naming a field, the number of rows and the first of them, if some are not finite."""
+def _check(gaussians: Gaussians) -> None:
+    """Raise ValueError unless Gaussians can be rendered; of numbers that are not finite it tells field and rows."""
     for field in dataclasses.fields(gaussians):
         rows = np.asarray(getattr(gaussians, field.name))
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))))
@@ -197,6 +202,7 @@ def _check_rows(gaussians: Gaussians) -> None:
                 f"gaussians.{field.name} must be finite; {len(bad):,} of {gaussians.num:,} rows have NaN or infinite "
                 f"numbers, the first is row {bad[0]:,} (from 0)"
             )
+    check_model(Model(gaussians))
 
 
 def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
