@@ -12,6 +12,7 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
 from a2tg_jax.appearance.layers import layers_in_words
 from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
+from a2tg_jax.appearance.stored import check_given
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind, short_repr
@@ -67,11 +68,13 @@ class Model:
     @property
     def rule(self) -> AppearanceRule:
         """Appearance rule for the renderer."""
+        check_given(self.appearance, self.params)
         return PlainRule() if self.gaussians.num == 0 else self.appearance.rule(self.params, self.layout)
 
     @property
     def live(self) -> "Model":
         """Model of only the rows that exist (host)."""
+        check_given(self.appearance, self.params)
         if self.num_live is None:
             return self
         params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
@@ -127,6 +130,7 @@ class Model:
 
     def bytes_of(self, num: int) -> int:
         """Return the bytes of the trained floats of the first `num` Gaussians and their appearance (host)."""
+        check_given(self.appearance, self.params)
         return BYTES_PER_FLOAT * (self.gaussians.floats_per_row * num + self.appearance.num_floats(self.layout, num))
 
     @property
@@ -141,7 +145,12 @@ class Model:
         return self.appearance.textures(self.params, self.layout)
 
     def with_textures(self, textures: Textures, layout: AtlasLayout) -> "Model":
-        """Return the same model with other textures."""
+        """Return the same model with other textures.
+
+        Raises:
+          ValueError: if the model has none; the message says how to build one that has.
+        """
+        check_given(self.appearance, self.params)
         params, layout = self.appearance.with_textures(self.params, self.layout, textures, layout)
         return dataclasses.replace(self, params=params, layout=layout)
 
@@ -151,7 +160,12 @@ class Model:
         return self.appearance.bands(self.params, self.layout)
 
     def with_bands(self, bands: Bands, owners: BandLayout) -> "Model":
-        """Return the same model with other spherical harmonics beyond those of the Gaussians."""
+        """Return the same model with other spherical harmonics beyond those of the Gaussians.
+
+        Raises:
+          ValueError: if the model has no degrees per Gaussian; the message says how to build one that has.
+        """
+        check_given(self.appearance, self.params)
         params, layout = self.appearance.with_bands(self.params, self.layout, bands, owners)
         return dataclasses.replace(self, params=params, layout=layout)
 
@@ -221,7 +235,8 @@ class Model:
     def __repr__(self) -> str:
         try:
             return f"Model({', '.join(text for _, text in self._facts())})"
-        except (TypeError, ValueError, AttributeError, IndexError):  # Leaves are not arrays, or have no values.
+        # Leaves are not arrays, have no values, or were given to a step.
+        except (TypeError, ValueError, AttributeError, IndexError, RuntimeError):
             return short_repr(self)
 
     def _repr_html_(self) -> str:

@@ -13,7 +13,12 @@ from small_models import some_model
 from small_values import some_gaussians, some_world
 
 import a2tg_jax as a2tg
+from a2tg_jax.appearance import Banded, Shaped
+from a2tg_jax.appearance.sh_bands import split_sh
 from a2tg_jax.host import signals
+from a2tg_jax.training import Checkpoint, History
+from a2tg_jax.training.option_groups import CorrectionConfig
+from a2tg_jax.training.resume import check_resume
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 
@@ -169,6 +174,18 @@ KINDS = {
     "flat.ply: load_model reads *.npz files; call load_ply instead": lambda: a2tg.load_model("flat.ply"),
     "load_compact reads *.a2tgz files; call load_model": lambda: a2tg.load_compact("m.npz"),
     "load_ply reads *.ply files; call load_model": lambda: a2tg.load_ply("m.npz"),
+    "similarity must be a Similarity; got ndarray": lambda: MODEL.transform(np.eye(4)),
+    "similarity.rotation must be an array; got list: use np.asarray": lambda: moved(rotation=[[1, 0, 0]]),
+    "texture must be a TextureConfig; got dict: say TextureConfig(cap=8)": lambda: a2tg.A2tg(
+        texture={"cap": 8}
+    ).check(),
+    "background must be Literal['black', 'white', 'random']; got 'grey'": lambda: a2tg.fit(
+        scene(), a2tg.A2tg(background="grey")
+    ),
+    "corrections.exposure_kind must be Literal[": lambda: a2tg.A2tg(
+        corrections=CorrectionConfig(exposure_kind="foo")
+    ).check(),
+    "batch_size must be int; got '4'": lambda: a2tg.A2tg(batch_size="4").check(),
 }
 
 
@@ -178,6 +195,75 @@ def test_a_value_of_the_wrong_kind_is_named(message):
         KINDS[message]()
 
 
+def moved(**changes) -> a2tg.Model:
+    return MODEL.transform(dataclasses.replace(a2tg.Similarity(1.0, np.eye(3), np.zeros(3)), **changes))
+
+
+VALUES = {
+    "num must be an integer of at least 2; got 3.5": lambda: started(num=3.5),
+    "num must be an integer of at least 2; got True": lambda: started(num=True),
+    "sh_degree must be an integer in 0..3; got 4": lambda: started(sh_degree=4),
+    "opacity must be a number between 0 and 1, both excluded; got 1.0": lambda: started(opacity=1.0),
+    "opacity must be a number between 0 and 1, both excluded; got '0.1'": lambda: started(opacity="0.1"),
+    "similarity must have a positive scale": lambda: moved(scale=0.0),
+    "similarity must have a rotation; got [[-1.0": lambda: moved(rotation=-np.eye(3)),
+    "similarity.rotation must be [3, 3]; got [4, 4]": lambda: moved(rotation=np.eye(4)),
+    "similarity must have a positive scale and a finite translation": lambda: moved(translation=np.full(3, np.nan)),
+    "gaussians must be float32 or float64; got bfloat16": lambda: a2tg.Model(
+        jax.tree.map(lambda x: x.astype(jnp.bfloat16), GAUSSIANS)
+    ).render(CAMERA),
+    "Plain has no textures to replace: a model with textures is Model(gaussians, textures, layout, appearance="
+    "Textured())": lambda: MODEL.with_textures(TEXTURES, LAYOUT),
+    "Plain has no degrees per Gaussian to replace: let Banded(appearance).allocate": lambda: MODEL.with_bands(*SPLIT),
+    "Plain has no shapes of kernels to replace": lambda: MODEL.appearance.with_shapes((), jnp.zeros(7)),
+}
+SPLIT = split_sh(np.asarray(GAUSSIANS.sh), np.full(GAUSSIANS.num, 3), 0)
+
+
+def started(**arguments) -> a2tg.Gaussians:
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    return a2tg.init_from_points(points, np.full((9, 3), 0.5), **arguments)
+
+
+@pytest.mark.parametrize("message", VALUES)
+def test_an_impossible_value_is_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        VALUES[message]()
+
+
+@pytest.mark.parametrize("appearance", [a2tg.Textured(), Banded(), Shaped()])
+@pytest.mark.parametrize("needs", ["rule", "live", "num_bytes", "with_textures", "save_model", "evaluate"])
+def test_an_appearance_without_its_parameters_is_refused_where_they_are_needed(appearance, needs, tmp_path):
+    calls = {
+        "with_textures": lambda model: model.with_textures(TEXTURES, LAYOUT),
+        "save_model": lambda model: a2tg.save_model(tmp_path / "m.npz", model),
+        "evaluate": lambda model: a2tg.evaluate(scene().test, model),
+    }
+    model = jax.tree.map(lambda x: x, a2tg.Model(GAUSSIANS, appearance=appearance))
+    message = f"model.params must be those of the appearance {type(appearance).__name__}; got (): say params, layout ="
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calls.get(needs, lambda model: getattr(model, needs))(model)
+
+
+def test_numbers_of_numpy_are_options():
+    a2tg.A2tg(seed=np.int64(3), initial_opacity=np.float32(0.2)).check()
+
+
+def test_a_class_that_was_defined_anew_is_told_from_the_one_before():
+    def defined() -> type[a2tg.System]:
+        @dataclasses.dataclass(frozen=True, kw_only=True)
+        class Own(a2tg.A2tg):
+            pass
+
+        return Own
+
+    checkpoint = Checkpoint(defined()(), 0, None, History.empty())
+    with pytest.raises(
+        ValueError, match=r"Own as it was before it was defined anew\): resume with checkpoint.system, or"
+    ):
+        check_resume(checkpoint, defined()(), 0)
+
+
 def test_transformations_may_put_anything_in_the_place_of_gaussians():
     axes = a2tg.Model(0, None, None)
     assert jax.tree.map(lambda x: None, MODEL).gaussians.means is None and axes.gaussians == 0
@@ -185,11 +271,16 @@ def test_transformations_may_put_anything_in_the_place_of_gaussians():
 
 def test_a_ply_file_with_nan_says_how_many_rows_and_which_first(tmp_path):
     bad = dataclasses.replace(GAUSSIANS, means=GAUSSIANS.means.at[jnp.array([2, 5]), 1].set(jnp.nan))
-    a2tg.save_ply(tmp_path / "bad.ply", bad)
-    with pytest.raises(
-        ValueError,
-        match=r"means must be finite; 2 of 7 rows have NaN or infinite numbers, the first is row 2 \(from 0\)",
-    ):
+    message = r"means must be finite; 2 of 7 rows have NaN or infinite numbers, the first is row 2 \(from 0\)"
+    with pytest.raises(ValueError, match=message):
+        a2tg.save_ply(tmp_path / "bad.ply", bad)
+    assert not (tmp_path / "bad.ply").exists()
+    a2tg.save_ply(tmp_path / "good.ply", GAUSSIANS)
+    header, rows = (tmp_path / "good.ply").read_bytes().split(b"end_header\n")
+    numbers = np.frombuffer(rows, "<f4").reshape(GAUSSIANS.num, -1).copy()
+    numbers[[2, 5], 1] = np.nan
+    (tmp_path / "bad.ply").write_bytes(header + b"end_header\n" + numbers.tobytes())
+    with pytest.raises(ValueError, match=message):
         a2tg.load_ply(tmp_path / "bad.ply")
 
 

@@ -22,6 +22,12 @@ from a2tg_jax.appearance.stored import StoredArrays, parameter_shapes
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.texture import AtlasLayout, Textures
 
+WITH_TEXTURES = "a model with textures is Model(gaussians, textures, layout, appearance=Textured())"
+WITH_BANDS = (
+    "let Banded(appearance).allocate(key, gaussians) make its parameters and layout, and give all three to Model"
+)
+WITH_SHAPES = WITH_BANDS.replace("Banded", "Shaped")
+
 
 @dataclasses.dataclass(frozen=True)
 class Appearance(MovableRows, StoredArrays):
@@ -88,21 +94,33 @@ class Appearance(MovableRows, StoredArrays):
         return None
 
     def with_textures(self, params: Any, layout: Any, textures: Textures, atlas: AtlasLayout) -> tuple[Any, Any]:
-        """Return parameters and layout with other textures; unchanged without textures."""
-        return params, layout
+        """Return parameters and layout with other textures.
+
+        Raises:
+          ValueError: if the appearance has no textures.
+        """
+        raise ValueError(f"{type(self).__name__} has no textures to replace: {WITH_TEXTURES}")
 
     def bands(self, params: Any, layout: Any) -> tuple[Bands, BandLayout] | None:
         """Return the coefficients beyond those of `Gaussians.sh`, and their owners; None without degrees."""
         return None
 
     def with_bands(self, params: Any, layout: Any, bands: Bands, owners: BandLayout) -> tuple[Any, Any]:
-        """Return parameters and layout with other coefficients; unchanged without degrees."""
-        return params, layout
+        """Return parameters and layout with other coefficients.
+
+        Raises:
+          ValueError: if the appearance has no degrees per Gaussian.
+        """
+        raise ValueError(f"{type(self).__name__} has no degrees per Gaussian to replace: {WITH_BANDS}")
 
     def shapes(self, params: Any) -> Array | None:
         """Return the shapes [N] of the kernels; None if all are Gaussians."""
         return None
 
     def with_shapes(self, params: Any, shapes: Array) -> Any:
-        """Return parameters with other shapes of the kernels; unchanged without shapes."""
-        return params
+        """Return parameters with other shapes of the kernels.
+
+        Raises:
+          ValueError: if the appearance has no shapes.
+        """
+        raise ValueError(f"{type(self).__name__} has no shapes of kernels to replace: {WITH_SHAPES}")

@@ -1,5 +1,6 @@
 """Appearances in files: named arrays, and whether the portable formats can hold them."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -100,6 +101,25 @@ def parameter_shapes(appearance: Any) -> tuple[Any, Any]:
     gaussians: Any = Gaussians(row(3), row(4), row(2), row(), row(16, 3))  # type: ignore[arg-type]
     shapes: tuple[Any, Any] = jax.eval_shape(appearance.allocate, jax.eval_shape(lambda: jax.random.key(0)), gaussians)
     return shapes
+
+
+def check_given(appearance: Any, params: Any) -> None:
+    """Raise ValueError if there are no parameters, `()`, of an appearance that has some."""
+    if type(params) is tuple and not params and _has_parameters(appearance):
+        kind = type(appearance).__name__
+        raise ValueError(
+            f"model.params must be those of the appearance {kind}; got (): say params, layout = appearance.allocate("
+            f"key, gaussians), and Model(gaussians, params, layout, appearance=appearance)"
+        )
+
+
+@functools.cache
+def _has_parameters(appearance: Any) -> bool:
+    """Return whether an appearance allocates parameters; False if that cannot be told without values."""
+    try:
+        return str(jax.tree.structure(parameter_shapes(appearance)[0])) != str(jax.tree.structure(()))
+    except (TypeError, ValueError, AttributeError):
+        return False
 
 
 def _name(path: tuple[Any, ...]) -> str:

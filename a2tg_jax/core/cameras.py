@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_kind, short_repr
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_floats, check_kind, short_repr
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
@@ -67,8 +67,7 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
     check_kind(name, camera, Camera, "use view.camera" if hasattr(camera, "camera") else "")
     for field, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
         value = getattr(camera, field)
-        if isinstance(value, list | tuple):
-            raise ValueError(f"{name}.{field} must be an array; got {type(value).__name__}: use jnp.asarray")
+        check_array(f"{name}.{field}", value, "jnp.asarray")
         check_floats(f"{name}.{field}", value, shape)
     if camera.rays is not None:
         check_floats(f"{name}.rays", camera.rays, (camera.height, camera.width, 2))

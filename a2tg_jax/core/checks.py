@@ -4,6 +4,7 @@ Checks read only `shape` and `dtype`, so that tracers pass and nothing is comput
 """
 
 import dataclasses
+import math
 from typing import Any, get_args
 
 import jax.numpy as jnp
@@ -37,6 +38,14 @@ def check_literal(name: str, value: Any, literal: Any) -> None:
         raise ValueError(f"{name} must be one of {', '.join(get_args(literal))}; got {value!r}")
 
 
+def check_integer(name: str, value: Any, least: int, most: float = math.inf) -> None:
+    """Raise ValueError unless a value is an integer, no truth value, in a range."""
+    is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_integer or not least <= value <= most:
+        wanted = f"of at least {least}" if most == math.inf else f"in {least}..{most}"
+        raise ValueError(f"{name} must be an integer {wanted}; got {value!r}")
+
+
 def _noun(kind: type) -> str:
     """Return the name of a class with its article; a plural, such as Gaussians, has none."""
     article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOUaeiou" else "a "
@@ -46,6 +55,12 @@ def _noun(kind: type) -> str:
 def kind_of(value: Any) -> str:
     """Return the class of a value in errors; a class itself by its name."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
+def check_array(name: str, x: Any, use: str) -> None:
+    """Raise ValueError, which says what to use, if x is a list or a tuple."""
+    if isinstance(x, list | tuple):
+        raise ValueError(f"{name} must be an array; got {type(x).__name__}: use {use}")
 
 
 def check_shape(name: str, x: Any, wanted: Wanted) -> None:

@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.checks import check_floats, dtype_of, short_repr
+from a2tg_jax.core.checks import FLOATS, check_floats, check_integer, dtype_of, short_repr
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
@@ -30,7 +30,7 @@ SH_C0 = 0.28209479177387814
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Gaussians:
-    """N flat Gaussians as unconstrained arrays, all of one float dtype."""
+    """N flat Gaussians as unconstrained arrays, all of one dtype: float32, or float64."""
 
     means: Array
     """[N, 3] centres in the world."""
@@ -88,11 +88,13 @@ def floats_per_gaussian(sh_degree: int = 3) -> int:
 
 
 def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
-    """Raise ValueError, naming the field, unless all fields have their shapes and one float dtype."""
+    """Raise ValueError, naming the field, unless all fields have their shapes and one dtype, float32 or float64."""
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
     check_floats(f"{name}.means", gaussians.means, ("N", 3))
     num, dtype = gaussians.num, dtype_of(gaussians.means)
+    if str(dtype) not in FLOATS:
+        raise ValueError(f"{name} must be {' or '.join(FLOATS)}; got {dtype}")
     bases = gaussians.sh.shape[1] if np.ndim(gaussians.sh) == 3 and gaussians.sh.shape[1] in NUM_BASES else 16
     shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, bases, 3)}
     for field, shape in shapes.items():
@@ -160,17 +162,19 @@ def init_from_points(
       float32 Gaussians, min(num, P) of them.
 
     Raises:
-      ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, or colours are an
-        array of integers or outside [0, 1].
+      ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, colours are an array
+        of integers or outside [0, 1], or another argument is outside its range.
     """
+    check_integer("num", 2 if num is None else num, 2)
+    check_integer("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
+    if not isinstance(opacity, float | np.floating) or not 0 < opacity < 1:
+        raise ValueError(f"opacity must be a number between 0 and 1, both excluded; got {opacity!r}")
     check_unit_colors("colors", colors)
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
     if not (np.isfinite(points).all() and np.isfinite(colors).all()):
         raise ValueError("points and colors must be finite; some are NaN or infinite")
-    if num is not None and num < 2:
-        raise ValueError(f"num must be at least 2; got {num}")
     rng = np.random.default_rng(seed)
     if num is not None and num < len(points):
         keep = np.sort(rng.choice(len(points), num, replace=False))

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from a2tg_jax.core.cameras import MAX_SKEW
-from a2tg_jax.core.checks import LARGEST_NUMBER
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_kind, check_shape
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,12 +46,17 @@ class Similarity:
 
 def check_similarity(similarity: Similarity, what: str) -> None:
     """Raise ValueError, naming it `what`, unless scale is positive, rotation is a rotation, and all is finite."""
+    check_kind(what, similarity, Similarity)
+    for name, wanted in ("rotation", (3, 3)), ("translation", (3,)):
+        check_array(f"{what}.{name}", getattr(similarity, name), "np.asarray")
+        check_shape(f"{what}.{name}", getattr(similarity, name), wanted)
     scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
     if not (1 / LARGEST_NUMBER <= scale <= LARGEST_NUMBER and (np.abs(translation) <= LARGEST_NUMBER).all()):
         raise ValueError(
             f"{what} must have a positive scale and a finite translation, up to {LARGEST_NUMBER:g}, the scale from "
             f"{1 / LARGEST_NUMBER:g}; got {scale:g}, {np.asarray(translation).tolist()}"
         )
+    rotation = np.asarray(rotation)
     is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW) and np.linalg.det(rotation) > 0
     if not is_rotation:  # Also of NaN.
         raise ValueError(f"{what} must have a rotation; got {np.asarray(rotation).tolist()}")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.sh import sh_basis
-from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.core.similarity import Similarity, check_similarity
 
 NUM_DIRECTIONS = 64
 SH_DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
@@ -30,9 +30,10 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
       N Gaussians of the same dtype; the quaternions are unit.
 
     Raises:
-      ValueError: if a field of the Gaussians has another shape than it must have.
+      ValueError: if a field of the Gaussians has another shape than it must have, or the similarity is none.
     """
     check_gaussians(gaussians)
+    check_similarity(similarity, "similarity")
     rotation = np.asarray(similarity.rotation, np.float64)
     means = similarity.apply(np.asarray(gaussians.means, np.float64))
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.asarray(gaussians.quats), scalar_first=True)

@@ -6,6 +6,9 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+import numpy as np
+
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.host.text import did_you_mean, shortened
 
 ConfigT = TypeVar("ConfigT")
@@ -56,6 +59,30 @@ def changed_config(config: ConfigT, changes: Mapping[str, Any], where: str) -> C
       ValueError: naming the field, if it is unknown or of another type.
     """
     return config_from_dict(type(config), merged(config_to_dict(config), _plain(changes)), where)
+
+
+def check_config(config: Any, prefix: str = "") -> None:
+    """Raise ValueError, naming the field, if a group, number, text or choice of a dataclass is of another type.
+
+    Fields of other types are not looked at.
+    """
+    hints = typing.get_type_hints(type(config))
+    for field in dataclasses.fields(config):
+        name, hint, value = prefix + field.name, hints[field.name], getattr(config, field.name)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            given = ", ".join(f"{key}={item!r}" for key, item in value.items()) if isinstance(value, Mapping) else "…"
+            check_kind(name, value, hint, f"say {hint.__name__}({shortened(given)})")
+            check_config(value, f"{name}.")
+        elif _is_plain(hint):
+            _from_json(hint, value.item() if isinstance(value, np.generic) else _to_json(value), name)
+
+
+def _is_plain(hint: Any) -> bool:
+    """Return whether a type is one of numbers, texts and choices, None, or a union or tuple of them."""
+    if typing.get_origin(hint) is typing.Literal or hint is ...:
+        return True
+    parts = typing.get_args(hint)
+    return all(map(_is_plain, parts)) if parts else hint in (int, float, bool, str, type(None))
 
 
 def _plain(changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from a2tg_jax.core.cameras import check_calibration
-from a2tg_jax.core.checks import FLOATS, LARGEST_NUMBER, check_floats, check_shape, dtype_of
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_shape, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import check_similarity
@@ -29,8 +29,6 @@ def check_model(model: Model) -> None:
     """
     gaussians = model.gaussians
     check_gaussians(gaussians)
-    if str(dtype_of(gaussians.means)) not in FLOATS:
-        raise ValueError(f"gaussians must be {' or '.join(FLOATS)}; got {dtype_of(gaussians.means)}")
     model.appearance.check(model.params, model.layout, gaussians)
     check_bounded("gaussians", gaussians)
     check_bounded("params", model.params)

@@ -100,8 +100,8 @@ def view_gradients(
 def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Parameters]]:
     """Return a function of a model that gives a loss and its gradient in all floats of the model.
 
-    `jax.value_and_grad` refuses a whole model, which has integers, too. The gradient is a `Parameters` as
-    `model.parameters` is: an optimizer updates these, and `model.with_parameters` puts them back.
+    `jax.value_and_grad` refuses a model with integers, such as the layout of textures. The gradient is a `Parameters`
+    as `model.parameters` is: an optimizer updates these, and `model.with_parameters` puts them back.
 
     Args:
       loss: of a model, and of any further arguments, which are not differentiated; a scalar.

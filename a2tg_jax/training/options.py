@@ -12,7 +12,7 @@ from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.densify.floaters import PruneFloaters
 from a2tg_jax.events import Event, FieldError, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import changed_config, flatten_config
+from a2tg_jax.io.config_json import changed_config, check_config, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.bilateral import BilateralGrid
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
@@ -309,7 +309,8 @@ class System:
                 )
 
     def _check_numbers(self) -> None:
-        """Refuse numbers that are not finite or outside the range of an option that every system has."""
+        """Refuse values of another type, and numbers that are not finite or outside their range."""
+        check_config(self)
         numbers = flatten_config(self)
         for name, value in numbers.items():
             held = value if isinstance(value, tuple) else (value,)
