@@ -96,7 +96,7 @@ class Observing(a2tg.StepEvent):
 GIVEN = {
     "stage 'own': appearance must be an Appearance; got the class Plain: say Plain(…)": {"appearance": a2tg.Plain},
     "stage 'own': rates must be LearningRates; got float": {"rates": 0.1},
-    "a stage must have at least 1 iteration, and fewer than 2^31, in an integer; 'own' has '30'": {"iterations": "30"},
+    "stage 'own': iterations must be an integer; got '30'": {"iterations": "30"},
     "stage 'own': events must be a tuple or a list; got Noise: one of them stands in (…,)": {"events": a2tg.Noise()},
     "stage 'own': events[1] must be a StepEvent or a HostEvent; got the class Noise: say Noise(…)": {
         "events": (a2tg.Noise(), a2tg.Noise)

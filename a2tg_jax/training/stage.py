@@ -105,10 +105,11 @@ class Stage:
             raise ValueError(
                 f"a stage's name must be letters, digits, - and _, for files are called so; got {self.name!r}"
             )
-        if not isinstance(self.iterations, int | np.integer) or not 1 <= self.iterations < 2**31:
+        if not isinstance(self.iterations, int | np.integer):
+            raise ValueError(f"stage {self.name!r}: iterations must be an integer; got {self.iterations!r}")
+        if not 1 <= self.iterations < 2**31:
             raise ValueError(
-                "a stage must have at least 1 iteration, and fewer than 2^31, in an integer; "
-                f"{self.name!r} has {self.iterations!r}"
+                f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
             )
         if not 0 <= self.jitter <= 1:
             raise ValueError(f"jitter must lie in 0..1; that of the stage {self.name!r} is {self.jitter}")
