@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
+from lab.kept import read_kept
 from scipy.spatial.transform import Rotation
 
 import a2tg_jax as a2tg
@@ -25,7 +26,7 @@ from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.corrected import refined_views
-from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.results.folder import write_json
 from a2tg_jax.training.corrections import exposed
 
 DEGREES, SHARE = 0.5, 0.01
@@ -184,7 +185,7 @@ def main() -> None:
     a2tg.configure_cpu()
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "real_captures.json"
-    found = read_json(path) if path.is_file() else {}
+    found = read_kept(path)
     for name, trainings in TRAININGS.items():
         if name != "synthetic" and arguments.scenes is None:
             continue

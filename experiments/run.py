@@ -19,7 +19,8 @@ from pathlib import Path
 
 from lab import pages
 from lab.cli import Experiment, argument_parser, run_experiments, stop
-from lab.grid import SUFFIX, has_scale
+from lab.grid import has_scale
+from lab.grid_file import SUFFIX
 from lab.interrupts import interruptible
 from lab.standard import STANDARD, file_experiment
 
@@ -51,7 +52,7 @@ def parse_arguments(known: Mapping[str, Experiment], arguments: Sequence[str] | 
     listed = "\n".join(f"  {name:20s} {textwrap.shorten(text, 110)}" for name, text in told.items())
     parser = argument_parser(f"{(__doc__ or '').strip()}\n\nnames:\n{listed}")
     parser.add_argument("names", nargs="+", metavar="NAME", help="experiments to run, as above, or grid files")
-    args = parser.parse_args(arguments)
+    args = parser.parse_intermixed_args(arguments)
     args.own_grids = [name for name in args.names if name.endswith(SUFFIX)]
     return args
 
@@ -60,7 +61,7 @@ def chosen(known: Mapping[str, Experiment], args: argparse.Namespace) -> list[Ex
     """Return the experiments of a call, or all that have its scale; unknown names end the program."""
     for name in args.names:
         if name not in known and name not in OTHERS and name not in args.own_grids:
-            hint = did_you_mean(name, [*known, *OTHERS]) or "; --help lists all"
+            hint = did_you_mean(name, [*known, *OTHERS]) or _of_an_option(name, args) or "; --help lists all"
             stop(f"there is no experiment {name!r}{hint}")
     are_both = len(set(args.names) - set(args.own_grids) - {APPENDIX}) and args.own_grids
     if are_both and args.out is None and args.scale != "smoke":
@@ -71,6 +72,13 @@ def chosen(known: Mapping[str, Experiment], args: argparse.Namespace) -> list[Ex
         return [*whole, *_file_experiments(known, args.own_grids)]
     named = [known[name] for name in dict.fromkeys(args.names) if name in known]
     return [*named, *_file_experiments(known, args.own_grids)]
+
+
+def _of_an_option(name: str, args: argparse.Namespace) -> str:
+    """Return how to repeat an option whose second value a name seems to be; empty if it does not."""
+    if "=" in name and args.cluster_parameter:
+        return f"; repeat the option for each value: --cluster-parameter {name}"
+    return f"; if it is a scene, repeat the option: --only {name}" if args.only else ""
 
 
 def _file_experiments(known: Mapping[str, Experiment], paths: Sequence[str]) -> list[Experiment]:

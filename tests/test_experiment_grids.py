@@ -12,7 +12,8 @@ from experiment_records import CELL, record, result
 from lab import tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
-from lab.grid import GRIDS, Method, has_scale, read_grid, splats_in
+from lab.grid import Method, has_scale, read_grid, splats_in
+from lab.grid_file import GRIDS
 from lab.jobs import Folders
 from lab.scenes import SceneAt, own_scene
 from run import chosen, experiments, main, parse_arguments
@@ -172,13 +173,32 @@ def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
     [
         ("gains", "gain", "table must be one of quality, gains, choices"),
         ("2DGS*-MCMC", "2DGS-MCMC", r"no method '2DGS-MCMC'; did you mean 2DGS\*-MCMC"),
-        ("budgets", "budget", "needs gaussians or budgets"),
-        ("path =", "folder =", "'folder', which is none of path"),
-        ("downscale = 4", "downscale = 0.5", "must be at least 1; got 0.5"),
+        ("budgets", "budget", "mine.toml: small.budget is an unknown key; did you mean budgets"),
+        ("budgets = [0.3]", "seeds = [1]", "needs gaussians or budgets"),
+        ("budgets = [0.3]", "blocks = [{ budget = [0.3] }]", r"small.blocks\[0\].budget is an unknown key"),
+        ("[small.scenes]", "[smal]\n[small.scenes]", "mine.toml: smal is an unknown key; did you mean small"),
+        ("path =", "folder =", "small.scenes.'mine'.folder is an unknown key; it has path, downscale"),
+        ("downscale = 4", "downscale = 0", "small.scenes.'mine'.downscale must be at least 1; got 0"),
+        ("downscale = 4", "downscale = 0.5", "small.scenes.'mine'.downscale must be int; got 0.5"),
+        ('options.background = "white"', "options = 3", "small.scenes.'mine'.options must be dict; got 3"),
+        ('"mine" = {', '"other" = 3\n"mine" = {', "small.scenes.'other' must be a table; got 3"),
         ("[small]", "[full]", r"no table of --scale small, \[small\]; it has \[full\]"),
-        ("title = ", "titel = ", "no entry 'title'"),
-        ("system = ", "sytem = ", "'sytem', which is none of like, system"),
-        ('system = "bytewise"', 'like = "A2TG"', "like 'A2TG', which is no method"),
+        ("title = ", "titel = ", "mine.toml: titel is an unknown key; did you mean title"),
+        ('title = "Mine"', "", "mine.toml: title is missing$"),
+        ('reference = "bytewise"', "reference = 3", "mine.toml: reference must be str; got 3"),
+        ('["2DGS*-MCMC"]', "[[1]]", r"mine.toml: methods must be list of str; got \[\[1\]\]"),
+        ("system = ", "sytem = ", "variants.'bytewise'.sytem is an unknown key; did you mean system"),
+        ('system = "bytewise"', "system = 3", r"variants.'bytewise'.system must be str \| None; got 3"),
+        ('{ system = "bytewise" }', "3", "variants.'bytewise' must be a table; got 3"),
+        ('system = "bytewise"', 'system = "bytewise", options = 3', "variants.'bytewise'.options must be dict; got 3"),
+        ('system = "bytewise"', 'system = "bytewise", floats = 0', "variants.'bytewise'.floats must be at least 1"),
+        ("budgets = [0.3]", "budgets = 0.3", r"small.budgets must be list of float \| None; got 0.3"),
+        ("budgets = [0.3]", "budgets = [nan]", "small.budgets must be at least 1e-06; got nan"),
+        ("budgets = [0.3]", "budgets = [0.3]\ngaussians = [9]", "small has gaussians and budgets: leave one out"),
+        ("budgets = [0.3]", "gaussians = []", "small.gaussians must not be empty"),
+        ("[small]", "[small]\niterations = [60]", r"small.iterations must be list of 2 int \| None; got \[60\]"),
+        ("[small]", "[small]\niterations = [60, -40]", "small.iterations must be at least 0; got -40"),
+        ('system = "bytewise"', 'like = "A2TG"', "mine.toml: 'bytewise' is like: there is no method 'A2TG'"),
         ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
     ],
 )
@@ -209,6 +229,14 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
         (["claim", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
         (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
         (["claim", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
+        (["claim", "--plan", "--jobs", "0"], "--jobs must be at least 1; got 0"),
+        (["claim", "--plan", "--memory-gb", "nan"], "--memory-gb must be a finite number larger than 0; got nan"),
+        (["claim", "--plan", "--downscale", "2"], "--downscale is that of --scene: add --scene"),
+        (["claim", "--plan", "--scene", ".", "--downscale", "0"], "--downscale must be at least 1; got 0"),
+        (["claim", "--plan", "--scene", ".", "--only", "fox"], "--only chooses scenes of the scale"),
+        (["claim", "--plan", "--cluster-parameter", "mem_gb=3"], "--cluster-parameter needs --cluster"),
+        (["claim", "--cluster", "slurm", "--cluster-parameter", "mem_gb"], "wants NAME=VALUE; got 'mem_gb'"),
+        (["claim", "--only", "fox", "lego"], "no experiment 'lego'; if it is a scene, repeat the option: --only lego"),
     ],
 )
 def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
@@ -216,6 +244,41 @@ def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, t
         main([*arguments, "--out", str(tmp_path), "--work", str(tmp_path)])
     told = capsys.readouterr().err
     assert ended.value.code == 2 and words in told and told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ("options.rates.means = -1.0", "mine.toml: 'bytewise': rates.means must be at least 0; got -1.0"),
+        ("options.rates = 3", "mine.toml: 'bytewise' options.rates must hold the fields of"),
+    ],
+)
+def test_a_plan_refuses_options_that_training_refuses(tmp_path, options, words, capsys):
+    text = OWN_GRID.replace('system = "bytewise"', f'system = "bytewise", {options}')
+    with pytest.raises(SystemExit) as ended:
+        main([own_grid(tmp_path, text), "--plan", "--work", str(tmp_path), "--out", str(tmp_path)])
+    assert ended.value.code == 2 and words in capsys.readouterr().err
+
+
+def test_names_may_follow_options_that_can_be_repeated():
+    args = parse_arguments(experiments(), ["--only", "fox", "claim", "--only", "lego", "plain"])
+    assert (args.only, args.names) == (["fox", "lego"], ["claim", "plain"])
+
+
+@pytest.mark.parametrize(
+    "text, words", [("[1]", "records.json must hold an object"), ('{"a": [1]}', "records.json: 'a' must be an object")]
+)
+def test_damaged_records_are_told(tmp_path, text, words, capsys):
+    (tmp_path / "records.json").write_text(text)
+    with pytest.raises(SystemExit) as ended:
+        main(["claim", "--scale", "smoke", "--plan", "--work", str(tmp_path), "--out", str(tmp_path)])
+    assert ended.value.code == 2 and words in capsys.readouterr().err
+
+
+def test_a_block_sets_budgets_in_place_of_gaussians(tmp_path):
+    text = OWN_GRID.replace("budgets = [0.3]", "gaussians = [900]\nblocks = [{ budgets = [0.3] }, { seeds = [1] }]")
+    cells = read_grid(own_grid(tmp_path, text), "small").cells
+    assert [(cell.gaussians, cell.budget, cell.seed) for cell in cells] == [(0, 0.3, 0), (900, None, 1)]
 
 
 def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):

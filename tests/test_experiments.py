@@ -15,7 +15,7 @@ from lab import queue, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import read_grid
 from lab.interrupts import interruptible
-from lab.jobs import Folders, Job, _load_checkpoint, model_bytes
+from lab.jobs import Folders, Job, _load_checkpoint, milliseconds, model_bytes
 from lab.plan import Machine, duration, finished_pace, plan_of
 from lab.progress import Progress
 from lab.stages import stages_of
@@ -181,7 +181,9 @@ def test_the_plan_counts_what_is_left(tmp_path):
     finished = {key: record(mb=mb) for key in stages_of([grid], {})}
     assert "| 6 of 6 | – |" in plan_of([grid], finished, folders, here)
     assert [duration(seconds) for seconds in (150, 3600, 9000)] == ["2 minutes", "1.0 hours", "2.5 hours"]
-    assert finished_pace(first, {"x": record(stage="textures", num=400)}) == pytest.approx(0.01)
+    short = record(stage="textures", num=400, ms_per_step=None)
+    assert finished_pace(first, {"x": record(stage="textures", num=400), "y": short}) == pytest.approx(0.01)
+    assert finished_pace(first, {"y": short}) is milliseconds(a2tg.History.empty()) is None
 
 
 def test_progress_names_stages_in_words(tmp_path, capsys):
@@ -192,6 +194,7 @@ def test_progress_names_stages_in_words(tmp_path, capsys):
     job = next(grid.jobs({}))
     progress.start(job.start)
     progress.done(job.start, record(seconds=3.0))
+    progress.done(job.start, record(seconds=3.0, ms_per_step=None))
     records[job.key] = record(mb=0.1)
     last = list(grid.jobs(records))[-1]
     progress.start(last)
@@ -200,10 +203,11 @@ def test_progress_names_stages_in_words(tmp_path, capsys):
     assert told[0] == f"8 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
     assert told[1] == "1 of 8 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
     assert told[2].startswith("1 of 8 done: built-in 1/2, A²TG, ") and "25.00 dB" in told[2]
-    assert told[3].startswith("2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians")
-    assert told[4].startswith("2 of 8 FAILED: ") and told[4].endswith(": no room")
+    assert told[2].endswith("; 3 s, 10 ms a step") and told[3].endswith("; 3 s"), "a short stage has no pace"
+    assert told[4].startswith("2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians")
+    assert told[5].startswith("2 of 8 FAILED: ") and told[5].endswith(": no room")
     log = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
-    assert len(log) == 5 and all(line.endswith(shown) for line, shown in zip(log, told, strict=True))
+    assert len(log) == 6 and all(line.endswith(shown) for line, shown in zip(log, told, strict=True))
 
 
 def test_arguments_have_defaults():

@@ -23,7 +23,12 @@ def config_to_dict(config: Any) -> dict[str, Any]:
 
 
 def config_from_dict(
-    kind: type[ConfigT], data: Mapping[str, Any], where: str = "config", *, given: Mapping[str, Any] | None = None
+    kind: type[ConfigT],
+    data: Mapping[str, Any],
+    where: str = "config",
+    *,
+    given: Mapping[str, Any] | None = None,
+    is_written: bool = True,
 ) -> ConfigT:
     """Return the dataclass `kind` that `config_to_dict` was given.
 
@@ -32,6 +37,7 @@ def config_from_dict(
       data: an entry per field. A field that has a default may be missing, as those are that an older version lacked.
       where: what the errors call this place, such as the name of the file.
       given: values of fields that are not among the data.
+      is_written: whether this program wrote the data, so that a missing field means another version.
 
     Raises:
       ValueError: if a field is missing or unknown, or has a value of another type; the field is named.
@@ -47,7 +53,7 @@ def config_from_dict(
     optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
     for name in names:
         if name not in data and name not in optional:
-            raise ValueError(f"{_within(where, name)} is missing; another version wrote it")
+            raise ValueError(f"{_within(where, name)} is missing{'; another version wrote it' if is_written else ''}")
     values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names if name in data}
     return kind(**values, **given)
 
@@ -131,7 +137,6 @@ def _to_json(value: Any) -> Any:
 
 def _from_json(hint: Any, value: Any, where: str) -> Any:
     """Return `value` as the type that the annotation asks for; what a dict holds is not looked at."""
-    hint = dict if typing.get_origin(hint) is dict else hint
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
     is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
@@ -145,8 +150,18 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
 
 
 def _told(hint: Any) -> str:
-    """Return a type as a user reads it."""
-    return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint).replace("typing.", "")
+    """Return a type as a user reads it; a tuple is a list, as files have it."""
+    origin, inner = typing.get_origin(hint), [item for item in typing.get_args(hint) if item is not ...]
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(str, inner))}"
+    if origin in (dict, Mapping):
+        return "dict"
+    if origin is tuple:
+        same = len(set(inner)) == 1 and len(inner) > 1
+        return f"list of {len(inner)} {_told(inner[0])}" if same else f"list of {', '.join(map(_told, inner))}"
+    if inner:
+        return " | ".join(map(_told, inner))
+    return "None" if hint is type(None) else hint.__name__
 
 
 def _fits(hint: Any, value: Any) -> bool:
@@ -154,6 +169,8 @@ def _fits(hint: Any, value: Any) -> bool:
     origin = typing.get_origin(hint)
     if origin is typing.Literal:
         return value in typing.get_args(hint)
+    if origin in (dict, Mapping):
+        return isinstance(value, dict)
     if origin is tuple:
         return isinstance(value, list) and all(map(_fits, _item_hints(hint, value), value))
     if isinstance(value, bool):

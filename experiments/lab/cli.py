@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,22 +13,24 @@ import a2tg_jax as a2tg
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
-from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.results.folder import write_json
 from a2tg_jax.results.record import SYNTHETIC
 from lab import machine, spreadsheet, tables, versions
 from lab.grid import Grid, read_grid
+from lab.grid_file import SCALES
 from lab.jobs import Folders, Job, Record
+from lab.kept import read_figures, read_kept
 from lab.plan import Machine, plan_of
 from lab.progress import Progress
 from lab.queue import LocalPool, Pool, SubmititPool, run_all
 from lab.scenes import SceneAt, own_scene
+from lab.stages import check_systems
 from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 RUNS = EXPERIMENTS.parent / "runs"
 USAGE = 2
 """Exit code of a call that cannot be run as it is."""
-SCALES = ("full", "long", "small", "smoke")
 MEMORY_SHARE = 0.8
 """Default share of the machine's memory for all jobs together."""
 MOST_SENT = 1_000
@@ -40,6 +43,7 @@ class Lab:
     """Folders, pool and records of one call of the command line."""
 
     def __init__(self, args: argparse.Namespace):
+        check_arguments(args)
         self.args = args
         self.scale: str = args.scale
         self.out: Path = args.out or self._default_out()
@@ -69,7 +73,8 @@ class Lab:
     @property
     def own_scenes(self) -> tuple[SceneAt, ...]:
         """Return the scenes given by path, which take the place of the scale's."""
-        return tuple(own_scene(path, self.args.downscale) for path in self.args.scene)
+        downscale = 1 if self.args.downscale is None else self.args.downscale
+        return tuple(own_scene(path, downscale) for path in self.args.scene)
 
     @property
     def is_smoke(self) -> bool:
@@ -149,7 +154,8 @@ class Lab:
         experiment.present(self, grids)
 
     def check_inputs(self, grids: Sequence[Grid]) -> None:
-        """Raise if a scene is missing, before anything is trained."""
+        """Raise if a scene is missing or an option invalid, before anything is trained."""
+        check_systems(grids, self.records)
         for path in {cell.scene.path for grid in grids for cell in grid.cells} - {SYNTHETIC}:
             if not Path(path).is_absolute() and not self.folders.scenes.is_dir():
                 raise ValueError(f"there is no folder --scenes {self.folders.scenes}")
@@ -165,15 +171,12 @@ class Lab:
         """Merge the records into the results, to which another program may have added some."""
         self.out.mkdir(parents=True, exist_ok=True)
         with _locked(self.out / ".lock"):
-            write_json(self._file, dict(sorted({**self._kept(), **self.records}.items())))
-
-    def _kept(self) -> dict[str, Record]:
-        return read_json(self._file) if self._file.is_file() else {}
+            write_json(self._file, dict(sorted({**read_kept(self._file), **self.records}.items())))
 
     def _all_records(self) -> dict[str, Record]:
         """Return the records of the results and of jobs that were never collected."""
-        own = {path.stem: read_json(path) for path in (self.work / "records").glob("*.json")}
-        found = {**own, **self._kept()}
+        own = {path.stem: read_figures(path) for path in (self.work / "records").glob("*.json")}
+        found = {**own, **read_kept(self._file)}
         return {key: one for key, one in found.items() if not (self.args.renew and versions.is_from_before(one))}
 
     def machine(self) -> Machine:
@@ -182,7 +185,7 @@ class Lab:
 
     def _memory(self) -> float:
         """Return the bytes that jobs of this machine may take together."""
-        return self.args.memory_gb * 1e9 if self.args.memory_gb else MEMORY_SHARE * machine.memory_bytes()
+        return self.args.memory_gb * 1e9 if self.args.memory_gb is not None else MEMORY_SHARE * machine.memory_bytes()
 
     def _pool(self) -> Pool:
         args, inf, memory = self.args, float("inf"), self._memory()
@@ -265,10 +268,10 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
     add("--scale", type=_scale, default="small", metavar="{full,long,small,smoke}",
         help="full is the paper's, for a GPU; long has its options and length on small photographs")  # fmt: skip
-    add("--only", nargs="+", metavar="SCENE", help="run these scenes of the scale only")
+    add("--only", action="append", metavar="SCENE", help="run this scene of the scale only; may be repeated")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip
-    add("--downscale", type=int, default=1, help="factor by which the photographs of --scene are downscaled")
+    add("--downscale", type=int, metavar="K", help="factor by which the photographs of --scene are downscaled")
     add("--without-held-out", action="store_true", help="leave out the held-out scenes")
     add("--validation", action="store_true",
         help="hold out every eighth training view in place of the test views, to choose options by")  # fmt: skip
@@ -281,11 +284,32 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--jobs", type=int, help="number of jobs at a time; default: one a GPU, else one a core")
     add("--memory-gb", type=float, help="memory of all jobs on this machine together; default: 80%% of it")
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
-    add("--cluster-parameter", nargs="*", default=[], metavar="NAME=VALUE", help="submitit's parameters: mem_gb=32 …")
+    add("--cluster-parameter", action="append", default=[], metavar="NAME=VALUE",
+        help="parameter of submitit, such as mem_gb=32; may be repeated")  # fmt: skip
     add("--plan", action="store_true", help="run nothing; print what is left to run and about how long it takes")
     add("--renew", action="store_true", help="train again what earlier versions of systems made")
     add("--tables-only", action="store_true", help="run nothing; write tables and plots of the finished runs")
     return parser
+
+
+def check_arguments(args: argparse.Namespace) -> None:
+    """Refuse numbers out of range, and options that have no effect beside the others.
+
+    Raises:
+      ValueError: naming the option.
+    """
+    if args.jobs is not None and args.jobs < 1:
+        raise ValueError(f"--jobs must be at least 1; got {args.jobs}")
+    if args.memory_gb is not None and not 0 < args.memory_gb < math.inf:
+        raise ValueError(f"--memory-gb must be a finite number larger than 0; got {args.memory_gb}")
+    if args.downscale is not None and not args.scene:
+        raise ValueError("--downscale is that of --scene: add --scene, or set downscale in a grid file of your own")
+    if args.only and args.scene:
+        raise ValueError("--only chooses scenes of the scale, whose place --scene takes: leave one out")
+    if args.cluster_parameter and not args.cluster:
+        raise ValueError("--cluster-parameter needs --cluster")
+    for text in args.cluster_parameter:
+        _parameter(text)
 
 
 def _scale(name: str) -> str:

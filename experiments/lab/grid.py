@@ -6,8 +6,8 @@ cell's reference, which are known once that is trained; a method whose Gaussians
 """
 
 import dataclasses
+import functools
 import itertools
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,23 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.io.config_json import merged
 from a2tg_jax.training.registry import with_changes
+from lab.grid_file import (
+    GRIDS,
+    SUFFIX,
+    GridFile,
+    MethodTable,
+    Scale,
+    blocks_of,
+    method_tables,
+    read_grid_file,
+    shared_scale,
+)
 from lab.jobs import Job, Record
 from lab.scenes import SceneAt, chosen_scenes, read_scenes
+from lab.toml_tables import read_toml
 
-GRIDS = Path(__file__).resolve().parents[1] / "grids"
-SUFFIX = ".toml"
 REHEARSAL = 100
 """Factor by which a rehearsal is shorter."""
-TABLES = ("quality", "gains", "choices")
-"""Kinds of tables of a grid, the default first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +94,7 @@ class Grid:
     """Methods at the final bytes of the reference."""
     validation: bool = False
     """Whether validation views are held out in place of the test views."""
-    table: str = TABLES[0]
+    table: str = "quality"
     """Kind of its tables."""
 
     def runs(self, records: Mapping[str, Record]) -> Iterator[Run]:
@@ -119,13 +127,21 @@ class Grid:
         return self._job(method, cell, splats_in(mb, method))
 
     def _job(self, method: Method, cell: Cell, num: int) -> Job:
-        first, second = cell.iterations
-        system = type(a2tg.find_system(method.system)).preset(self.preset)
-        size = {"densify": {"cap": num}} if cell.budget is None else {"memory_budget": cell.budget}
-        basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
-        for changes in (basis, cell.scene.options, method.options):
-            system = with_changes(system, changes, f"{self.name}: {method.label}")
+        system = _system(f"{self.name}{SUFFIX}: {method.label!r}", self.preset, method, cell, num)
         return Job(cell.scene.path, cell.scene.downscale, system, len(system.stages()) - 1, self.validation)
+
+
+@functools.lru_cache(maxsize=10_000)
+def _system(place: str, preset: str, method: Method, cell: Cell, num: int) -> a2tg.System:
+    """Return the system of a method in a cell, with a number of Gaussians."""
+    first, second = cell.iterations
+    system = type(a2tg.find_system(method.system)).preset(preset)
+    size = {"densify": {"cap": num}} if cell.budget is None else {"memory_budget": cell.budget}
+    basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
+    told = {"": basis, f" options on {cell.scene.label!r}": cell.scene.options, " options": method.options}
+    for part, changes in told.items():
+        system = with_changes(system, changes, f"{place}{part}")
+    return system
 
 
 def splats_in(mb: float, method: Method) -> int:
@@ -160,33 +176,25 @@ def read_grid(
       rehearsal: whether only the first cell is run, at a hundredth of the iterations.
 
     Raises:
-      ValueError: if the file lacks the scale, or a scene, a method or a kind of table is unknown.
+      ValueError: if the file lacks the scale or has a mistake, or a scene or a method is unknown.
     """
-    path, scales = grid_path(name), _read(GRIDS / "scales.toml")
-    file, place = _read(path), path.name
-    if scale not in file:
-        found = ", ".join(f"[{known}]" for known in scales if known in file) or "none"
-        raise ValueError(f"{place} has no table of --scale {scale}, [{scale}]; it has {found}")
-    settings, known_scenes = _settings(file[scale], scales[scale], path)
-    methods = _methods({**_read(GRIDS / "methods.toml"), **file.get("variants", {})}, place)
-
-    def method(label: str) -> Method:
-        if label not in methods:
-            hint = did_you_mean(label, methods) or f"; there are {', '.join(methods)}"
-            raise ValueError(f"{place}: there is no method {label!r}{hint}")
-        return methods[label]
+    path = grid_path(name)
+    file, place = read_grid_file(path), path.name
+    own_table = file.scale(scale, place)
+    settings, known_scenes = _settings(own_table, scale, path)
+    methods = _methods(file, place)
 
     def methods_in(key: str) -> tuple[Method, ...]:
         """Return the methods of an entry of the scale, or else of the file."""
-        return tuple(map(method, file[scale].get(key, file.get(key, []))))
+        labels = getattr(own_table, key)
+        return tuple(_found(label, methods, place) for label in (getattr(file, key) if labels is None else labels))
 
-    reference = method(_entry(file, "reference", place))
+    reference = _found(file.reference, methods, place)
     others = dict.fromkeys((*methods_in("methods"), *methods_in("variants")))
     others.pop(reference, None)
-    blocks = [{**settings, **block} for block in settings.get("blocks", [{}])]
     cells = [
         cell
-        for block in blocks
+        for block in blocks_of(settings, f"{place}: {scale}")
         for cell in _cells(block, own or chosen_scenes(known_scenes, block, scenes, held_out, place), place)
     ]
     if not cells:
@@ -194,14 +202,14 @@ def read_grid(
     if rehearsal:
         cells = [_shortened(cells[0])]
     return Grid(
-        path.stem, _entry(file, "title", place), scale, settings["preset"], tuple(dict.fromkeys(cells)), reference,
-        tuple(others), methods_in("at_equal_bytes"), validation, _table(file, place),
+        path.stem, file.title, scale, settings.preset, tuple(dict.fromkeys(cells)), reference, tuple(others),
+        methods_in("at_equal_bytes"), validation, file.table,
     )  # fmt: skip
 
 
 def has_scale(name: str, scale: str) -> bool:
     """Return whether a grid has a scale."""
-    return scale in _read(grid_path(name))
+    return getattr(read_grid_file(grid_path(name)), scale) is not None
 
 
 def grid_path(name: str) -> Path:
@@ -209,76 +217,52 @@ def grid_path(name: str) -> Path:
     return Path(name).expanduser() if name.endswith(SUFFIX) else GRIDS / f"{name}{SUFFIX}"
 
 
-def _entry(file: Mapping[str, Any], key: str, place: str) -> str:
-    if key not in file:
-        raise ValueError(f"{place} has no entry {key!r}")
-    return file[key]
-
-
-def _table(file: Mapping[str, Any], place: str) -> str:
-    """Return the kind of the grid's tables."""
-    table = file.get("table", TABLES[0])
-    if table not in TABLES:
-        raise ValueError(f"{place}: table must be one of {', '.join(TABLES)}; got {table!r}")
-    return table
-
-
-def _settings(
-    own: Mapping[str, Any], scale: Mapping[str, Any], path: Path
-) -> tuple[dict[str, Any], dict[str, SceneAt]]:
+def _settings(own: Scale, scale: str, path: Path) -> tuple[Scale, dict[str, SceneAt]]:
     """Return the settings of a grid at a scale, and its scenes; scenes of its own take the place of the scale's."""
-    if "scenes" not in own:
-        return {**scale, **own}, read_scenes(scale["scenes"], "scales.toml", None)
-    everywhere = {key: value for key, value in scale.items() if key != "only"}
-    return {**everywhere, **own}, read_scenes(own["scenes"], path.name, path.parent)
+    shared = shared_scale(scale)
+    if own.scenes is None:
+        return shared.changed(own), read_scenes(shared.scenes, f"scales.toml: {scale}.scenes", None)
+    everywhere = dataclasses.replace(shared, only=None)
+    return everywhere.changed(own), read_scenes(own.scenes, f"{path.name}: {scale}.scenes", path.parent)
 
 
-def _methods(table: Mapping[str, Mapping[str, Any]], place: str) -> dict[str, Method]:
-    """Return methods by label; one that is `like` another inherits its system and options."""
+def _methods(file: GridFile, place: str) -> dict[str, Method]:
+    """Return all methods by label; one that is `like` another inherits its system and options."""
+    tables = method_tables(read_toml(GRIDS / "methods.toml"), "methods.toml: ")
+    tables |= method_tables(file.variants, f"{place}: variants.")
     methods: dict[str, Method] = {}
-    for label, values in table.items():
-        own = dict(values)
-        if "like" in own:
-            like = own.pop("like")
-            if like not in methods:
-                hint = did_you_mean(like, methods) or f"; there are {', '.join(methods)}"
-                raise ValueError(f"{place}: {label!r} is like {like!r}, which is no method above it{hint}")
-            base = methods[like]
-            own = {"system": base.system, **own, "options": merged(base.options, own.get("options", {}))}
-        methods[label] = _method(label, own, place)
+    for label, table in tables.items():
+        base = None if table.like is None else _found(table.like, methods, f"{place}: {label!r} is like")
+        methods[label] = _method(label, table, base, place)
     return methods
 
 
-def _method(label: str, values: Mapping[str, Any], place: str) -> Method:
-    known = [field.name for field in dataclasses.fields(Method) if field.name != "label"]
-    for key in values:
-        if key not in known:
-            raise ValueError(f"{place}: method {label!r} has {key!r}, which is none of like, {', '.join(known)}")
-    if "system" not in values:
+def _method(label: str, table: MethodTable, base: Method | None, place: str) -> Method:
+    system, options = table.system, table.options
+    if base is not None:
+        system, options = system or base.system, merged(base.options, options)
+    if system is None:
         raise ValueError(f"{place}: method {label!r} has neither a system nor a method that it is like")
-    return Method(label, **values)
+    return Method(label, system, options, table.floats, table.most)
 
 
-def _cells(block: Mapping, scenes: Sequence[SceneAt], place: str) -> list[Cell]:
+def _found(label: str, methods: Mapping[str, Method], place: str) -> Method:
+    if label not in methods:
+        hint = did_you_mean(label, methods) or f"; there are {', '.join(methods)}"
+        raise ValueError(f"{place}: there is no method {label!r}{hint}")
+    return methods[label]
+
+
+def _cells(block: Scale, scenes: Sequence[SceneAt], place: str) -> list[Cell]:
     """Return a cell for every number of Gaussians or budget, every seed and every scene of a block."""
-    if "budgets" not in block and "gaussians" not in block:
+    if block.gaussians is None and block.budgets is None:
         raise ValueError(f"{place}: a scale needs gaussians or budgets")
-    first, second = block["iterations"]
-    sizes = (
-        [(0, budget) for budget in block["budgets"]] if "budgets" in block else [(n, None) for n in block["gaussians"]]
-    )
-    pairs = itertools.product(sizes, block["seeds"], scenes)
-    return [Cell(scene, num, seed, (first, second), budget) for (num, budget), seed, scene in pairs]
+    sizes = [(num, None) for num in block.gaussians or ()] + [(0, budget) for budget in block.budgets or ()]
+    pairs = itertools.product(sizes, block.seeds, scenes)
+    return [Cell(scene, num, seed, block.iterations, budget) for (num, budget), seed, scene in pairs]
 
 
 def _shortened(cell: Cell) -> Cell:
     """Return a cell at a hundredth of its iterations."""
     first, second = cell.iterations
     return dataclasses.replace(cell, iterations=(max(1, first // REHEARSAL), second // REHEARSAL))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: {error}") from error

@@ -195,7 +195,7 @@ def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Rec
         "system": reference_of(job.system), "version": job.system.version, "options": differences(job.system),
         "stage": result.name, "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
-        "seconds": result.seconds, "ms_per_step": _milliseconds(result.history),
+        "seconds": result.seconds, "ms_per_step": milliseconds(result.history),
     }  # fmt: skip
 
 
@@ -224,10 +224,11 @@ def texture_sizes(model: a2tg.Model) -> dict[str, int]:
     return {f"{rows}x{columns}": int(count) for (rows, columns), count in zip(pairs, counts, strict=True)}
 
 
-def _milliseconds(history: a2tg.History) -> float:
-    """Return the median time of a step, free of compilation but not of other programs beside it."""
+def milliseconds(history: a2tg.History) -> float | None:
+    """Return the median time of a step, free of compilation but not of other programs beside it; None for a stage too
+    short to tell."""
     paces = np.diff(history.seconds) / np.diff(history.iteration)
-    return 1e3 * float(np.median(paces)) if len(paces) else float("nan")
+    return 1e3 * float(np.median(paces)) if len(paces) else None
 
 
 def _ready(path: Path) -> Path:

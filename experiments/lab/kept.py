@@ -5,9 +5,35 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from a2tg_jax.host.text import shortened
 from a2tg_jax.results.folder import read_json, write_json
 
 Figures = Mapping[str, Any]
+
+
+def read_kept(path: Path) -> dict[str, Figures]:
+    """Return figures by key, as a file keeps them; empty if there is no file.
+
+    Raises:
+      ValueError: naming the file, if it is damaged.
+    """
+    kept = read_figures(path) if path.is_file() else {}
+    for key, figures in kept.items():
+        if not isinstance(figures, dict):
+            raise ValueError(f"{path}: {key!r} must be an object of figures; got {shortened(figures)}")
+    return kept
+
+
+def read_figures(path: Path) -> dict[str, Any]:
+    """Return the figures in a file.
+
+    Raises:
+      ValueError: naming the file, if it is damaged.
+    """
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} must hold an object; got {shortened(found)}")
+    return found
 
 
 class KeptFigures:
@@ -16,7 +42,7 @@ class KeptFigures:
     def __init__(self, folder: Path, name: str, table: Callable[[Mapping[str, Figures]], str]):
         folder.mkdir(parents=True, exist_ok=True)
         self._json, self._table, self._told = folder / f"{name}.json", folder / f"{name}.md", table
-        self.found: dict[str, Figures] = read_json(self._json) if self._json.is_file() else {}
+        self.found: dict[str, Figures] = read_kept(self._json)
 
     def has_all(self, keys: Iterable[str]) -> bool:
         """Return whether every key was measured before."""

@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.results.folder import write_json
 from lab import tables
 from lab.cli import Lab
 from lab.grid import Grid
+from lab.kept import read_kept
 
 Figures = Mapping[str, Any]
 """Figures of a model, in JSON."""
@@ -28,7 +29,7 @@ def measured_once(
       first_stage: whether to measure the model of the first stage.
     """
     path = lab.out / f"{name}.json"
-    kept: dict[str, Figures] = read_json(path) if path.is_file() else {}
+    kept: dict[str, Figures] = read_kept(path)
     found: list[tuple[tables.Result, Figures]] = []
     for result in tables.results_of(grid, lab.records):
         key = result.run.job.key

@@ -182,7 +182,7 @@ def finished_pace(job: Job, records: Mapping[str, Record]) -> float | None:
     paces = [
         record["ms_per_step"] / 1e3 * (1 + num / 10_000) / (1 + record["num"] / 10_000)
         for record in records.values()
-        if record["stage"] == stage and record["downscale"] == job.downscale
+        if record["stage"] == stage and record["downscale"] == job.downscale and record["ms_per_step"] is not None
     ]
     return float(np.nanmedian(paces)) if np.isfinite(paces).any() else None
 

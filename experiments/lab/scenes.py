@@ -7,6 +7,8 @@ from typing import Any
 
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.results.record import SYNTHETIC
+from lab.grid_file import Block
+from lab.toml_tables import table_as
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,35 +37,32 @@ def own_scene(path: Path, downscale: int) -> SceneAt:
     """
     if not path.is_dir():
         raise ValueError(f"there is no scene folder {path}")
-    if downscale < 1:
-        raise ValueError(f"--downscale must be at least 1; got {downscale}")
+    check_downscale("--downscale", downscale)
     return SceneAt(path.resolve().name, path.resolve().as_posix(), downscale)
 
 
-def read_scenes(table: Mapping[str, Mapping[str, Any]], place: str, folder: Path | None) -> dict[str, SceneAt]:
-    """Return the scenes of a table by label.
+def read_scenes(tables: Mapping[str, Any], where: str, folder: Path | None) -> dict[str, SceneAt]:
+    """Return scenes by label.
 
     Args:
-      table: entries of a TOML file.
-      place: name of the file, for messages.
+      tables: a table of a TOML file for each scene.
+      where: file and table, for messages.
       folder: folder that relative paths start from; None: that of --scenes.
 
     Raises:
-      ValueError: if an entry lacks its path, has an unknown key, or a downscale that is not at least 1.
+      ValueError: naming file, scene and key, if a table lacks its path, has an unknown key or one of another type, or a
+        downscale that is not at least 1.
     """
-    known = [field.name for field in dataclasses.fields(SceneAt) if field.name != "label"]
-    for label, entry in table.items():
-        for key in entry:
-            if key not in known:
-                raise ValueError(f"{place}: scene {label!r} has {key!r}, which is none of {', '.join(known)}")
-        if "path" not in entry:
-            raise ValueError(f"{place}: scene {label!r} has no path")
-        downscale = entry.get("downscale", 1)
-        if not isinstance(downscale, int) or downscale < 1:
-            raise ValueError(f"{place}: the downscale of scene {label!r} must be at least 1; got {downscale!r}")
-    return {
-        label: SceneAt(label, **{**entry, "path": _placed(entry["path"], folder)}) for label, entry in table.items()
-    }
+    scenes = {label: table_as(SceneAt, table, f"{where}.{label!r}", label=label) for label, table in tables.items()}
+    for label, scene in scenes.items():
+        check_downscale(f"{where}.{label!r}.downscale", scene.downscale)
+    return {label: dataclasses.replace(scene, path=_placed(scene.path, folder)) for label, scene in scenes.items()}
+
+
+def check_downscale(name: str, downscale: int) -> None:
+    """Raise ValueError unless a downscale is at least 1."""
+    if downscale < 1:
+        raise ValueError(f"{name} must be at least 1; got {downscale}")
 
 
 def _placed(path: str, folder: Path | None) -> str:
@@ -74,18 +73,18 @@ def _placed(path: str, folder: Path | None) -> str:
 
 
 def chosen_scenes(
-    scenes: Mapping[str, SceneAt], block: Mapping[str, Any], wanted: Sequence[str] | None, held_out: bool, place: str
+    scenes: Mapping[str, SceneAt], block: Block, wanted: Sequence[str] | None, held_out: bool, place: str
 ) -> list[SceneAt]:
     """Return the scenes of a block, or the wanted ones, at the block's downscale if it has one.
 
     Raises:
       ValueError: if a wanted scene is unknown.
     """
-    labels = block.get("only", scenes) if wanted is None else wanted
+    labels = wanted or block.only or scenes
     for label in labels:
         if label not in scenes:
             hint = did_you_mean(label, scenes) or f"; there are {', '.join(scenes)}"
             raise ValueError(f"{place}: there is no scene {label!r} at this scale{hint}")
     found = [scenes[label] for label in labels]
-    found = [dataclasses.replace(scene, downscale=block.get("downscale", scene.downscale)) for scene in found]
+    found = [dataclasses.replace(scene, downscale=block.downscale or scene.downscale) for scene in found]
     return [scene for scene in found if held_out or not scene.held_out]

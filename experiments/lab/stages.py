@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
 from lab.grid import Cell, Grid, Run
+from lab.grid_file import SUFFIX
 from lab.jobs import Job, Record, model_bytes
 from lab.scenes import SceneAt
 
@@ -39,6 +40,16 @@ def stages_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> dict[str,
             for job in chain(run.job):
                 found.setdefault(job.key, Stage(job, run))
     return found
+
+
+def check_systems(grids: Sequence[Grid], records: Mapping[str, Record]) -> None:
+    """Raise ValueError if training would refuse an option of a run; grid and method are named."""
+    for grid in grids:
+        for run in grid.runs(guessed(grid, records)):
+            try:
+                run.job.system.check()
+            except ValueError as error:
+                raise ValueError(f"{grid.name}{SUFFIX}: {run.method.label!r}: {error}") from error
 
 
 def chain(job: Job) -> Iterator[Job]:

@@ -6,7 +6,8 @@ from pathlib import Path
 from lab import tables
 from lab.cli import Experiment, Lab
 from lab.figures import figures_table
-from lab.grid import SUFFIX, Grid
+from lab.grid import Grid
+from lab.grid_file import SUFFIX
 from lab.tables import Result
 
 
