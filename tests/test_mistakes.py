@@ -122,6 +122,8 @@ MISTAKES = {
     "render done --size 640": "size must be WIDTHxHEIGHT",
     "render done --size 0x10": "size must be WIDTHxHEIGHT",
     "render done --path round": "round: no such path",
+    "render done --path orbt": "makes one; did you mean orbit?",
+    "mesh done --resolution 10 --voxel 0.1": "--resolution and --voxel both say the size of voxels",
     "render done --model stage2": "the run has the models",
     "render done --out photo.png": "photo.png",
     "render run": "has no finished",

@@ -10,6 +10,7 @@ import io
 import ipaddress
 import json
 import re
+import signal
 import socket
 
 import numpy as np
@@ -187,6 +188,13 @@ def test_view_tells_the_address_for_a_phone(monkeypatch, tmp_path, capsys):
     assert main(["view", str(tmp_path / "a.ply"), "--no-open", "--host", "0.0.0.0"]) == 0
     assert asked == [{"host": "0.0.0.0", "port": 0}]
     assert capsys.readouterr().out.startswith("http://x/t/ shows")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_ctrl_c_is_the_usual_end_of_a_server(monkeypatch, tmp_path, number, code):
+    save_ply(tmp_path / "a.ply", some_gaussians())
+    monkeypatch.setattr("a2tg_jax.cli.view.View._started", lambda *_: signal.raise_signal(number))
+    assert main(["view", str(tmp_path / "a.ply")]) == code
 
 
 def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys):

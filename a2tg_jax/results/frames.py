@@ -6,7 +6,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from PIL import Image
 
@@ -14,7 +14,7 @@ from a2tg_jax.core.cameras import Camera, crop_camera
 from a2tg_jax.core.capture import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
 from a2tg_jax.host.bars import progress_over
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
@@ -161,7 +161,11 @@ def write_video(frames: Sequence[Path], path: Path, *, frames_per_second: float 
 def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:
     """Return file names and cameras of the frames."""
     if isinstance(route, Path):
-        yield from _numbered(path_through(load_views(route), num_frames))
+        try:
+            saved = load_views(route)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{error}{did_you_mean(str(route), get_args(Route))}") from None
+        yield from _numbered(path_through(saved, num_frames))
         return
     if model.origin is None:
         raise ValueError("the model has no cameras to render; it does not know where it was trained")

@@ -73,6 +73,8 @@ class MeshOptions:
     def check(self, out: Path) -> None:
         """Raise ValueError before anything is computed if an option is invalid or a library is missing."""
         check_mesh_suffix(out, "--out")
+        if self.resolution is not None and self.voxel is not None:
+            raise ValueError("--resolution and --voxel both say the size of voxels: leave one out")
         check_lengths(self.resolution, self.voxel, self.radius)
         if self.clusters < 1:
             raise ValueError(f"clusters must be at least 1; got {self.clusters}")

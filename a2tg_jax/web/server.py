@@ -11,9 +11,11 @@ import ipaddress
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
+from a2tg_jax.host import signals
 from a2tg_jax.host.operating_system import allow_recent_port
 
 LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
@@ -141,7 +143,7 @@ def application(routes: Mapping[str, Route], door: Door) -> Application:
 def serve(
     routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0, on_start: Callable[[str], None] = print
 ) -> None:
-    """Serve until the process is interrupted.
+    """Serve until Ctrl-C, the usual end of a server.
 
     Args:
       routes: what is answered, by path.
@@ -151,10 +153,17 @@ def serve(
 
     Raises:
       ValueError: if waitress is not installed, the port is taken, or this machine has no such address.
+      Stopped: if the process is asked to end otherwise (`signals.raised`).
     """
-    server, url = _opened(routes, host, port, {})
-    on_start(url)
-    server.run()
+    with served(routes, host=host, port=port) as url:  # In a thread, for waitress hides how its loop was ended.
+        try:
+            on_start(url)
+            while True:
+                time.sleep(1)
+        except signals.Stopped:
+            raise
+        except KeyboardInterrupt:
+            return
 
 
 @contextlib.contextmanager
