@@ -241,6 +241,23 @@ def test_wrong_record_is_one_clear_line(tmp_path, text, message):
         read_record(run)
 
 
+@pytest.mark.parametrize(
+    ("version", "words"),
+    [("0.0.1", "a2tg-jax 0.0.1 began the run, and this is "), (None, "if an earlier version"), ("now", "got 3.0 ")],
+)
+def test_a_run_that_this_version_refuses_names_the_version_that_began_it(tmp_path, capsys, version, words):
+    run = create_run(tmp_path)
+    write_record(run, RECORD)
+    text = run.record.read_text().replace("jitter = 0.0", "jitter = 3.0")
+    if version != "now":
+        line = "" if version is None else f'version = "{version}"\n'
+        text = re.sub(r'version = ".*"\n', line, text)
+    run.record.write_text(text)
+    assert cli.main(["train", "--out", str(tmp_path), "--resume"]) == 2
+    told = capsys.readouterr().err.replace("\n", " ")
+    assert "run.toml: jitter must lie in 0..1; got 3.0" in told and words in told
+
+
 def test_configuration_file_says_a_part(tmp_path):
     run = create_run(tmp_path / "run")
     run.record.write_text('scene = "../fox"\npreset = "quick"\n[options.texture]\nk_a = 9\nupscale_at = [0.25, 0.5]\n')

@@ -15,6 +15,7 @@ A configuration file says the same or less; what it leaves out has the value tha
 import dataclasses
 import os
 import shlex
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -182,6 +183,8 @@ class RunFile:
     compare: tuple[str, ...] = ()
     on_nan: OnNan = "stop"
     init: str | None = None
+    version: str | None = None
+    """Version of a2tg-jax that wrote the file."""
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def chosen(self, where: str) -> System:
@@ -278,6 +281,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "compare": list(record.compare),
         "on_nan": record.on_nan,
         **({} if record.init is None else {"init": record.init}),
+        "version": version("a2tg-jax"),
         "options": _without_none(config_to_dict(record.system), start),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n{_budget_note(record.system)}{tomli_w.dumps(table)}"
@@ -298,19 +302,37 @@ def read_record(run: RunFolder) -> RunRecord:
 
     Raises:
       ValueError: if it is damaged, its system is not found, or an option is unknown, of another type or out of range;
-        it is named.
+        it is named, and the version that began the run if it is another one.
     """
+    try:
+        return _checked_record(run)
+    except ValueError as error:
+        told = str(error) if str(run.record) in str(error) else f"{run.record}: {error}"
+        raise ValueError(f"{shortened(told, LONGEST_REASON)}{_of_another_version(run)}") from error
+
+
+def _checked_record(run: RunFolder) -> RunRecord:
     file = read_run_file(run.record)
     if file.scene is None:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.lens, file.validation)
     system = file.chosen(str(run.record))
     record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init)
-    try:
-        record.check()
-    except ValueError as error:
-        raise ValueError(f"{run.record}: {shortened(str(error), LONGEST_REASON)}") from error
+    record.check()
     return record
+
+
+def _of_another_version(run: RunFolder) -> str:
+    """Return what to do if another version may have begun a run that this one refuses; empty if this one did."""
+    try:
+        before = parse_toml(read_regular(run.record, MOST_TOML_BYTES)).get("version")
+    except ValueError:
+        return ""
+    now = version("a2tg-jax")
+    if before is None:
+        return f"; if an earlier version than a2tg-jax {now} began the run, go on with that version"
+    told = f"; a2tg-jax {shortened(before)} began the run, and this is {now}: go on with that version"
+    return told if before != now else ""
 
 
 def repeating_command(run: RunFolder) -> str:
