@@ -184,6 +184,15 @@ def test_help_tells_one_default_of_each_option(capsys, monkeypatch, name):
     assert len(options) > 1 and all(option.count("(default:") < 2 for option in options)
 
 
+def test_help_fills_its_lines(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    text = capsys.readouterr().out
+    assert "it needs more. Photographs beyond" in text
+    assert "Adam's learning rates of the Gaussians." in text, "groups keep their description"
+
+
 def test_help_names_every_preset(capsys):
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])

@@ -1,15 +1,19 @@
 """Command-line arguments parsed into a dataclass by tyro, with every error on one line."""
 
 import contextlib
+import dataclasses
 import difflib
 import io
+import itertools
 import os
 import re
 import shlex
+import types
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar
 
 import tyro
+from docstring_parser import parse_from_object
 from tyro.conf import arg
 
 from a2tg_jax.cli.errors import UNRECOGNIZED, plain, told_unknown, unknown_words
@@ -89,8 +93,10 @@ def parse(
     Raises:
       ValueError: if an argument is missing, unknown or of another type.
     """
-    errors = io.StringIO()
-    width = contextlib.nullcontext() if {"-h", "--help"} & set(arguments) else _columns(WIDE)
+    errors, is_help = io.StringIO(), bool({"-h", "--help"} & set(arguments))
+    if is_help:
+        _tell_in_paragraphs(kind, options.get("default"))
+    width = contextlib.nullcontext() if is_help else _columns(WIDE)
     try:
         with registry(), width, contextlib.redirect_stderr(errors):
             parsed: Parsed = tyro.cli(kind, prog=program, args=arguments, **options)
@@ -102,6 +108,19 @@ def parse(
     if told.startswith(UNRECOGNIZED):
         told = told_unknown(unknown_words(told), lambda flag: hint(flag) or _suggested(flag, kind, options))
     raise ValueError(f"{told} (see {program} --help)")
+
+
+def _tell_in_paragraphs(kind: type, default: Any) -> None:
+    """Have the help of a dataclass, and of those in its default, fill its lines; tyro breaks them where the docstrings
+    in the source do."""
+    params = itertools.chain.from_iterable(parse_from_object(one).params for one in kind.__mro__[-2::-1])
+    told = {param.arg_name: " ".join(param.description.split()) for param in params if param.description}
+    for field in dataclasses.fields(kind):
+        if field.name in told:
+            field.metadata = types.MappingProxyType({**field.metadata, "help": told[field.name]})
+        value = getattr(default, field.name, None)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            _tell_in_paragraphs(type(value), value)
 
 
 def one_line(box: str) -> str:
