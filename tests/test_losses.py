@@ -71,7 +71,29 @@ def test_gradient_equals_central_differences_at_every_pixel(x64, weight):
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(image.ravel()), differences, rtol=1e-5, atol=1e-9)
 
 
-def test_ssim_of_a_batch_under_vmap_and_jit():
+@pytest.mark.parametrize("is_native", [True, False])
+def test_first_and_second_derivatives_in_both_modes(monkeypatch, x64, is_native):
+    """Forward mode is the gradient along a direction; second derivatives are differences of gradients."""
+    monkeypatch.setattr(losses, "has_native", lambda: is_native)
+    image, target = map(jnp.asarray, random_pair(11, 18, 0.1))
+    direction, eps = jnp.sin(jnp.arange(image.size, dtype=image.dtype)).reshape(image.shape), 1e-6
+    gradient = jax.grad(lambda image: photometric_loss(image, target))
+
+    def derivatives(image):
+        along = jax.jacfwd(lambda step: photometric_loss(image + step * direction, target))(0.0)
+        forward_over_reverse = jax.jvp(gradient, (image,), (direction,))[1]
+        return along, forward_over_reverse, jax.grad(lambda image: jnp.vdot(gradient(image), direction))(image)
+
+    along, *seconds = jax.jit(derivatives)(image)
+    here, ahead, behind = (jax.jit(gradient)(image + step * direction) for step in (0, eps, -eps))
+    np.testing.assert_allclose(along, jnp.vdot(here, direction), rtol=1e-9)
+    for second in seconds:
+        np.testing.assert_allclose(second, (ahead - behind) / (2 * eps), atol=1e-6 * jnp.abs(seconds[0]).max())
+
+
+@pytest.mark.parametrize("is_native", [True, False])
+def test_ssim_of_a_batch_under_vmap_and_jit(monkeypatch, is_native):
+    monkeypatch.setattr(losses, "has_native", lambda: is_native)
     pairs = [random_pair(14, 31, 0.1, np.float32, seed) for seed in range(3)]
     images, targets = (jnp.stack([jnp.asarray(x) for x in side]) for side in zip(*pairs, strict=True))
     batched = jax.jit(jax.vmap(jax.value_and_grad(mean_ssim)))(images, targets)

@@ -3,7 +3,6 @@
 Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would kill the gradient where it is needed.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,6 +11,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_floats, check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import normalize, safe_divide
+from a2tg_jax.rasterize.kernels import windows
 from a2tg_jax.rasterize.kernels.choice import has_native
 
 SSIM_SIGMA = 1.5
@@ -64,16 +64,14 @@ def mean_ssim(image: Array, target: Array) -> Array:
             f"{image.shape[0]}: use larger images or ssim_weight=0"
         )
     x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
+    score = windows.Score(_similarity, SSIM_TAPS)
     if has_native():
-        from a2tg_jax.rasterize.kernels.native.ssim import Score, least_width, mean_score
+        from a2tg_jax.rasterize.kernels.native.ssim import least_width, mean_score
 
         is_supported = x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64)
         if is_supported and x.shape[2] >= least_width(x.dtype, SSIM_WINDOW):
-            return mean_score(Score(_similarity, SSIM_TAPS), x, y)
-    # The target's own mean is blurred apart, so that no gradient is computed for it. The two second moments enter
-    # SSIM only through their sum: four blurs instead of five.
-    mean_x, mean_squares, mean_product = jnp.split(_window_mean(jnp.concatenate([x, x * x + y * y, x * y])), 3)
-    return jnp.mean(_similarity(mean_x, _window_mean(y), mean_squares, mean_product))
+            return mean_score(score, x, y)
+    return windows.mean_score(score, x, y)
 
 
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:
@@ -178,34 +176,3 @@ def back_project(depth: Array, camera: Camera) -> Array:
     rotation = camera.viewmat[:3, :3]
     points: Array = (rays @ rotation) * depth[..., None] + camera.center[None, None]
     return points
-
-
-@jax.custom_vjp
-def _window_mean(images: Array) -> Array:
-    """Return the mean under SSIM's window at every place where it fits: [C, H, W] → [C, H-10, W-10]."""
-    return _blur(_blur(images, 1), 2)
-
-
-def _window_mean_forward(images: Array) -> tuple[Array, None]:
-    return _window_mean(images), None
-
-
-def _window_mean_backward(_: None, cotangent: Array) -> tuple[Array]:
-    # The window is symmetric: its transpose is the same mean of the padded cotangent.
-    pad = (2 * SSIM_RADIUS, 2 * SSIM_RADIUS)
-    return (_window_mean(jax.lax.optimization_barrier(jnp.pad(cotangent, ((0, 0), pad, pad)))),)
-
-
-_window_mean.defvjp(_window_mean_forward, _window_mean_backward)
-
-
-def _blur(x: Array, axis: int) -> Array:
-    """Apply the 11 Gaussian taps along one axis, as a sum of shifted slices (faster than a convolution on CPUs)."""
-    size = x.shape[axis] - 2 * SSIM_RADIUS
-    shifted = [jax.lax.slice_in_dim(x, tap, tap + size, axis=axis) for tap in range(SSIM_WINDOW)]
-    blurred = shifted[SSIM_RADIUS] * SSIM_TAPS[SSIM_RADIUS]
-    for tap in range(SSIM_RADIUS):
-        blurred = blurred + (shifted[tap] + shifted[-1 - tap]) * SSIM_TAPS[tap]
-    # Without the barrier XLA fuses the two passes into one of 121 taps.
-    kept: Array = jax.lax.optimization_barrier(blurred)
-    return kept

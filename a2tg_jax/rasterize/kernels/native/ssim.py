@@ -15,36 +15,29 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jax.typing import DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
+from a2tg_jax.rasterize.kernels import windows
 from a2tg_jax.rasterize.kernels.native import ffi, llvm_modules, threads
 from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
 from a2tg_jax.rasterize.kernels.tracing import example, trace
+from a2tg_jax.rasterize.kernels.windows import Score
 
 SCORE = ("x", "y", "sums", "d_means", "rows")
 PULL_BACK = ("x", "y", "d_mean", "d_squares", "d_product", "share", "d_x", "rows")
 INTEGERS = ("first", "last", "channels", "height", "width")
 LEAST_PIXELS = 10_000
 """Least number of pixels that is worth another thread."""
-
-
-class Score(NamedTuple):
-    """Score to average over windows; hashable."""
-
-    function: Callable[[Array, Array, Array, Array], Array]
-    """Element-wise function of the means of x, y, x² + y² and x·y."""
-    taps: tuple[float, ...]
-    """Weights of a window along one axis."""
 
 
 def least_width(dtype: DTypeLike, num_taps: int) -> int:
@@ -56,10 +49,43 @@ def _num_lanes(dtype: DTypeLike) -> int:
     return llvm_modules.vector_bytes() // int(np.dtype(dtype).itemsize)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def mean_score(score: Score, x: Array, y: Array) -> Array:
     """Return the average over all windows of images [C, H, W], float32 or float64, at least `least_width` wide."""
     return _score(score, x, y)[0]
+
+
+@functools.partial(mean_score.defjvp, symbolic_zeros=True)
+def _mean_score_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    value, *slopes = value_and_slopes(score, *primals)
+    terms = [
+        jnp.sum(slope * tangent)
+        for slope, tangent in zip(slopes, tangents, strict=True)
+        if not isinstance(tangent, SymbolicZero)
+    ]
+    return value, sum(terms, jnp.zeros_like(value))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return the average, and its derivatives by x and y; XLA computes none that is not used."""
+    value, (d_x_mean, d_y_mean, *d_products) = _score(score, x, y)
+    share = jnp.full(1, 1 / _num_windows(score, x), x.dtype)
+    name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
+    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
+    d_x, d_y = (ffi.call(name, [(x.shape, x.dtype)], *given)[0] for given in inputs)
+    return value, d_x, d_y
+
+
+@value_and_slopes.defjvp
+def _value_and_slopes_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Any, Any]:
+    """Differentiate the plain array code: second derivatives need no speed."""
+
+    def plain(x: Array, y: Array) -> tuple[Array, Array, Array]:
+        value, slopes = jax.value_and_grad(functools.partial(windows.mean_score, score), argnums=(0, 1))(x, y)
+        return value, *slopes
+
+    return value_and_slopes(score, *primals), jax.jvp(plain, primals, tangents)[1]
 
 
 def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:
@@ -70,28 +96,13 @@ def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:
     shapes = (count * down,), (4, count, down + 2 * margin, across)
     name = _registered(score, str(x.dtype), "score", _score_handler)
     sums, d_means = ffi.call(name, [(shape, x.dtype) for shape in shapes], x, y)
-    return jnp.sum(sums) / (count * down * across), d_means
+    return jnp.sum(sums) / _num_windows(score, x), d_means
 
 
-def _score_forward(score: Score, x: Array, y: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-    value, d_means = _score(score, x, y)
-    return value, (x, y, d_means)
-
-
-def _score_backward(score: Score, residuals: tuple[Array, Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    x, y, (d_x_mean, d_y_mean, *d_products) = residuals
-    count, height, _ = x.shape
-    name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
-    num_windows = count * (height - len(score.taps) + 1) * d_x_mean.shape[2]
-    share = cotangent[None] / num_windows
-    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
-    # XLA drops the second call if its result is not used.
-    (d_x,), (d_y,) = (ffi.call(name, [(x.shape, x.dtype)], *given) for given in inputs)
-    cotangents: tuple[Array, Array] = cotangent_of((x, y), (d_x, d_y))
-    return cotangents
-
-
-mean_score.defvjp(_score_forward, _score_backward)
+def _num_windows(score: Score, x: Array) -> int:
+    count, height, width = x.shape
+    margin = len(score.taps) - 1
+    return count * (height - margin) * (width - margin)
 
 
 def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"], handler: Callable[..., None]) -> str:
