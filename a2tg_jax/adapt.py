@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
-from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.checks import check_int, check_literal, check_mask, check_number, check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.spread_arrays import on_host, placed_like
@@ -29,10 +29,13 @@ from a2tg_jax.texture import (
     Textures,
     bucket_capacity,
     check_textures,
+    checked_sizes,
     plan_layout,
     shape_of,
 )
 
+Axes = Literal["paper", "authors"]
+"""Whose choice of the axis that a thin Gaussian doubles."""
 PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 """Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and a longer one for short stages, in
@@ -64,7 +67,7 @@ class UpscaleChoices:
     """Largest reported memory in MB (10^6 bytes); needed by select="budget"."""
     anisotropic: bool = static(default=True)
     """Whether thin Gaussians double one axis only; off: always both."""
-    axes: Literal["paper", "authors"] = static(default="paper")
+    axes: Axes = static(default="paper")  # noqa: RUF009 - an alias of Literal
     """Axis that a thin Gaussian doubles: the long one, or the short one as in the authors' program."""
     k_a: float = 4.0
     """Aspect ratio above which a Gaussian counts as elongated."""
@@ -205,7 +208,7 @@ def next_sizes(
     k_s: float,
     cap: int,
     anisotropic: bool = True,
-    axes: str = "paper",
+    axes: Axes = "paper",
 ) -> np.ndarray:
     """Return the texture sizes one upscaling would give (A²TG, anisotropic upscaling).
 
@@ -225,11 +228,17 @@ def next_sizes(
       [N, 2] int64 (Tv, Tu), nowhere below `sizes`.
 
     Raises:
-      ValueError: if the shapes differ.
+      ValueError: if the shapes differ, or a number is out of range.
     """
-    sizes, scales = np.asarray(sizes, np.int64), np.asarray(scales)
-    if sizes.ndim != 2 or sizes.shape[1] != 2 or sizes.shape != scales.shape:
-        raise ValueError(f"sizes and scales must both be [N, 2]; got {sizes.shape} and {scales.shape}")
+    sizes = checked_sizes(sizes).astype(np.int64)
+    check_shape("scales", scales, sizes.shape)
+    scales = np.asarray(scales)
+    if (scales < 0).any():
+        raise ValueError(f"scales must be positive standard deviations; got {scales.min():g}: say gaussians.scales")
+    check_number("k_a", k_a, least=0)
+    check_number("k_s", k_s, least=0)
+    check_int("cap", cap, 1, MAX_SIDE)
+    check_literal("axes", axes, Axes)
     s_x, s_y = scales.T
     is_thin_u = anisotropic & (s_x > k_a * s_y) & (s_y < k_s)
     is_thin_v = anisotropic & (s_y > k_a * s_x) & (s_x < k_s)
@@ -311,6 +320,7 @@ def select(
         return _select_fraction(statistic, can_grow, fraction)
     if budget_bytes is not None:
         return within_budget(statistic, can_grow, added_bytes, budget_bytes)
+    check_number("threshold", threshold)
     chosen: np.ndarray = can_grow & (statistic > threshold)
     return chosen
 
@@ -341,13 +351,13 @@ def reallocate(
     Raises:
       ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
     """
-    new_sizes = np.asarray(new_sizes)
-    check_textures(textures, layout, layout.num)
+    check_textures(textures, layout)
+    new_sizes = checked_sizes(new_sizes, "new_sizes")
     check_shape("new_sizes", new_sizes, (layout.num, 2))
     new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket, room=room)
     texel_moves = moment_moves = _plan_moves(layout, new_layout)
     if kept is not None:
-        check_shape("kept", kept, (layout.num,))
+        check_mask("kept", kept, (layout.num,))
         moment_moves = _plan_moves(layout, new_layout, np.asarray(kept))
     shapes = [(capacity, *size, 4) for capacity, size in zip(capacities, new_layout.resolutions, strict=True)]
 
@@ -414,8 +424,7 @@ def _nearest(old: int, new: int) -> np.ndarray:
 
 
 def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: float) -> np.ndarray:
-    if not 0 <= fraction <= 1:
-        raise ValueError(f"fraction must lie in [0, 1]; got {fraction}")
+    check_number("fraction", fraction, least=0, most=1)
     candidates = np.flatnonzero(can_grow & (statistic > 0))
     order = np.argsort(-statistic[candidates], kind="stable")
     num = math.floor(fraction * len(statistic) + 0.5)

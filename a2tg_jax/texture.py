@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.core.checks import check_floats, check_shape, short_repr
+from a2tg_jax.core.checks import check_floats, check_kind, check_number, check_shape, short_repr
 from a2tg_jax.core.spread_arrays import on_host, placed_like
 
 MAX_SIDE = 16
@@ -78,14 +78,15 @@ class AtlasLayout:
         return short_repr(self)
 
 
-def check_textures(textures: Textures, layout: AtlasLayout, num: int, name: str = "textures") -> None:
-    """Raise ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians."""
+def check_textures(textures: Textures, layout: AtlasLayout, num: int | None = None, name: str = "textures") -> None:
+    """Raise ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians; None: of any."""
     if not isinstance(textures, Textures) or not isinstance(layout, AtlasLayout):
         kinds = f"{type(textures).__name__} and {type(layout).__name__}"
         raise ValueError(f"{name} and layout must be Textures and their AtlasLayout; got {kinds}")
-    if layout.num != num:
+    check_shape("layout.bucket", layout.bucket, ("N",))
+    if num is not None and layout.num != num:
         raise ValueError(f"layout is of {layout.num} textures, but there are {num} gaussians")
-    check_shape("layout.row", layout.row, (num,))
+    check_shape("layout.row", layout.row, (layout.num,))
     if len(textures.buckets) != len(layout.resolutions):
         counts = f"{len(textures.buckets)} buckets, and the layout {len(layout.resolutions)} sizes"
         raise ValueError(f"{name} must have one bucket for each size of the layout; they have {counts}")
@@ -149,13 +150,11 @@ def plan_layout(
     Raises:
       ValueError: if a size is out of range.
     """
-    sizes = np.asarray(sizes)
-    if sizes.ndim != 2 or sizes.shape[1] != 2 or not np.issubdtype(sizes.dtype, np.integer):
-        raise ValueError(f"sizes must be integers [N, 2] as (Tv, Tu); got {sizes.dtype} {sizes.shape}")
-    is_wrong = ((sizes < 1) | (sizes > MAX_SIDE)).any(axis=1) & (sizes != 0).any(axis=1)
-    if is_wrong.any():
-        found = sizes[is_wrong]
-        raise ValueError(f"texture sides must lie in 1..{MAX_SIDE}, or both be 0; got {found.min()}..{found.max()}")
+    sizes = checked_sizes(sizes)
+    for shape in known:
+        check_kind("known", shape, Shape)
+    if room is not None:
+        check_kind("room", room, Shape)
     codes, bucket, counts = np.unique(sizes @ np.array([64, 1]), return_inverse=True, return_counts=True)
     order = np.argsort(bucket, kind="stable")
     starts = np.repeat(np.cumsum(counts) - counts, counts)
@@ -166,6 +165,24 @@ def plan_layout(
     place = np.asarray([shape.resolutions.index(resolution) for resolution in needed], np.int32)
     buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
     return AtlasLayout(placed_like(buckets, like), placed_like(row, like), shape.resolutions), shape.capacities
+
+
+def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
+    """Return the sizes of textures as an array (host).
+
+    Raises:
+      ValueError: unless they are integers [N, 2], each side 1 to 16, or both 0.
+    """
+    if isinstance(sizes, Textures | AtlasLayout):
+        raise ValueError(f"{name} must be integers [N, 2]; got {type(sizes).__name__}: say layout.sizes")
+    sizes = np.asarray(sizes)
+    if sizes.ndim != 2 or sizes.shape[1] != 2 or not np.issubdtype(sizes.dtype, np.integer):
+        raise ValueError(f"{name} must be integers [N, 2] as (Tv, Tu); got {sizes.dtype} {sizes.shape}")
+    is_wrong = ((sizes < 1) | (sizes > MAX_SIDE)).any(axis=1) & (sizes != 0).any(axis=1)
+    if is_wrong.any():
+        found = sizes[is_wrong]
+        raise ValueError(f"texture sides must lie in 1..{MAX_SIDE}, or both be 0; got {found.min()}..{found.max()}")
+    return sizes
 
 
 def _choose_shape(needed: dict[tuple[int, int], int], known: Sequence[Shape], wanted: Shape | None) -> Shape:
@@ -192,7 +209,13 @@ def allocate_textures(
       sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0 for an empty texture, which takes no bytes.
       rgb: initial RGB residual.
       dtype: dtype of the texels.
+
+    Raises:
+      ValueError: if a size is out of range, or the dtype is none of floats.
     """
+    check_number("rgb", rgb)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"dtype must be a dtype of floats; got {dtype}")
     layout, capacities = plan_layout(sizes)
     texel = jnp.asarray([rgb, rgb, rgb, 1.0], dtype)
     shapes = zip(capacities, layout.resolutions, strict=True)
@@ -246,7 +269,7 @@ def first_textures(textures: Textures, layout: AtlasLayout, num: int) -> tuple[T
 
 def texture_arrays(textures: Textures, layout: AtlasLayout) -> list[np.ndarray]:
     """Return the N textures as numpy arrays [Tv, Tu, 4], in the order of the Gaussians (host)."""
-    check_textures(textures, layout, layout.num)
+    check_textures(textures, layout)
     buckets = [np.asarray(bucket) for bucket in textures.buckets]
     places = zip(np.asarray(layout.bucket), np.asarray(layout.row), strict=True)
     return [buckets[bucket][row] for bucket, row in places]

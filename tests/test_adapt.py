@@ -125,7 +125,7 @@ def test_rules_out_of_range_are_named(rule, name):
 def test_shapes_that_disagree_are_named():
     with pytest.raises(ValueError, match=r"sizes must be \[3, 2\]; got \[4, 2\]"):
         select(np.zeros(3), np.ones((4, 2), int), np.ones((4, 2), int), threshold=0)
-    with pytest.raises(ValueError, match="must both be"):
+    with pytest.raises(ValueError, match=r"scales must be \[4, 2\]; got \[3, 2\]"):
         next_sizes(np.ones((4, 2), int), np.ones((3, 2)), k_a=4, k_s=0.01, cap=4)
 
 

@@ -1,12 +1,13 @@
-"""Checks of shapes and dtypes, with errors that name the argument; short texts for arrays.
+"""Checks of kinds, numbers, shapes and dtypes, with errors that name the argument; short texts for arrays.
 
-Checks read only `shape` and `dtype`, so that tracers pass and nothing is computed.
+Checks of arrays read only `shape` and `dtype`, so that tracers pass and nothing is computed.
 """
 
 import dataclasses
-import math
+import numbers
 from typing import Any, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -38,12 +39,51 @@ def check_literal(name: str, value: Any, literal: Any) -> None:
         raise ValueError(f"{name} must be one of {', '.join(get_args(literal))}; got {value!r}")
 
 
-def check_integer(name: str, value: Any, least: int, most: float = math.inf) -> None:
-    """Raise ValueError unless a value is an integer, no truth value, in a range."""
-    is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not is_integer or not least <= value <= most:
-        wanted = f"of at least {least}" if most == math.inf else f"in {least}..{most}"
-        raise ValueError(f"{name} must be an integer {wanted}; got {value!r}")
+def check_int(name: str, value: Any, least: int, most: int | None = None, otherwise: str = "") -> None:
+    """Raise ValueError unless a value is an int, of Python or numpy, in a range; the error adds what else may be."""
+    is_int = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_int or value < least or (most is not None and value > most):
+        limits = f"at least {least}" if most is None else f"{least} to {most}"
+        raise ValueError(f"{name} must be an int, {limits}{otherwise}; got {value!r}")
+
+
+def check_number(
+    name: str,
+    value: Any,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    most: float | None = None,
+    below: float | None = None,
+) -> None:
+    """Raise ValueError unless a value is one real number within limits; NaN is within none.
+
+    A scalar array is a number. Values of tracers are not read.
+    """
+    limits = {"at least": least, "above": above, "at most": most, "below": below}
+    wanted = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if limit is not None)
+    is_array = hasattr(value, "dtype") and np.shape(value) == () and jnp.issubdtype(value.dtype, jnp.number)
+    if is_array and isinstance(value, jax.core.Tracer):
+        return
+    is_number = is_array or (isinstance(value, numbers.Real) and not isinstance(value, bool))
+    if not is_number or not _is_within(float(value), least, above, most, below):
+        found = described(value) if hasattr(value, "dtype") and not is_array else repr(value)
+        raise ValueError(f"{name} must be {wanted or 'a number'}; got {found}")
+
+
+def _is_within(
+    number: float, least: float | None, above: float | None, most: float | None, below: float | None
+) -> bool:
+    is_low_enough = (most is None or number <= most) and (below is None or number < below)
+    is_high_enough = (least is None or number >= least) and (above is None or number > above)
+    return is_low_enough and is_high_enough and number == number
+
+
+def check_array(name: str, x: Any, hint: str = "") -> None:
+    """Raise ValueError, with an optional hint, unless a value is an array or a tracer."""
+    if not (hasattr(x, "shape") and hasattr(x, "dtype")):
+        hint = hint or ("use jnp.asarray" if isinstance(x, list | tuple) else "")
+        raise ValueError(f"{name} must be an array; got {kind_of(x)}{hint and f': {hint}'}")
 
 
 def _noun(kind: type) -> str:
@@ -73,7 +113,8 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     """
     shape = np.shape(x)
     if len(shape) != len(wanted) or not _fits(shape, wanted):
-        raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape)}")
+        is_array = hasattr(x, "shape") or isinstance(x, numbers.Number | list | tuple)
+        raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape) if is_array else _kind_of(x)}")
 
 
 def check_floats(name: str, x: Any, wanted: Wanted) -> None:
@@ -81,6 +122,13 @@ def check_floats(name: str, x: Any, wanted: Wanted) -> None:
     check_shape(name, x, wanted)
     if not jnp.issubdtype(dtype_of(x), jnp.floating):
         raise ValueError(f"{name} must be floats; got {dtype_of(x)}")
+
+
+def check_mask(name: str, x: Any, wanted: Wanted) -> None:
+    """Raise ValueError unless x has the wanted shape, as in `check_shape`, and holds bools."""
+    check_shape(name, x, wanted)
+    if dtype_of(x) != np.bool_:
+        raise ValueError(f"{name} must be bools; got {dtype_of(x)}")
 
 
 def dtype_of(x: Any) -> Any:
