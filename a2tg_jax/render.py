@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, Features, PlainRule, appearance_for
+from a2tg_jax.appearance import Appearance, AppearanceRule, Features, PlainRule, appearance_for, check_rule
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_floats, check_shape, dtype_of
+from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
@@ -69,6 +69,7 @@ def render_appearance(
     """Render a view as `render_image` does, with an appearance rule; of the first `num_live` rows, if given."""
     check_gaussians(gaussians)
     check_camera(camera)
+    check_rule(rule)
     background = (0,) * rule.num_colors if background is None else background
     check_background(background, rule.num_colors)
     if num_live is not None:
@@ -125,8 +126,9 @@ def appearance_of(
     """Return the appearance of Gaussians and textures given apart, which `settings.texture` decides.
 
     Raises:
-      ValueError: if only one of textures and layout is given, or they do not fit the Gaussians.
+      ValueError: if only one of textures and layout is given, they do not fit the Gaussians, or there are no settings.
     """
+    check_kind("settings", settings, RenderSettings)
     if (textures is None) != (layout is None):
         raise ValueError("textures and layout belong together: give both or neither")
     if textures is not None and layout is not None:

@@ -47,7 +47,7 @@ class Doctor:
         _tell("memory", f"{memory_limit() / 1e9:.1f} GB may be used")
         _tell("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set")
         _tell("cache", str(compilation_cache_folder()))
-        _tell("compositor", f"{choice.choose('auto', RenderSettings.tile_size)} is the choice of 'auto'")
+        _tell("compositor", f"{choice.choose('auto')} is the choice of 'auto'")
         for name, remedy in choice.REMEDIES.items():
             if not choice.is_available(name):
                 _tell("", f"{name} is not available: it needs {remedy}")

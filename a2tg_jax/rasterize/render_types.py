@@ -7,10 +7,12 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import TextureOptions
+from a2tg_jax.core.checks import check_int, check_kind, check_number
 from a2tg_jax.core.display import as_bytes, enlarged, png, short_tuple_repr
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.rasterize.exchange import Exchange
+from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.rasterize.splats import Wanted
 
 IMAGES = ("color", "alpha", "depth", "normal", "distortion")
@@ -24,7 +26,7 @@ class RenderSettings:
     """Static options of a rendering; hashable, so that jit can close over them or take them as static."""
 
     tile_size: int = 8
-    """Side of a tile in pixels; it does not change the image."""
+    """Side of a tile in pixels, 1 to 64; it does not change the image."""
     near_plane: float = NEAR_PLANE
     """Least depth of visible splats and hits, in units of the world; positive. If you scale the world, scale near_plane
     by the same factor (`transform`)."""
@@ -50,14 +52,20 @@ class RenderSettings:
     """Devices that render together, an image or several at once (`exchange_among`); None: one."""
 
     def __post_init__(self) -> None:
-        if not self.near_plane > 0:
-            raise ValueError(f"near_plane must be positive; got {self.near_plane}")
-        if type(self.supersample) is not int or self.supersample < 1:
-            raise ValueError(f"supersample must be an int, at least 1; got {self.supersample!r}")
-        if isinstance(self.capacity, np.integer):
-            object.__setattr__(self, "capacity", int(self.capacity))
-        if self.capacity is not None and (type(self.capacity) is not int or self.capacity < 1):
-            raise ValueError(f"capacity must be an int, at least 1, or None; got {self.capacity!r}")
+        """Refuse numbers out of range; convert numpy's integers to Python's, which are static for jit."""
+        check_number("near_plane", self.near_plane, above=0)
+        check_kind("texture", self.texture, TextureOptions)
+        if self.exchange is not None:
+            check_kind("exchange", self.exchange, Exchange)
+        for name, least, most in (("tile_size", 1, MAX_TILE_SIZE), ("sh_degree", 0, 3), ("supersample", 1, None)):
+            check_int(name, getattr(self, name), least, most)
+        for name, least in (("capacity", 1), ("tile_batch", 0)):
+            if getattr(self, name) is not None:
+                check_int(name, getattr(self, name), least, otherwise=", or None")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.integer):
+                object.__setattr__(self, field.name, int(value))
 
     def transform(self, similarity: Similarity) -> "RenderSettings":
         """Return settings that show a model in the world of `similarity` as these show it in its own."""

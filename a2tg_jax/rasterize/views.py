@@ -125,7 +125,7 @@ def _rendered(
     probe: Array | None, statistic: Statistic | None,
 ) -> tuple[RenderOutput, Array]:  # fmt: skip
     """Return the output of one view, or of several if `each` is `jax.vmap`; other arguments as of `render_traced`."""
-    compositor = choose(settings.compositor, settings.tile_size)
+    compositor = choose(settings.compositor)
     if camera.rays is not None and compositor == "cuda":
         compositor = _for_rays(settings)
     compositing = _compositing_settings(

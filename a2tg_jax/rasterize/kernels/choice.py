@@ -27,16 +27,14 @@ REMEDIES: dict[Literal["cuda", "native"], str] = {
 """Requirements of the compositors that do not run everywhere."""
 
 
-def choose(wanted: Wanted, tile_size: int) -> Compositor:
+def choose(wanted: Wanted) -> Compositor:
     """Return the compositor that is wanted, or with "auto" the fastest one for JAX's default backend.
 
     Raises:
-      ValueError: if there is no such compositor, it cannot run here, or the tiles are too large.
+      ValueError: if there is no such compositor, or it cannot run here.
     """
     if wanted not in ("auto", "cuda", "native", "xla", "autodiff"):
         raise ValueError(f"compositor must be 'auto', 'cuda', 'native', 'xla' or 'autodiff'; got {wanted!r}")
-    if not 1 <= tile_size <= MAX_TILE_SIZE:
-        raise ValueError(f"tile_size must lie in 1..{MAX_TILE_SIZE}; got {tile_size}")
     if (wanted == "cuda" or wanted == "native") and not is_available(wanted):
         raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or say 'auto'")
     if wanted != "auto":
