@@ -8,9 +8,9 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule
-from a2tg_jax.core.cameras import Camera, check_camera, resize_camera
-from a2tg_jax.core.checks import check_kind
+from a2tg_jax.appearance import AppearanceRule, check_rule
+from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
+from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
@@ -52,14 +52,14 @@ def plan_render(
       settings: static options; their capacity is replaced.
 
     Raises:
-      ValueError: if there is no camera, if textures or a rule are given beside a model or each other, or under jit and
-        vmap, where shapes are fixed.
+      ValueError: if there is no camera, an argument is of another kind or out of range, textures or a rule are given
+        beside a model or each other, or under jit and vmap, where shapes are fixed.
     """
-    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    check_kind("gaussians", gaussians, (Model, Gaussians))
+    cameras = checked_cameras(cameras)
     if not cameras:
         raise ValueError("cameras must be one camera at least; got none")
-    if not head_room >= 1:
-        raise ValueError(f"head_room must be at least 1; got {head_room}")
+    check_number("head_room", head_room, least=1)
     check_kind("settings", settings, RenderSettings)
     num_live = None
     if isinstance(gaussians, Model):
@@ -72,8 +72,6 @@ def plan_render(
         rule = rule_of(gaussians, textures, layout, settings)
     elif textures is not None or layout is not None:
         raise ValueError("rule already says what the splats show: give it, or textures and layout")
-    for camera in cameras:
-        check_camera(camera)
     most = max(pairs_to_draw(gaussians, camera, rule, settings, num_live) for camera in cameras)
     return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
@@ -95,7 +93,7 @@ class Renderer:
         model: Model | Gaussians,
         rule: AppearanceRule | None = None,
         *,
-        cameras: Iterable[Camera] = (),
+        cameras: Camera | Iterable[Camera] = (),
         capacities: Mapping[Size, int] | None = None,
         background: Any = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
@@ -106,7 +104,7 @@ class Renderer:
         Args:
           model: a model, or Gaussians of which all rows exist.
           rule: appearance rule of Gaussians; None is plain 2DGS. A model has its own.
-          cameras: cameras for which the first capacities are planned; others may follow.
+          cameras: one or more for which the first capacities are planned; others may follow.
           capacities: initial capacities, such as those of the renderer of a similar model.
           background: [3] colour; None is the model's own, or black.
           settings: static options; the renderer finds the capacity.
@@ -117,6 +115,8 @@ class Renderer:
         """
         check_kind("model", model, (Model, Gaussians))
         check_kind("settings", settings, RenderSettings)
+        if rule is not None:
+            check_rule(rule)
         if isinstance(model, Model) and rule is not None:
             raise ValueError("rule: a model says itself what its splats show; give Gaussians with a rule")
         if not isinstance(model, Model):
@@ -132,7 +132,7 @@ class Renderer:
         self._known = own[:: -(-len(own) // PLANNED_CAMERAS) or 1]
         self.capacities: dict[Size, int] = dict(capacities or {})
         """Capacities for (splat, tile) pairs by image size, (width, height)."""
-        self._plan(list(cameras))
+        self._plan(checked_cameras(cameras))
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{width}×{height}" for width, height in self.capacities) or "no size yet"
@@ -156,7 +156,6 @@ class Renderer:
     def _plan(self, cameras: list[Camera]) -> None:
         """Plan capacities for all these cameras."""
         for camera in cameras:
-            check_camera(camera)
             size = camera.width, camera.height
             self.capacities[size] = max(self.capacities.get(size, 0), capacity_for(self._num_pairs(camera)))
 

@@ -1,13 +1,15 @@
 """Pinhole cameras in OpenCV's frame: x right, y down, z forward; pixel centres at +0.5."""
 
 import dataclasses
+from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_floats, check_kind, short_repr
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_floats, check_int, check_kind, short_repr
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
@@ -62,12 +64,12 @@ class Camera:
 def check_camera(camera: Camera, name: str = "camera") -> None:
     """Raise ValueError, naming the field, unless the matrices have their shapes and the image a size.
 
-    The pose must be a rigid motion, which is checked outside jit, vmap and grad.
+    The pose must be a rigid motion, and K have the form of intrinsics, which is checked outside jit, vmap and grad.
     """
-    check_kind(name, camera, Camera, "use view.camera" if hasattr(camera, "camera") else "")
+    check_is_camera(camera, name)
     for field, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
         value = getattr(camera, field)
-        check_array(f"{name}.{field}", value, "jnp.asarray")
+        check_array(f"{name}.{field}", value)
         check_floats(f"{name}.{field}", value, shape)
     if camera.rays is not None:
         check_floats(f"{name}.rays", camera.rays, (camera.height, camera.width, 2))
@@ -77,6 +79,45 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
             kind = "" if isinstance(value, int) else ", a Python int"
             raise ValueError(f"{name}.{side} must be a positive number of pixels{kind}; got {value!r}")
     _check_rigid(camera.viewmat, f"{name}.viewmat")
+    _check_projection(camera.K, f"{name}.K")
+
+
+def check_is_camera(camera: Camera, name: str = "camera") -> None:
+    """Raise ValueError unless a value is a camera, whatever is in it."""
+    check_kind(name, camera, Camera, _hint(camera))
+
+
+def _hint(value: Any) -> str:
+    return "use view.camera" if hasattr(value, "camera") else ""
+
+
+def checked_cameras(cameras: Any, name: str = "cameras") -> list[Camera]:
+    """Return one camera, or several, as a list.
+
+    Raises:
+      ValueError: if it is neither, or as `check_camera` does.
+    """
+    if isinstance(cameras, Camera):
+        check_camera(cameras, name)
+        return [cameras]
+    check_kind(name, cameras, (Camera, Iterable), _hint(cameras))
+    several: list[Camera] = list(cameras)
+    for index, camera in enumerate(several):
+        check_camera(camera, f"{name}[{index}]")
+    return several
+
+
+def _check_projection(K: Array, name: str) -> None:
+    """Raise ValueError unless a matrix with values has positive focal lengths and the form of intrinsics, up to drift
+    such as gradient steps leave."""
+    if isinstance(K, jax.core.Tracer):
+        return
+    values = np.asarray(K, np.float64)
+    focal = values[[0, 1], [0, 1]]
+    is_upper = abs(values[1, 0]) <= MAX_DRIFT * focal[1] and np.abs(values[2] - [0, 0, 1]).max() <= MAX_DRIFT
+    if not (np.isfinite(values).all() and (focal > 0).all() and is_upper):
+        wanted = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, finite, with positive focal lengths fx and fy"
+        raise ValueError(f"{name} must be {wanted}; got {_numbers(values)}")
 
 
 def _check_rigid(viewmat: Array, name: str) -> None:
@@ -137,7 +178,14 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the same view at another image size: K scales with each side (pixel edges stay edges)."""
+    """Return the same view at another image size: K scales with each side (pixel edges stay edges).
+
+    Raises:
+      ValueError: unless it is a camera, and both sides are positive ints.
+    """
+    check_is_camera(camera)
+    check_int("width", width, 1)
+    check_int("height", height, 1)
     dtype = camera.K.dtype
     factors = jnp.asarray([[width / camera.width], [height / camera.height], [1.0]], dtype)
     rays = camera.rays
@@ -162,7 +210,13 @@ def crop_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return the same view at another image size and aspect: scaled to cover it, and cropped around its centre.
 
     The view is that of a pinhole camera: rays of a lens are left out.
+
+    Raises:
+      ValueError: unless it is a camera, and both sides are positive ints.
     """
+    check_is_camera(camera)
+    check_int("width", width, 1)
+    check_int("height", height, 1)
     camera = dataclasses.replace(camera, rays=None)
     factor = max(width / camera.width, height / camera.height)
     scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))

@@ -43,6 +43,8 @@ class Gaussians:
     sh: Array
     """[N, K, 3] spherical-harmonic coefficients of the colour, degree 0 first; K is 1, 4, 9 or 16."""
 
+    __iter__ = None  # Python would iterate by __getitem__, forever: indices of JAX end nowhere.
+
     @property
     def num(self) -> int:
         """Number of rows N."""

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from a2tg_jax.core.cameras import Camera, check_camera, intrinsics, looking, resize_camera, viewmat_of_axes
+from a2tg_jax.core.checks import check_int
 from a2tg_jax.core.similarity import camera_centers
 
 SMOOTHING = 0.06
@@ -68,6 +69,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are fewer than two cameras or no frames.
     """
+    check_int("num_frames", num_frames, 0)
     _check_cameras("cameras", cameras)
     if len(cameras) < 2 or num_frames < 1:
         raise ValueError(f"a path needs two cameras and a frame; got {len(cameras)} cameras, {num_frames} frames")
@@ -96,6 +98,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are no views or no frames.
     """
+    check_int("num_frames", num_frames, 0)
     _check_cameras("views", views)
     if not views or num_frames < 1:
         raise ValueError(f"a path needs a view and a frame; got {len(views)} views, {num_frames} frames")
