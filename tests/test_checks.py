@@ -10,7 +10,8 @@ import pytest
 from small_values import some_gaussians, some_world
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.checks import check_floats, check_shape, described
+from a2tg_jax.core.cameras import check_camera
+from a2tg_jax.core.checks import check_floats, check_number, check_shape, described
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.text import shortened
 from a2tg_jax.training.losses import depth_normals, mean_scale
@@ -20,6 +21,9 @@ SETTINGS = a2tg.RenderSettings(capacity=1024)
 IMAGE, MAP = jnp.ones((12, 16, 3)), jnp.ones((12, 16))
 KEY = jax.random.key(0)
 TEXTURES, LAYOUT = a2tg.allocate_textures(np.ones((7, 2), int))
+SCALES = np.ones((7, 2), np.float32)
+VIEW = a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3), np.uint8))
+OUTPUT = a2tg.RenderOutput(IMAGE, MAP, MAP, IMAGE, jnp.zeros((), bool), MAP)
 WRONG_TEXTURES = a2tg.Textures((jnp.ones((7, 1, 1, 3)),))
 
 
@@ -55,6 +59,10 @@ def render(**options):
 
 def moved(moments=None, num_live=7, **options):
     return a2tg.relocate(KEY, options.get("gaussians", some_gaussians()), moments or (), num_live)
+
+
+def sizes_after(sizes, scales, **options):
+    return a2tg.next_sizes(sizes, scales, **{"k_a": 4.0, "k_s": 0.01, "cap": 4, **options})
 
 
 def adam(params, grads, rates=0.1):
@@ -117,11 +125,100 @@ def adam(params, grads, rates=0.1):
         (lambda: adam({"a": jnp.ones(7)}, {"b": jnp.ones(7)}), "grads must have the structure of params"),
         (lambda: adam(jnp.ones((7, 3)), jnp.ones((7, 3)), jnp.ones(3)), "rates must broadcast to [7, 3]"),
         (lambda: adam(jnp.ones((1, 3)), jnp.ones((1, 3)), jnp.ones((7, 3))), "rates must broadcast to [1, 3]"),
+        (lambda: adam({"a": jnp.ones(7, int)}, {"a": jnp.ones(7)}), "params['a'] must be floats; got int32"),
+        (lambda: sizes_after(SCALES, LAYOUT.sizes), "sizes must be integers [N, 2] as (Tv, Tu); got float32 (7, 2)"),
+        (lambda: sizes_after(LAYOUT, SCALES), "sizes must be integers [N, 2]; got AtlasLayout: say layout.sizes"),
+        (
+            lambda: sizes_after(100 * LAYOUT.sizes, SCALES),
+            "texture sides must lie in 1..16, or both be 0; got 100..100",
+        ),
+        (lambda: sizes_after(LAYOUT.sizes, -SCALES), "scales must be positive standard deviations; got -1: say"),
+        (lambda: sizes_after(LAYOUT.sizes, SCALES, k_a=np.nan), "k_a must be at least 0; got nan"),
+        (lambda: sizes_after(LAYOUT.sizes, SCALES, cap=4.5), "cap must be an int, 1 to 16; got 4.5"),
+        (lambda: sizes_after(LAYOUT.sizes, SCALES, axes="foo"), "axes must be one of paper, authors; got 'foo'"),
+        (lambda: a2tg.reallocate(LAYOUT, TEXTURES, LAYOUT.sizes), "must be Textures and their AtlasLayout"),
+        (lambda: a2tg.reallocate(TEXTURES, LAYOUT, LAYOUT.sizes, kept=np.arange(7)), "kept must be bools; got int64"),
+        (lambda: a2tg.texture_arrays(LAYOUT, TEXTURES), "Textures and their AtlasLayout; got AtlasLayout and Textures"),
+        (lambda: a2tg.allocate_textures(LAYOUT.sizes, rgb=(1, 1, 1)), "rgb must be a number; got (1, 1, 1)"),
+        (lambda: render(settings=None), "settings must be RenderSettings; got NoneType"),
+        (lambda: a2tg.RenderSettings(tile_size=8.0), "tile_size must be an int, 1 to 64; got 8.0"),
+        (lambda: a2tg.RenderSettings(sh_degree=7), "sh_degree must be an int, 0 to 3; got 7"),
+        (lambda: a2tg.RenderSettings(tile_batch=-1), "tile_batch must be an int, at least 0, or None; got -1"),
+        (lambda: a2tg.RenderSettings(near_plane="1"), "near_plane must be above 0; got '1'"),
+        (lambda: a2tg.plan_render(CAMERA, some_gaussians()), "gaussians must be a Model or Gaussians; got Camera"),
+        (lambda: a2tg.plan_render(some_gaussians(), None), "cameras must be a Camera or an Iterable; got NoneType"),
+        (lambda: a2tg.plan_render(some_gaussians(), [VIEW]), "cameras[0] must be a Camera; got View: use view.camera"),
+        (lambda: a2tg.Renderer(some_gaussians(), CAMERA), "rule must be an AppearanceRule; got Camera"),
+        (lambda: a2tg.resize_camera(CAMERA, 0, 12), "width must be an int, at least 1; got 0"),
+        (lambda: a2tg.resize_camera(CAMERA, 16, np.nan), "height must be an int, at least 1; got nan"),
+        (lambda: a2tg.resize_camera(CAMERA, 16, 12.0), "height must be an int, at least 1; got 12.0"),
+        (lambda: a2tg.smooth_path([CAMERA, CAMERA], "5"), "num_frames must be an int, at least 0; got '5'"),
+        (lambda: a2tg.photometric_loss(OUTPUT, IMAGE), "image must be an array; got RenderOutput: say output.color"),
+        (lambda: a2tg.photometric_loss(IMAGE, VIEW), "target must be an array; got View: say view_image(view)"),
+        (lambda: a2tg.photometric_loss(IMAGE, IMAGE, ssim_weight=2), "ssim_weight must be at least 0 and at most 1"),
+        (lambda: a2tg.ssim(None, IMAGE), "image must be an array; got NoneType"),
+        (lambda: a2tg.normal_consistency(IMAGE, MAP, MAP, VIEW), "camera must be a Camera; got View: use view.camera"),
+        (lambda: a2tg.normal_consistency(None, MAP, MAP, CAMERA), "normal must be [12, 16, 3]; got NoneType"),
+        (lambda: a2tg.parameter_bytes(a2tg.Model(some_gaussians())), "got Model: say model.num_bytes"),
+        (lambda: a2tg.parameter_bytes(some_gaussians(), TEXTURES), "layout must be an AtlasLayout; got Textures"),
+        (lambda: a2tg.view_image(CAMERA), "view must be a View; got Camera"),
+        (
+            lambda: a2tg.view_gradients(lambda m, o: 0.0, some_gaussians(), CAMERA),
+            "got Gaussians: say Model(gaussians)",
+        ),
+        (lambda: a2tg.shrink_textures(some_gaussians(), [VIEW]), "got Gaussians: say Model(gaussians)"),
+        (lambda: a2tg.align_poses(CAMERA, some_gaussians()), "got Camera: say align_poses(scene.test, model)"),
+        (lambda: a2tg.adam_update(IMAGE, IMAGE, None, 0.1), "state must be an AdamState; got NoneType: say adam_init"),
+        (
+            lambda: a2tg.adam_update(IMAGE, IMAGE, a2tg.adam_init(IMAGE), 0.1, b1=1.0),
+            "b1 must be at least 0 and below 1",
+        ),
+        (lambda: a2tg.exponential_decay("1", 0.1, 3, 10), "start must be a number; got '1'"),
+        (lambda: a2tg.exponential_decay(1.0, 0.0, 3, 10), "final_factor must be above 0; got 0.0"),
+        (lambda: a2tg.exponential_decay(1.0, 0.1, None, 10), "iteration must be a number; got None"),
+        (lambda: a2tg.color_fit(IMAGE, IMAGE[:5]), "target must be [12, 16, 3]; got [5, 16, 3]"),
+        (lambda: a2tg.color_fit(IMAGE, IMAGE, np.ones((12, 16), int)), "mask must be bools; got int64"),
+        (lambda: a2tg.transform_gaussians(some_gaussians(), np.eye(4)), "similarity must be a Similarity; got ndarray"),
     ],
 )
 def test_the_error_names_argument_wanted_and_actual(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()
+
+
+INTRINSICS = {
+    "not finite": CAMERA.K.at[0, 2].set(jnp.nan),
+    "focal length of 0": CAMERA.K.at[1, 1].set(0.0),
+    "negative focal length": CAMERA.K.at[1, 1].multiply(-1),
+    "transposed": CAMERA.K.T,
+    "scaled": 2 * CAMERA.K,
+}
+
+
+@pytest.mark.parametrize("K", INTRINSICS.values(), ids=INTRINSICS)
+def test_intrinsics_of_a_wrong_form_are_refused_outside_jit(K):
+    camera = dataclasses.replace(CAMERA, K=K)
+    with pytest.raises(ValueError, match=re.escape("camera.K must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pix")):
+        a2tg.render_image(some_gaussians(), camera)
+    jax.eval_shape(lambda camera: a2tg.render_image(some_gaussians(), camera, settings=SETTINGS), camera)
+
+
+def test_intrinsics_may_be_skewed_and_drift():
+    check_camera(dataclasses.replace(CAMERA, K=CAMERA.K.at[0, 1].set(3.0).at[1, 0].set(1e-3).at[2, 2].set(1.001)))
+
+
+def test_numbers_within_limits_pass_whatever_their_kind():
+    for value in (1, 1.0, np.float32(1), jnp.float32(1), np.ones((), int)):
+        check_number("x", value, least=0, most=1)
+    assert jax.jit(lambda x: check_number("x", x, above=5) or x)(1.0) == 1
+    for value in (True, "1", None, np.ones(1), np.nan, 2, 1j):
+        with pytest.raises(ValueError, match=r"^x must be at least 0 and at most 1; got "):
+            check_number("x", value, least=0, most=1)
+
+
+def test_gaussians_are_not_iterated_without_an_end():
+    with pytest.raises(TypeError, match="'Gaussians' object is not iterable"):
+        list(some_gaussians())
 
 
 def test_an_image_goes_behind_the_splats_as_the_error_says():

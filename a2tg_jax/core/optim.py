@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_shape
 
 with warnings.catch_warnings():
     # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
@@ -40,7 +40,11 @@ def adam_init(params: Any) -> AdamState:
 
     Args:
       params: any pytree of float arrays.
+
+    Raises:
+      ValueError: if a leaf holds no floats, naming it.
     """
+    _check_floats(params)
     zeros = jax.tree.map(jnp.zeros_like, params)
     return AdamState(mu=zeros, nu=jax.tree.map(jnp.zeros_like, params), count=jnp.zeros((), jnp.int32))
 
@@ -64,8 +68,14 @@ def adam_update(
       jaxopt's `OptStep(params, state)`, the updated parameters and the `AdamState`.
 
     Raises:
-      ValueError: if gradients, moments or rates do not fit the parameters, naming the leaf.
+      ValueError: if parameters are not floats, gradients, moments or rates do not fit them, naming the leaf, or a
+        number is out of range.
     """
+    check_kind("state", state, AdamState, "say adam_init(params)")
+    for name, decay in (("b1", b1), ("b2", b2)):
+        check_number(name, decay, least=0, below=1)
+    check_number("eps", eps, above=0)
+    _check_floats(params)
     for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
         _check_like(name, tree, params)
     count = state.count + 1
@@ -95,9 +105,24 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
 
     Returns:
       A scalar of the default float dtype.
+
+    Raises:
+      ValueError: if an argument is no number, or one out of range.
     """
+    check_number("start", start)
+    check_number("final_factor", final_factor, above=0)
+    check_number("iteration", iteration)
+    check_number("total", total, least=1)
     progress = jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) / total, 0.0, 1.0)
     return start * jnp.exp(math.log(final_factor) * progress)
+
+
+def _check_floats(params: Any) -> None:
+    """Raise ValueError, naming the leaf, unless all leaves of the parameters are arrays of floats."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        name = f"params{jax.tree_util.keystr(path)}"
+        check_array(name, leaf)
+        check_floats(name, leaf, leaf.shape)
 
 
 def _check_like(name: str, tree: Any, params: Any) -> None:

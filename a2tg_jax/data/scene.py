@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_kind, check_shape
 from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, in_bytes, png
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity
@@ -188,11 +189,16 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
 
     Returns:
       [H, W, 3] float32 in [0, 1].
+
+    Raises:
+      ValueError: if it is no view, or the background is neither a colour nor an image of the view's size.
     """
+    check_kind("view", view, View)
     pixels = view.picture.read()
     color = pixels[..., :3].astype(np.float32) / np.float32(255)
     if not view.has_alpha:
         return color
+    check_shape("background", background, color.shape if np.ndim(background) == 3 else (3,))
     alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
     composed: np.ndarray = alpha * color + (1 - alpha) * np.asarray(background, np.float32)
     return composed

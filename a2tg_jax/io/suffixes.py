@@ -4,10 +4,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.core.checks import check_kind
-from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
-from a2tg_jax.model import Model
+from a2tg_jax.model import check_model
 
 FORMATS = {
     ".npz": "model", ".a2tgz": "compact", ".ply": "ply", ".glb": "gltf", ".gltf": "gltf",
@@ -31,4 +29,4 @@ def check_suffix(path: str | os.PathLike[str], function: str) -> None:
 def check_saved(path: str | os.PathLike[str], model: Any, function: str) -> None:
     """Raise ValueError unless a value is a model, and the suffix is not that of another format."""
     check_suffix(path, function)
-    check_kind("model", model, Model, "say Model(gaussians)" if isinstance(model, Gaussians) else "")
+    check_model(model)

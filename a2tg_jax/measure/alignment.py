@@ -16,12 +16,14 @@ from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_mask, check_shape
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import View, view_image
-from a2tg_jax.model import Model
+from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.model import Model, check_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
@@ -45,9 +47,19 @@ def color_fit(image: Any, target: Any, mask: Any = None) -> np.ndarray:
 
     Returns:
       float64. Where an image of few colours leaves it open, the smallest such numbers.
+
+    Raises:
+      ValueError: if the shapes differ, the mask holds no bools, or a colour that counts is not finite.
     """
+    check_shape("image", image, ("H", "W", 3))
+    check_shape("target", target, np.shape(image))
+    if mask is not None:
+        check_mask("mask", mask, np.shape(image)[:2])
     counts = np.ones(np.shape(image)[:2], bool) if mask is None else np.asarray(mask)
     colors, wanted = np.asarray(image, np.float64)[counts], np.asarray(target, np.float64)[counts]
+    for name, values in (("image", colors), ("target", wanted)):
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite where its pixels count; it has NaN or infinite colours")
     inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
     affine: np.ndarray = np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
     return affine
@@ -72,7 +84,12 @@ def align_poses(
       background: [3] colour; None is the model's own.
       settings: all but the capacity, which is found.
       num_steps: of Adam.
+
+    Raises:
+      ValueError: if an argument is of another kind, or there are no views.
     """
+    check_are_views(views, "align_poses(scene.test, model)")
+    check_model(model)
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
     cameras = [view.camera for view in views]

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.checks import check_kind, check_shape
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.npz import read_npz
@@ -118,15 +118,21 @@ def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> 
     Args:
       gaussians: the live Gaussians only.
       layout: of their textures; None when there are none.
+
+    Raises:
+      ValueError: if one is of another kind.
     """
+    check_kind("gaussians", gaussians, Gaussians, "say model.num_bytes" if hasattr(gaussians, "num_bytes") else "")
+    if layout is not None:
+        check_kind("layout", layout, AtlasLayout)
     texels = 0 if layout is None else layout.num_texels
     return BYTES_PER_FLOAT * gaussians.floats_per_row * gaussians.num + BYTES_PER_TEXEL * texels
 
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    image, target = jnp.asarray(image), jnp.asarray(target)
     losses.check_same_shape(image, target)
+    image, target = jnp.asarray(image), jnp.asarray(target)
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
         return image, target

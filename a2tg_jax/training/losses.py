@@ -3,12 +3,14 @@
 Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would kill the gradient where it is needed.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_floats, check_shape
+from a2tg_jax.core.cameras import Camera, check_is_camera
+from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import normalize, safe_divide
 from a2tg_jax.rasterize.kernels import windows
@@ -32,12 +34,14 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
       ssim_weight: w in [0, 1].
 
     Raises:
-      ValueError: if the shapes differ, or as `mean_ssim` does.
+      ValueError: if one is no image, the shapes differ, the weight is out of range, or as `mean_ssim` does.
     """
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
-    if isinstance(ssim_weight, (int, float)) and ssim_weight == 0:
-        return l1
+    if not isinstance(ssim_weight, Array):
+        check_number("ssim_weight", ssim_weight, least=0, most=1)
+        if ssim_weight == 0:
+            return l1
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - mean_ssim(image, target))
 
 
@@ -100,6 +104,7 @@ def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera
     Raises:
       ValueError: if an image is not of the camera's size.
     """
+    check_is_camera(camera)
     size = camera.height, camera.width
     check_floats("normal", normal, (*size, 3))
     check_floats("depth", depth, size)
@@ -124,6 +129,7 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
     Raises:
       ValueError: if an image is not of the camera's size.
     """
+    check_is_camera(camera)
     check_floats("depth", depth, (camera.height, camera.width))
     check_shape("is_valid", is_valid, depth.shape)
     if camera.rays is not None:
@@ -152,10 +158,19 @@ def mean_scale(gaussians: Gaussians, num_live: Array | int) -> Array:
 
 def check_same_shape(image: Array, target: Array) -> None:
     """Raise ValueError unless both are floats [H, W, 3] of one shape."""
+    for name, value in (("image", image), ("target", target)):
+        check_array(name, value, _hint(value))
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
     if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):
         raise ValueError(f"image and target must be floats in [0, 1]; got {image.dtype} and {target.dtype}")
+
+
+def _hint(value: Any) -> str:
+    """Return what to say in place of a value that is no image, if it has one."""
+    if hasattr(value, "color"):
+        return "say output.color"
+    return "say view_image(view)" if hasattr(value, "picture") else ""
 
 
 def _live_mean(values: Array, num_live: Array | int) -> Array:
