@@ -116,6 +116,13 @@ def test_gaussians_of_checkpoints(tmp_path, kind):
     assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians())
 
 
+def test_coefficients_above_degree_3_are_left_out_with_a_warning(tmp_path):
+    more = Tensor(np.concatenate([some_gaussians().sh[:, 1:], np.ones((7, 9, 3))], axis=1))
+    write_checkpoint(tmp_path / "a.pt", {"splats": {**tensors(), "shN": more}})
+    with pytest.warns(UserWarning, match="has SH of degree 4; degree 3 is read"):
+        assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians())
+
+
 class Harm:
     def __reduce__(self):
         return os.system, ("touch harmed",)

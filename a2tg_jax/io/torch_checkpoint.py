@@ -27,6 +27,7 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.flattening import flattened
+from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
@@ -47,6 +48,8 @@ NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_
 TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacities": 6}
 """Places of the parameters in the tuple that 3DGS and 2DGS save."""
 TUPLE_LENGTH = 12
+COEFFICIENTS = (1, 4, 9, 16, 25)
+"""Numbers of coefficients by degree of the spherical harmonics; gsplat trains degree 4, too."""
 
 
 def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
@@ -70,7 +73,7 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
             reason = shortened(str(error) or type(error).__name__, 200)
             raise ValueError(f"{path}: is no checkpoint of PyTorch 1.6 or newer, or is damaged ({reason})") from error
     try:
-        gaussians = _gaussians_of(_fields_of(arrays), path)
+        gaussians = _gaussians_of(_fields_of(arrays, path), path)
         check_model(Model(gaussians))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -229,8 +232,8 @@ def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray
     return np.array(np.lib.stride_tricks.as_strided(flat[tensor.offset :], size, strides), np.float32)
 
 
-def _fields_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return means, quats, scales, opacities and SH [N, K, 3]. Raises ValueError if the shapes disagree."""
+def _fields_of(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
+    """Return means, quats, scales, opacities and SH to degree 3 [N, K, 3]. Raises ValueError if the shapes disagree."""
     num = len(arrays["means"])
     first = arrays["sh0"].reshape(num, 1, 3)
     rest = arrays.get("shN")
@@ -238,9 +241,11 @@ def _fields_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     shapes = {"means": (num, 3), "quats": (num, 4), "scales": (num, arrays["scales"].shape[-1]), "opacities": (num,)}
     fields = {name: arrays[name].reshape(shape) for name, shape in shapes.items()}
     sh = np.concatenate([first, rest], axis=1)
-    if sh.shape[1] not in (1, 4, 9, 16) or fields["scales"].shape[1] not in (2, 3):
-        raise ValueError(f"has {sh.shape[1]} coefficients and {fields['scales'].shape[1]} scales of each Gaussian")
-    return {**fields, "sh": sh}
+    if sh.shape[1] not in COEFFICIENTS or fields["scales"].shape[1] not in (2, 3):
+        found = f"{sh.shape[1]} coefficients and {fields['scales'].shape[1]} scales of each Gaussian"
+        raise ValueError(f"has {found}; SH of degree 0 to 4 have 1, 4, 9, 16 or 25, and Gaussians 2 or 3 scales")
+    degree = degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))
+    return {**fields, "sh": sh[:, : COEFFICIENTS[degree]]}
 
 
 def _gaussians_of(fields: Mapping[str, np.ndarray], path: Path) -> Gaussians:
