@@ -53,7 +53,7 @@ LONGEST_ERROR = 1000
 SMALLER = {
     "train": LESS_MEMORY,
     "render": "lower --size or --supersample",
-    "mesh": "lower --resolution, --radius or --texture-size",
+    "mesh": "lower --resolution, --radius, --max-memory or --texture-size",
 }
 """Advice by command for a lack of memory; other commands say "close other programs"."""
 OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]

@@ -35,7 +35,6 @@ GRID_SHARE = 0.5
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
 GRID_FULL = "lower --resolution or --radius, or raise --max-memory"
-NO_MEMORY = "lower --resolution, --radius or --max-memory"
 NO_SURFACE = "give a larger --radius, or --unbounded"
 SMALL_PARTS = "raise --resolution or lower --voxel, or train longer or from more views"
 """Advice of the command line, by what went wrong."""
@@ -167,8 +166,6 @@ def _extracted(source: Source, options: MeshOptions) -> MeshResult:
         raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
     except NoSurfaceError as error:
         raise ValueError(f"{error.told(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
-    except MemoryError:
-        raise ValueError(f"the memory does not suffice: {NO_MEMORY}") from None
 
 
 def _summary(result: MeshResult, mesh: Mesh, scale: float, files: list[Path], seconds: float) -> str:
