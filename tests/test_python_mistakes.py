@@ -179,10 +179,10 @@ KINDS = {
     "texture must be a TextureConfig; got dict: say TextureConfig(cap=8)": lambda: a2tg.A2tg(
         texture={"cap": 8}
     ).check(),
-    "background must be Literal['black', 'white', 'random']; got 'grey'": lambda: a2tg.fit(
+    "background must be one of black, white, random; got 'grey'": lambda: a2tg.fit(
         scene(), a2tg.A2tg(background="grey")
     ),
-    "corrections.exposure_kind must be Literal[": lambda: a2tg.A2tg(
+    "corrections.exposure_kind must be one of ": lambda: a2tg.A2tg(
         corrections=CorrectionConfig(exposure_kind="foo")
     ).check(),
     "batch_size must be int; got '4'": lambda: a2tg.A2tg(batch_size="4").check(),
@@ -200,9 +200,9 @@ def moved(**changes) -> a2tg.Model:
 
 
 VALUES = {
-    "num must be an integer of at least 2; got 3.5": lambda: started(num=3.5),
-    "num must be an integer of at least 2; got True": lambda: started(num=True),
-    "sh_degree must be an integer in 0..3; got 4": lambda: started(sh_degree=4),
+    "num must be an int, at least 2; got 3.5": lambda: started(num=3.5),
+    "num must be an int, at least 2; got True": lambda: started(num=True),
+    "sh_degree must be an int, 0 to 3; got 4": lambda: started(sh_degree=4),
     "opacity must be a number between 0 and 1, both excluded; got 1.0": lambda: started(opacity=1.0),
     "opacity must be a number between 0 and 1, both excluded; got '0.1'": lambda: started(opacity="0.1"),
     "similarity must have a positive scale": lambda: moved(scale=0.0),

@@ -97,12 +97,6 @@ def kind_of(value: Any) -> str:
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
-def check_array(name: str, x: Any, use: str) -> None:
-    """Raise ValueError, which says what to use, if x is a list or a tuple."""
-    if isinstance(x, list | tuple):
-        raise ValueError(f"{name} must be an array; got {type(x).__name__}: use {use}")
-
-
 def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     """Raise ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
 
@@ -114,7 +108,7 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     shape = np.shape(x)
     if len(shape) != len(wanted) or not _fits(shape, wanted):
         is_array = hasattr(x, "shape") or isinstance(x, numbers.Number | list | tuple)
-        raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape) if is_array else _kind_of(x)}")
+        raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape) if is_array else kind_of(x)}")
 
 
 def check_floats(name: str, x: Any, wanted: Wanted) -> None:

@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.checks import FLOATS, check_floats, check_integer, dtype_of, short_repr
+from a2tg_jax.core.checks import FLOATS, check_floats, check_int, dtype_of, short_repr
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
@@ -167,8 +167,8 @@ def init_from_points(
       ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, colours are an array
         of integers or outside [0, 1], or another argument is outside its range.
     """
-    check_integer("num", 2 if num is None else num, 2)
-    check_integer("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
+    check_int("num", 2 if num is None else num, 2)
+    check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
     if not isinstance(opacity, float | np.floating) or not 0 < opacity < 1:
         raise ValueError(f"opacity must be a number between 0 and 1, both excluded; got {opacity!r}")
     check_unit_colors("colors", colors)

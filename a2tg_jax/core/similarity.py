@@ -48,7 +48,7 @@ def check_similarity(similarity: Similarity, what: str) -> None:
     """Raise ValueError, naming it `what`, unless scale is positive, rotation is a rotation, and all is finite."""
     check_kind(what, similarity, Similarity)
     for name, wanted in ("rotation", (3, 3)), ("translation", (3,)):
-        check_array(f"{what}.{name}", getattr(similarity, name), "np.asarray")
+        check_array(f"{what}.{name}", getattr(similarity, name), "use np.asarray")
         check_shape(f"{what}.{name}", getattr(similarity, name), wanted)
     scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
     if not (1 / LARGEST_NUMBER <= scale <= LARGEST_NUMBER and (np.abs(translation) <= LARGEST_NUMBER).all()):
