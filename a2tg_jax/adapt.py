@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from a2tg_jax.appearance.texel_moves import Move, moved_texels, plan_moves
 from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_int, check_literal, check_mask, check_number, check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
@@ -355,14 +356,14 @@ def reallocate(
     new_sizes = checked_sizes(new_sizes, "new_sizes")
     check_shape("new_sizes", new_sizes, (layout.num, 2))
     new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket, room=room)
-    texel_moves = moment_moves = _plan_moves(layout, new_layout)
+    texel_moves = moment_moves = plan_moves(layout, new_layout)
     if kept is not None:
         check_mask("kept", kept, (layout.num,))
-        moment_moves = _plan_moves(layout, new_layout, np.asarray(kept))
+        moment_moves = plan_moves(layout, new_layout, np.asarray(kept))
     shapes = [(capacity, *size, 4) for capacity, size in zip(capacities, new_layout.resolutions, strict=True)]
 
-    def rebuild(tree: Textures, moves: list[_Move], padding: tuple[float, ...]) -> Textures:
-        buckets = _moved_texels(tree, shapes, moves, padding)
+    def rebuild(tree: Textures, moves: list[Move], padding: tuple[float, ...]) -> Textures:
+        buckets = moved_texels(tree, shapes, moves, padding)
         return Textures(tuple(placed_like(bucket, layout.bucket) for bucket in buckets))
 
     def rebuild_moments(leaf: Any) -> Any:
@@ -373,54 +374,6 @@ def reallocate(
 
     moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
     return ReallocateResult(rebuild(textures, texel_moves, NEUTRAL_TEXEL), new_layout, moments)
-
-
-class _Move(NamedTuple):
-    """Textures that go from one bucket to another."""
-
-    old_bucket: int
-    new_bucket: int
-    old_rows: np.ndarray
-    new_rows: np.ndarray
-
-
-def _plan_moves(old: AtlasLayout, new: AtlasLayout, is_moved: np.ndarray | None = None) -> list[_Move]:
-    """Return one move for each pair of buckets that some Gaussian, among the marked ones [N] if given, connects."""
-    chosen = slice(None) if is_moved is None else is_moved
-    num_new = len(new.resolutions)
-    pairs = on_host(old.bucket)[chosen].astype(np.int64) * num_new + on_host(new.bucket)[chosen]
-    order = np.argsort(pairs, kind="stable")
-    codes, starts = np.unique(pairs[order], return_index=True)
-    old_rows, new_rows = on_host(old.row)[chosen][order], on_host(new.row)[chosen][order]
-    stops = [*starts[1:], len(order)][: len(starts)]
-    return [
-        _Move(int(code) // num_new, int(code) % num_new, old_rows[start:stop], new_rows[start:stop])
-        for code, start, stop in zip(codes, starts, stops, strict=True)
-    ]
-
-
-def _moved_texels(
-    old: Textures, shapes: Sequence[tuple[int, ...]], moves: list[_Move], padding: tuple[float, ...]
-) -> list[np.ndarray]:
-    """Return new buckets of these shapes, filled with `padding` and then with the moved texels.
-
-    Each old bucket is read once, one after the other.
-    """
-    dtype = old.buckets[0].dtype if old.buckets else np.float32
-    targets = [np.broadcast_to(np.asarray(padding, dtype), shape).copy() for shape in shapes]
-    for index, bucket in enumerate(old.buckets):
-        own = [move for move in moves if move.old_bucket == index]
-        source = on_host(bucket) if own and bucket.size else np.zeros(0)
-        for move in own if source.size else ():
-            target = targets[move.new_bucket]
-            v, u = (_nearest(source.shape[axis], target.shape[axis]) for axis in (1, 2))
-            target[move.new_rows] = source[np.ix_(move.old_rows, v, u)]
-    return targets
-
-
-def _nearest(old: int, new: int) -> np.ndarray:
-    """Return [new] indices of the old texels nearest to the new ones along a side, ⌊(j + 1/2)·old/new⌋, in integers."""
-    return (2 * np.arange(new) + 1) * old // (2 * new)
 
 
 def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: float) -> np.ndarray:
