@@ -144,7 +144,7 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.RenderSettings(tile_size=8.0), "tile_size must be an int, 1 to 64; got 8.0"),
         (lambda: a2tg.RenderSettings(sh_degree=7), "sh_degree must be an int, 0 to 3; got 7"),
         (lambda: a2tg.RenderSettings(tile_batch=-1), "tile_batch must be an int, at least 0, or None; got -1"),
-        (lambda: a2tg.RenderSettings(near_plane="1"), "near_plane must be above 0; got '1'"),
+        (lambda: a2tg.RenderSettings(near_plane="1"), "near_plane must be a number above 0; got '1'"),
         (lambda: a2tg.plan_render(CAMERA, some_gaussians()), "gaussians must be a Model or Gaussians; got Camera"),
         (lambda: a2tg.plan_render(some_gaussians(), None), "cameras must be a Camera or an Iterable; got NoneType"),
         (lambda: a2tg.plan_render(some_gaussians(), [VIEW]), "cameras[0] must be a Camera; got View: use view.camera"),
@@ -152,7 +152,7 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.resize_camera(CAMERA, 0, 12), "width must be an int, at least 1; got 0"),
         (lambda: a2tg.resize_camera(CAMERA, 16, np.nan), "height must be an int, at least 1; got nan"),
         (lambda: a2tg.resize_camera(CAMERA, 16, 12.0), "height must be an int, at least 1; got 12.0"),
-        (lambda: a2tg.smooth_path([CAMERA, CAMERA], "5"), "num_frames must be an int, at least 0; got '5'"),
+        (lambda: a2tg.smooth_path([CAMERA, CAMERA], "5"), "num_frames must be an int, at least 1; got '5'"),
         (lambda: a2tg.photometric_loss(OUTPUT, IMAGE), "image must be an array; got RenderOutput: say output.color"),
         (lambda: a2tg.photometric_loss(IMAGE, VIEW), "target must be an array; got View: say view_image(view)"),
         (lambda: a2tg.photometric_loss(IMAGE, IMAGE, ssim_weight=2), "ssim_weight must be at least 0 and at most 1"),
@@ -173,9 +173,12 @@ def adam(params, grads, rates=0.1):
             lambda: a2tg.adam_update(IMAGE, IMAGE, a2tg.adam_init(IMAGE), 0.1, b1=1.0),
             "b1 must be at least 0 and below 1",
         ),
-        (lambda: a2tg.exponential_decay("1", 0.1, 3, 10), "start must be a number; got '1'"),
+        (lambda: a2tg.exponential_decay("1", 0.1, 3, 10), "start must be a number, or an array of numbers; got "),
         (lambda: a2tg.exponential_decay(1.0, 0.0, 3, 10), "final_factor must be above 0; got 0.0"),
-        (lambda: a2tg.exponential_decay(1.0, 0.1, None, 10), "iteration must be a number; got None"),
+        (
+            lambda: a2tg.exponential_decay(1.0, 0.1, None, 10),
+            "iteration must be a number, or an array",
+        ),
         (lambda: a2tg.color_fit(IMAGE, IMAGE[:5]), "target must be [12, 16, 3]; got [5, 16, 3]"),
         (lambda: a2tg.color_fit(IMAGE, IMAGE, np.ones((12, 16), int)), "mask must be bools; got int64"),
         (lambda: a2tg.transform_gaussians(some_gaussians(), np.eye(4)), "similarity must be a Similarity; got ndarray"),
@@ -212,8 +215,18 @@ def test_numbers_within_limits_pass_whatever_their_kind():
         check_number("x", value, least=0, most=1)
     assert jax.jit(lambda x: check_number("x", x, above=5) or x)(1.0) == 1
     for value in (True, "1", None, np.ones(1), np.nan, 2, 1j):
-        with pytest.raises(ValueError, match=r"^x must be at least 0 and at most 1; got "):
+        with pytest.raises(ValueError, match=r"^x must be (a number )?at least 0 and at most 1; got "):
             check_number("x", value, least=0, most=1)
+
+
+def test_schedules_are_computed_for_many_iterations_at_once():
+    rates = a2tg.exponential_decay(jnp.ones(3), 0.01, jnp.array([0, 5, 10]), 10)
+    np.testing.assert_allclose(rates, [1, 0.1, 0.01], rtol=1e-6)
+
+
+def test_metrics_take_nested_lists():
+    image = np.full((12, 12, 3), 0.25, np.float32)
+    assert float(a2tg.psnr(image.tolist(), image + np.float32(0.1))) == pytest.approx(20, abs=1e-4)
 
 
 def test_gaussians_are_not_iterated_without_an_end():

@@ -98,9 +98,9 @@ def test_one_view_stands_still_and_equal_views_do_no_harm():
     assert path_through([view], 3) == [view] * 3
     still = path_through([view, view, view], 4)
     np.testing.assert_allclose(still[2].viewmat, view.viewmat, atol=1e-5)
-    with pytest.raises(ValueError, match="a path needs a view and a frame"):
+    with pytest.raises(ValueError, match="a path needs a view; got none"):
         path_through([], 3)
-    with pytest.raises(ValueError, match="a path needs a view and a frame"):
+    with pytest.raises(ValueError, match="num_frames must be an int, at least 1; got 0"):
         path_through([view], 0)
 
 

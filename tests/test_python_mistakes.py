@@ -203,8 +203,8 @@ VALUES = {
     "num must be an int, at least 2; got 3.5": lambda: started(num=3.5),
     "num must be an int, at least 2; got True": lambda: started(num=True),
     "sh_degree must be an int, 0 to 3; got 4": lambda: started(sh_degree=4),
-    "opacity must be a number between 0 and 1, both excluded; got 1.0": lambda: started(opacity=1.0),
-    "opacity must be a number between 0 and 1, both excluded; got '0.1'": lambda: started(opacity="0.1"),
+    "opacity must be above 0 and below 1; got 1.0": lambda: started(opacity=1.0),
+    "opacity must be a number above 0 and below 1; got '0.1'": lambda: started(opacity="0.1"),
     "similarity must have a positive scale": lambda: moved(scale=0.0),
     "similarity must have a rotation; got [[-1.0": lambda: moved(rotation=-np.eye(3)),
     "similarity.rotation must be [3, 3]; got [4, 4]": lambda: moved(rotation=np.eye(4)),
@@ -214,7 +214,9 @@ VALUES = {
     ).render(CAMERA),
     "Plain has no textures to replace: a model with textures is Model(gaussians, textures, layout, appearance="
     "Textured())": lambda: MODEL.with_textures(TEXTURES, LAYOUT),
-    "Plain has no degrees per Gaussian to replace: let Banded(appearance).allocate": lambda: MODEL.with_bands(*SPLIT),
+    "Plain has no degrees per Gaussian to replace: say shown = Banded(appearance), params, ": lambda: MODEL.with_bands(
+        *SPLIT
+    ),
     "Plain has no shapes of kernels to replace": lambda: MODEL.appearance.with_shapes((), jnp.zeros(7)),
 }
 SPLIT = split_sh(np.asarray(GAUSSIANS.sh), np.full(GAUSSIANS.num, 3), 0)
@@ -245,8 +247,18 @@ def test_an_appearance_without_its_parameters_is_refused_where_they_are_needed(a
         calls.get(needs, lambda model: getattr(model, needs))(model)
 
 
-def test_numbers_of_numpy_are_options():
-    a2tg.A2tg(seed=np.int64(3), initial_opacity=np.float32(0.2)).check()
+def test_numbers_of_numpy_and_jax_are_options():
+    times = np.float32(0.25), 0.5
+    for at in (times, np.array(times)):
+        a2tg.A2tg(seed=np.int64(3), initial_opacity=jnp.float32(0.2), texture=a2tg.TextureConfig(upscale_at=at)).check()
+
+
+def test_options_without_resolvable_annotations_are_not_looked_at():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Own(a2tg.A2tg):
+        table: "OnlyInThisFunction" = ()  # type: ignore[name-defined] # noqa: F821
+
+    Own().check()
 
 
 def test_a_class_that_was_defined_anew_is_told_from_the_one_before():

@@ -51,7 +51,7 @@ def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministi
     monkeypatch.setattr(choice, "has_native", lambda: False)
     monkeypatch.setattr(choice, "has_cuda", lambda: True)
     monkeypatch.setenv("XLA_FLAGS", flags)
-    assert choice.choose("auto", 8) == compositor and choice.choose("cuda", 8) == "cuda"
+    assert choice.choose("auto") == compositor and choice.choose("cuda") == "cuda"
 
 
 def test_what_may_change_bits_is_told():

@@ -127,10 +127,10 @@ RETURNED = {
     "stage 'own': Returning.apply: state must keep its structure": {"events": (Returning("state"),)},
     "stage 'own': Observing.observe must keep its structure": {"events": (Observing(),)},
     "stage 'own': OnHost.apply: the result must be a Change; got Model": {"events": (OnHost(),)},
-    "the loss function 'each_pixel' must return a scalar of floats, such as jnp.mean(…); got float32[16, 16, 3]": {
+    "the loss function 'each_pixel' must return a scalar, such as jnp.mean(…); got float32[16, 16, 3]": {
         "losses": (a2tg.Term(each_pixel),)
     },
-    "the loss function '<lambda>' must return a scalar of floats, such as jnp.mean(…); got None": {
+    "the loss function '<lambda>' must return a scalar, such as jnp.mean(…); got None": {
         "losses": (a2tg.Term(lambda *_: None),)
     },
     "depth was not rendered: say has_geometry=True, as in Term(function, has_geometry=True)": {
@@ -159,5 +159,6 @@ def test_depth_that_was_not_rendered_is_no_zero(scene):
     output = jax.eval_shape(lambda: shown(False))
     assert output.alpha.shape == (16, 16) and "normal=None" in repr(output)
     for name in ("depth", "normal", "distortion"):
+        assert not hasattr(output, name)
         with pytest.raises(ValueError, match=f"{name} was not rendered"):
             getattr(output, name)

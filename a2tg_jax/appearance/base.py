@@ -23,10 +23,14 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.texture import AtlasLayout, Textures
 
 WITH_TEXTURES = "a model with textures is Model(gaussians, textures, layout, appearance=Textured())"
-WITH_BANDS = (
-    "let Banded(appearance).allocate(key, gaussians) make its parameters and layout, and give all three to Model"
-)
-WITH_SHAPES = WITH_BANDS.replace("Banded", "Shaped")
+
+
+def _with_wrapper(name: str) -> str:
+    """Return how to make a model whose appearance is wrapped by the class of that name."""
+    return (
+        f"say shown = {name}(appearance), params, layout = shown.allocate(key, gaussians), and "
+        "Model(gaussians, params, layout, appearance=shown)"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +115,7 @@ class Appearance(MovableRows, StoredArrays):
         Raises:
           ValueError: if the appearance has no degrees per Gaussian.
         """
-        raise ValueError(f"{type(self).__name__} has no degrees per Gaussian to replace: {WITH_BANDS}")
+        raise ValueError(f"{type(self).__name__} has no degrees per Gaussian to replace: {_with_wrapper('Banded')}")
 
     def shapes(self, params: Any) -> Array | None:
         """Return the shapes [N] of the kernels; None if all are Gaussians."""
@@ -123,4 +127,4 @@ class Appearance(MovableRows, StoredArrays):
         Raises:
           ValueError: if the appearance has no shapes.
         """
-        raise ValueError(f"{type(self).__name__} has no shapes of kernels to replace: {WITH_SHAPES}")
+        raise ValueError(f"{type(self).__name__} has no shapes of kernels to replace: {_with_wrapper('Shaped')}")

@@ -113,13 +113,17 @@ def check_given(appearance: Any, params: Any) -> None:
         )
 
 
-@functools.cache
 def _has_parameters(appearance: Any) -> bool:
     """Return whether an appearance allocates parameters; False if that cannot be told without values."""
     try:
-        return str(jax.tree.structure(parameter_shapes(appearance)[0])) != str(jax.tree.structure(()))
-    except (TypeError, ValueError, AttributeError):
+        return _allocates(appearance)
+    except Exception:  # `allocate` of a class of one's own may raise anything, and a field may have no hash.
         return False
+
+
+@functools.lru_cache(maxsize=64)
+def _allocates(appearance: Any) -> bool:
+    return str(jax.tree.structure(parameter_shapes(appearance)[0])) != str(jax.tree.structure(()))
 
 
 def _name(path: tuple[Any, ...]) -> str:

@@ -100,8 +100,11 @@ def checked_cameras(cameras: Any, name: str = "cameras") -> list[Camera]:
     if isinstance(cameras, Camera):
         check_camera(cameras, name)
         return [cameras]
-    check_kind(name, cameras, (Camera, Iterable), _hint(cameras))
-    several: list[Camera] = list(cameras)
+    try:
+        several: list[Camera] = list(cameras)
+    except TypeError:  # Sequences that only have __getitem__ are no Iterable, but can be listed.
+        check_kind(name, cameras, (Camera, Iterable), _hint(cameras))
+        raise
     for index, camera in enumerate(several):
         check_camera(camera, f"{name}[{index}]")
     return several

@@ -1,6 +1,7 @@
 """Checks of kinds, numbers, shapes and dtypes, with errors that name the argument; short texts for arrays.
 
-Checks of arrays read only `shape` and `dtype`, so that tracers pass and nothing is computed.
+Checks of arrays read only `shape` and `dtype`, so that tracers pass and nothing is computed. `check_number` reads the
+value of a scalar array that is no tracer.
 """
 
 import dataclasses
@@ -65,10 +66,18 @@ def check_number(
     is_array = hasattr(value, "dtype") and np.shape(value) == () and jnp.issubdtype(value.dtype, jnp.number)
     if is_array and isinstance(value, jax.core.Tracer):
         return
-    is_number = is_array or (isinstance(value, numbers.Real) and not isinstance(value, bool))
-    if not is_number or not _is_within(float(value), least, above, most, below):
-        found = described(value) if hasattr(value, "dtype") and not is_array else repr(value)
-        raise ValueError(f"{name} must be {wanted or 'a number'}; got {found}")
+    if not is_array and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
+        found = described(value) if hasattr(value, "dtype") else repr(value)
+        raise ValueError(f"{name} must be {f'a number {wanted}'.rstrip()}; got {found}")
+    if not _is_within(float(value), least, above, most, below):
+        raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
+
+
+def check_numeric(name: str, value: Any) -> None:
+    """Raise ValueError unless a value is a number or an array of numbers of any shape; none is read."""
+    is_array = hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.number)
+    if not is_array and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
+        raise ValueError(f"{name} must be a number, or an array of numbers; got {described(value)}")
 
 
 def _is_within(

@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.checks import FLOATS, check_floats, check_int, dtype_of, short_repr
+from a2tg_jax.core.checks import FLOATS, check_floats, check_int, check_number, dtype_of, short_repr
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
@@ -169,8 +169,7 @@ def init_from_points(
     """
     check_int("num", 2 if num is None else num, 2)
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
-    if not isinstance(opacity, float | np.floating) or not 0 < opacity < 1:
-        raise ValueError(f"opacity must be a number between 0 and 1, both excluded; got {opacity!r}")
+    check_number("opacity", opacity, above=0, below=1)
     check_unit_colors("colors", colors)
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_shape
+from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_numeric, check_shape
 
 with warnings.catch_warnings():
     # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
@@ -62,7 +62,7 @@ def adam_update(
         array that broadcasts against its leaf at equal rank ([1, K, 1] sets one per spherical harmonic).
       b1: decay of the first moment, in [0, 1).
       b2: decay of the second moment, in [0, 1).
-      eps: ε > 0.
+      eps: ε ≥ 0.
 
     Returns:
       jaxopt's `OptStep(params, state)`, the updated parameters and the `AdamState`.
@@ -74,7 +74,7 @@ def adam_update(
     check_kind("state", state, AdamState, "say adam_init(params)")
     for name, decay in (("b1", b1), ("b2", b2)):
         check_number(name, decay, least=0, below=1)
-    check_number("eps", eps, above=0)
+    check_number("eps", eps, least=0)
     _check_floats(params)
     for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
         _check_like(name, tree, params)
@@ -109,9 +109,9 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     Raises:
       ValueError: if an argument is no number, or one out of range.
     """
-    check_number("start", start)
+    check_numeric("start", start)
     check_number("final_factor", final_factor, above=0)
-    check_number("iteration", iteration)
+    check_numeric("iteration", iteration)
     check_number("total", total, least=1)
     progress = jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) / total, 0.0, 1.0)
     return start * jnp.exp(math.log(final_factor) * progress)

@@ -69,10 +69,10 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are fewer than two cameras or no frames.
     """
-    check_int("num_frames", num_frames, 0)
+    check_int("num_frames", num_frames, 1)
     _check_cameras("cameras", cameras)
-    if len(cameras) < 2 or num_frames < 1:
-        raise ValueError(f"a path needs two cameras and a frame; got {len(cameras)} cameras, {num_frames} frames")
+    if len(cameras) < 2:
+        raise ValueError(f"a path needs two cameras; got {len(cameras)}")
     viewmats = np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
     centers = camera_centers(viewmats)
     forwards, downs = viewmats[:, 2, :3], viewmats[:, 1, :3]
@@ -98,10 +98,10 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are no views or no frames.
     """
-    check_int("num_frames", num_frames, 0)
+    check_int("num_frames", num_frames, 1)
     _check_cameras("views", views)
-    if not views or num_frames < 1:
-        raise ValueError(f"a path needs a view and a frame; got {len(views)} views, {num_frames} frames")
+    if not views:
+        raise ValueError("a path needs a view; got none")
     first = views[0]
     views = [resize_camera(view, first.width, first.height) for view in views]
     if len(views) == 1:

@@ -47,9 +47,9 @@ class Similarity:
 def check_similarity(similarity: Similarity, what: str) -> None:
     """Raise ValueError, naming it `what`, unless scale is positive, rotation is a rotation, and all is finite."""
     check_kind(what, similarity, Similarity)
-    for name, wanted in ("rotation", (3, 3)), ("translation", (3,)):
-        check_array(f"{what}.{name}", getattr(similarity, name), "use np.asarray")
-        check_shape(f"{what}.{name}", getattr(similarity, name), wanted)
+    check_array(f"{what}.rotation", similarity.rotation, "use np.asarray")
+    check_shape(f"{what}.rotation", similarity.rotation, (3, 3))
+    check_shape(f"{what}.translation", similarity.translation, (3,))
     scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
     if not (1 / LARGEST_NUMBER <= scale <= LARGEST_NUMBER and (np.abs(translation) <= LARGEST_NUMBER).all()):
         raise ValueError(

@@ -196,9 +196,9 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
     check_kind("view", view, View)
     pixels = view.picture.read()
     color = pixels[..., :3].astype(np.float32) / np.float32(255)
+    check_shape("background", background, color.shape if np.ndim(background) == 3 else (3,))
     if not view.has_alpha:
         return color
-    check_shape("background", background, color.shape if np.ndim(background) == 3 else (3,))
     alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
     composed: np.ndarray = alpha * color + (1 - alpha) * np.asarray(background, np.float32)
     return composed

@@ -18,7 +18,7 @@ from a2tg_jax.data import View, view_image
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
 from a2tg_jax.io.quantise import Precision
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 
@@ -71,7 +71,7 @@ def loss_on_views(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
     """Return the PSNR that models lose against the given one, as a mean over the photographs of some views."""
-    check_model(model)
+    check_is_model(model)
     check_are_views(views, "loss_on_views(model, scene.train)")
     background = model.background if background is None else background
     draw = _drawing(model, [view.camera for view in views], background, settings)
@@ -96,7 +96,7 @@ def loss_beside_renders(
     10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR stands for.
     Uncorrelated errors add up this way.
     """
-    check_model(model)
+    check_is_model(model)
     draw = _drawing(model, cameras, model.background, settings)
     renders = list(draw(model))
     assumed_error = 10 ** (-assumed_psnr / 10)

@@ -26,7 +26,7 @@ from a2tg_jax.core.jit import Jitted
 from a2tg_jax.data import View
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
@@ -76,7 +76,7 @@ def _has_such_textures(appearance: Appearance) -> bool:
 
 
 def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
-    check_model(model)
+    check_is_model(model)
     check_are_views(views, "shrink_textures(model, scene.train)")
     if not views:
         raise ValueError("views must hold at least one view; got none")

@@ -6,8 +6,6 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-import numpy as np
-
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.host.text import did_you_mean, shortened
 
@@ -70,9 +68,13 @@ def changed_config(config: ConfigT, changes: Mapping[str, Any], where: str) -> C
 def check_config(config: Any, prefix: str = "") -> None:
     """Raise ValueError, naming the field, if a group, number, text or choice of a dataclass is of another type.
 
-    Fields of other types are not looked at.
+    Fields of other types are not looked at, nor dataclasses whose annotations cannot be resolved, such as those of a
+    class within a function.
     """
-    hints = typing.get_type_hints(type(config))
+    try:
+        hints = typing.get_type_hints(type(config))
+    except NameError:
+        return
     for field in dataclasses.fields(config):
         name, hint, value = prefix + field.name, hints[field.name], getattr(config, field.name)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
@@ -80,7 +82,14 @@ def check_config(config: Any, prefix: str = "") -> None:
             check_kind(name, value, hint, f"say {hint.__name__}({shortened(given)})")
             check_config(value, f"{name}.")
         elif _is_plain(hint):
-            _from_json(hint, value.item() if isinstance(value, np.generic) else _to_json(value), name)
+            _from_json(hint, _without_arrays(value), name)
+
+
+def _without_arrays(value: Any) -> Any:
+    """Return numbers, tuples and arrays of NumPy and JAX as JSON has them."""
+    if isinstance(value, tuple):
+        return [_without_arrays(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _is_plain(hint: Any) -> bool:

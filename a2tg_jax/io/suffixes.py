@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from a2tg_jax.host.text import shortened
-from a2tg_jax.model import check_model
+from a2tg_jax.model import check_is_model
 
 FORMATS = {
     ".npz": "model", ".a2tgz": "compact", ".ply": "ply", ".glb": "gltf", ".gltf": "gltf",
@@ -29,4 +29,4 @@ def check_suffix(path: str | os.PathLike[str], function: str) -> None:
 def check_saved(path: str | os.PathLike[str], model: Any, function: str) -> None:
     """Raise ValueError unless a value is a model, and the suffix is not that of another format."""
     check_suffix(path, function)
-    check_model(model)
+    check_is_model(model)

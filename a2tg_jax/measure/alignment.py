@@ -23,7 +23,7 @@ from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import View, view_image
 from a2tg_jax.data.scene import check_are_views
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
@@ -89,7 +89,7 @@ def align_poses(
       ValueError: if an argument is of another kind, or there are no views.
     """
     check_are_views(views, "align_poses(scene.test, model)")
-    check_model(model)
+    check_is_model(model)
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
     cameras = [view.camera for view in views]

@@ -131,14 +131,19 @@ def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> 
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
+    image, target = _converted(image), _converted(target)
     losses.check_same_shape(image, target)
-    image, target = jnp.asarray(image), jnp.asarray(target)
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
         return image, target
     check_shape("mask", mask, image.shape[:2])
     counts = jnp.asarray(mask)[..., None]
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
+
+
+def _converted(image: Any) -> Any:
+    """Return arrays of other libraries and nested lists as arrays of JAX, and all else as it is."""
+    return jnp.asarray(image) if hasattr(image, "__array__") or type(image) in (list, tuple) else image
 
 
 def _share_of_windows(mask: Array, dtype: Any) -> Array:

@@ -17,7 +17,7 @@ from a2tg_jax.mesh.fusion import fuse
 from a2tg_jax.mesh.marching import surface_of
 from a2tg_jax.mesh.space import RADII, Space, common_sphere
 from a2tg_jax.mesh.triangles import Mesh, largest_clusters
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 
@@ -120,7 +120,7 @@ def extract_mesh(
         memory than `max_bytes`, or if there is no surface within the radius.
     """
     start = time.perf_counter()
-    check_model(model)
+    check_is_model(model)
     cameras = training_cameras(model) if cameras is None else list(cameras)
     if not model.num or not cameras:
         what = "the model has no Gaussians" if not model.num else "there are no cameras"

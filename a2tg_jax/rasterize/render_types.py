@@ -77,11 +77,15 @@ class RenderSettings:
         return RenderSettings(texture=TextureOptions.official())
 
 
+class NotRenderedError(ValueError, AttributeError):
+    """Depth, normal or distortion of a render without geometry was read; for `hasattr` there is no such attribute."""
+
+
 class RenderOutput(NamedTuple):
     """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background.
 
     A render with `has_geometry=False` has None in place of depth, normal and distortion, and reading them raises
-    ValueError.
+    `NotRenderedError`, a ValueError.
     """
 
     color: Array
@@ -101,7 +105,7 @@ class RenderOutput(NamedTuple):
     def __getattribute__(self, name: str) -> Any:
         value = tuple.__getattribute__(self, name)
         if value is None and name in GEOMETRY:
-            raise ValueError(
+            raise NotRenderedError(
                 f"{name} was not rendered: say has_geometry=True, as in Term(function, has_geometry=True) for a loss "
                 "term of your own"
             )

@@ -14,7 +14,7 @@ from a2tg_jax.core.display import short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
-from a2tg_jax.model import Model, Parameters, check_model
+from a2tg_jax.model import Model, Parameters, check_is_model
 from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -78,7 +78,7 @@ def view_gradients(
         without a capacity.
     """
     check_literal("statistic", statistic, Statistic)
-    check_model(model)
+    check_is_model(model)
     background = model.background if background is None else background
     check_gaussians(model.gaussians, "model.gaussians")
     check_camera(camera)

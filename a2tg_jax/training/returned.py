@@ -16,10 +16,11 @@ from a2tg_jax.model import Model
 
 
 def check_scalar(name: str, value: Any) -> None:
-    """Raise ValueError unless what a loss function or term of that name returned is a scalar of floats."""
-    is_array = isinstance(value, float | np.ndarray | np.generic | jax.Array)
-    if not is_array or np.shape(value) != () or not jnp.issubdtype(dtype_of(value), jnp.floating):
-        raise ValueError(f"{name} must return a scalar of floats, such as jnp.mean(…); got {described(value)}")
+    """Raise ValueError unless what a loss function or term of that name returned is a real number."""
+    is_number = isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.shape(value) == ()
+    kind = dtype_of(value) if is_number else None
+    if kind is None or not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise ValueError(f"{name} must return a scalar, such as jnp.mean(…); got {described(value)}")
 
 
 def check_change(name: str, change: Any) -> None:
@@ -38,4 +39,9 @@ def check_kept(name: str, found: Any, wanted: Any) -> None:
     before, after = (str(jax.tree.structure(tree)) for tree in (wanted, found))
     if after != before:
         raise ValueError(f"{name} must keep its structure, {shortened(before)}; got {shortened(after)}")
-    check_like(name, jax.tree.map(jnp.asarray, found), wanted)
+    check_like(name, jax.tree.map(_shape_of, found), wanted)
+
+
+def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
+    """Return the shape and dtype that JAX gives a number or an array, which stays where it is."""
+    return jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.canonicalize_dtype(dtype_of(leaf)))

@@ -40,10 +40,11 @@ LossFunction = Callable[[Model, Target, RenderOutput], Array]
 class Term:
     """Function of model, target and render, times a weight.
 
-    def roughness(model, target, output):
-        return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
+    Example:
+        def roughness(model, target, output):
+            return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
 
-    Term(roughness, weight=0.1, has_geometry=True)
+        Term(roughness, weight=0.1, has_geometry=True)
     """
 
     function: LossFunction = static()

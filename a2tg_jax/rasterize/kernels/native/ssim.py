@@ -68,7 +68,7 @@ def _mean_score_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return the average, and its derivatives by x and y; XLA computes none that is not used."""
+    """Return the average, and its derivatives by x and y; under jit, XLA drops one that is not used."""
     value, (d_x_mean, d_y_mean, *d_products) = _score(score, x, y)
     share = jnp.full(1, 1 / _num_windows(score, x), x.dtype)
     name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
