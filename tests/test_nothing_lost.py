@@ -11,6 +11,8 @@ import signal
 import subprocess
 import sys
 import warnings
+from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +21,9 @@ import pytest
 
 from a2tg_jax import Change, StepEvent, event
 from a2tg_jax.cli import main as cli
-from a2tg_jax.host import signals
+from a2tg_jax.host import atomic, signals
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import this_machine
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results import preflight as checks
@@ -118,6 +121,52 @@ def test_a_write_deletes_old_partial_files_of_the_same_file(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"a.npz", young.name, other.name}
 
 
+@pytest.mark.parametrize("name", ["iterdir", "unlink"])
+def test_old_partial_files_that_stay_keep_nothing_from_being_written(tmp_path, monkeypatch, name):
+    """As another user's in a sticky folder, or any in a folder that cannot be listed."""
+    partial = tmp_path / ".a.npz.1.partial"
+    partial.touch()
+    os.utime(partial, (0, 0))
+    unlink = Path.unlink
+
+    def refuse(path=None, **_):
+        if name == "unlink" and path != partial:
+            return unlink(path, **_)
+        raise PermissionError(13, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, name, refuse)
+        for _ in range(2):
+            with replacing(tmp_path / "a.npz") as temporary:
+                temporary.touch()
+    assert {path.name for path in tmp_path.iterdir()} >= {"a.npz"}
+
+
+def test_many_writes_list_their_folder_once(tmp_path, monkeypatch):
+    listed, left_over = [], atomic.left_over
+    monkeypatch.setattr(atomic, "left_over", lambda folder: listed.append(folder) or left_over(folder))
+    for index in range(3):
+        with replacing(tmp_path / f"{index}.png") as temporary:
+            temporary.touch()
+    assert listed == [tmp_path]
+
+
+@pytest.mark.parametrize("filename", ["/", b"x.npz", 7, None, "/no/such/folder/x.npz", Path("x.npz")])
+@pytest.mark.parametrize("free", [0, 1 << 40, None])
+def test_a_full_disk_is_told_whatever_the_file(monkeypatch, filename, free):
+    def disk_usage(folder):
+        if free is None:
+            raise OSError(5, "Input/output error")
+        return SimpleNamespace(free=free)
+
+    monkeypatch.setattr(shutil, "disk_usage", disk_usage)
+    told = error_text(OSError(28, "No space left on device", filename), "")
+    state = {0: "full, 0.0 MB are free", 1 << 40: "full or has no inodes left, 1099511.6 MB are free", None: "full"}
+    is_named = isinstance(filename, str | Path)
+    start = f"{filename}: the disk is {state[free]}" if is_named else "the disk is full"
+    assert told == f"{start}: make room, or write to another disk"
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="/dev/full is Linux's")
 @pytest.mark.parametrize("is_ours", [True, False])
 def test_a_full_disk_is_told_with_the_file_and_what_to_do(tmp_path, monkeypatch, capsys, is_ours):
@@ -128,7 +177,11 @@ def test_a_full_disk_is_told_with_the_file_and_what_to_do(tmp_path, monkeypatch,
 
     monkeypatch.setattr(cli.Info, "run", write)
     assert cli.main(["info", "run"]) == 2
-    told = rf"{tmp_path / 'x.npz'}: the disk is full, \d+\.\d MB are free" if is_ours else "the disk is full"
+    told = (
+        rf"{tmp_path / 'x.npz'}: the disk is full( or has no inodes left)?, \d+\.\d MB are free"
+        if is_ours
+        else "the disk is full"
+    )
     error = capsys.readouterr().err
     assert re.fullmatch(f"a2tg: error: {told}: make room, or write to another disk\n", error)
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import functools
 import os
 import re
 import time
@@ -23,7 +24,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
-    folders are made. Partial files that killed processes left of the same file are deleted after an hour.
+    folders are made. Partial files that killed processes left of the same file are deleted after an hour; a process
+    looks for them once in a folder.
 
     Raises:
       OSError: as the block does. The error of a full disk names the file.
@@ -61,15 +63,19 @@ def left_over(folder: Path) -> dict[Path, Path]:
     return {entry: folder / match[1] for entry, match in names.items() if match}
 
 
+@functools.lru_cache(maxsize=64)
+def _left_over_once(folder: Path) -> dict[Path, Path]:
+    """Call `left_over` once per folder and process: folders of frames are long."""
+    return left_over(folder)
+
+
 def _drop_stale(path: Path) -> None:
-    """Delete the partial files of killed processes of one file."""
-    start = f".{path.name}."
-    for name in os.listdir(path.parent):
-        if name.startswith(start) and re.fullmatch(r"\d+\.partial", name.removeprefix(start)):
-            partial = path.with_name(name)
-            with contextlib.suppress(FileNotFoundError):  # Another process may delete it.
-                if time.time() - partial.stat().st_mtime > STALE_SECONDS:
-                    partial.unlink()
+    """Delete the partial files of killed processes of one file, if they can be found and deleted."""
+    path = path.absolute()
+    with contextlib.suppress(OSError):  # Another process may delete them, and another user's stay.
+        for partial, whole in _left_over_once(path.parent).items():
+            if whole == path and time.time() - partial.stat().st_mtime > STALE_SECONDS:
+                partial.unlink()
 
 
 def _flush(path: Path) -> None:

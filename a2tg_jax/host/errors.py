@@ -1,6 +1,8 @@
 """Errors that a user can do something about, and their texts."""
 
+import contextlib
 import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -8,6 +10,9 @@ import jax
 
 from a2tg_jax.host.atomic import NO_ROOM
 from a2tg_jax.host.text import shortened
+
+PLENTY = 1 << 30
+"""Free bytes above which a disk that takes no file may lack inodes."""
 
 
 def error_text(error: Exception, less_memory: str) -> str | None:
@@ -28,8 +33,18 @@ def error_text(error: Exception, less_memory: str) -> str | None:
 
 def _full_disk_text(error: OSError) -> str:
     """Return which file a disk has no room for, how much is free, and what to do."""
-    if error.filename is None:
-        return "the disk is full: make room, or write to another disk"
-    folder = next(above for above in Path(error.filename).absolute().parents if above.exists())
-    free = f", {shutil.disk_usage(folder).free / 1e6:.1f} MB are free" if error.errno == errno.ENOSPC else ""
-    return f"{error.filename}: the disk is full{free}: make room, or write to another disk"
+    state, advice = "the disk is full", "make room, or write to another disk"
+    if not isinstance(error.filename, str | os.PathLike):
+        return f"{state}: {advice}"
+    free = _free_bytes(Path(error.filename)) if error.errno == errno.ENOSPC else None
+    if free is not None:
+        state += f"{' or has no inodes left' if free > PLENTY else ''}, {free / 1e6:.1f} MB are free"
+    return f"{error.filename}: {state}: {advice}"
+
+
+def _free_bytes(path: Path) -> int | None:
+    """Return the free bytes of the disk of a file or folder that need not exist; None if nobody knows them."""
+    path = path.absolute()
+    with contextlib.suppress(OSError):
+        return shutil.disk_usage(next(above for above in (path, *path.parents) if above.is_dir())).free
+    return None
