@@ -29,6 +29,7 @@ from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
+from a2tg_jax.results import web_export
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
@@ -36,7 +37,7 @@ from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, rou
 from a2tg_jax.results.web_export import export_web, exported_text, loss_told
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
-from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, served
+from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
 
 
 def ask(app, path="/", method="GET", host="127.0.0.1:80"):
@@ -160,6 +161,19 @@ def test_a_server_on_a_network_has_a_new_token_each_time(monkeypatch):
                 connection.close()
             tokens.append(token)
     assert tokens[0] != tokens[1]
+
+
+def test_an_error_of_the_server_ends_the_command_but_no_training(monkeypatch):
+    waitress = pytest.importorskip("waitress")
+
+    def fail(self):
+        raise OSError("Bad file descriptor")
+
+    monkeypatch.setattr(waitress.server.BaseWSGIServer, "run", fail)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        serve({}, on_start=lambda url: None)
+    with pytest.warns(UserWarning, match="the viewer's server ended early: Bad file descriptor"), served({}):
+        pass
 
 
 def test_addresses_on_a_network(monkeypatch):
@@ -311,6 +325,24 @@ def test_a_folder_and_a_single_file(tmp_path):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out --single-file"):
         export_web(source, tmp_path / "with.html", photographs=True)
+
+
+def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkeypatch):
+    source, old = Source(textured(), "a"), tmp_path / "photographs" / "0.jpg"
+    export_web(source, tmp_path)
+    old.parent.mkdir()
+    old.touch()
+    (tmp_path / "photographs.json").write_text("[0]")
+
+    def full(path):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr(web_export, "replacing", full)
+        export_web(source, tmp_path, overwrite=True)
+    assert old.is_file()
+    export_web(source, tmp_path, overwrite=True)
+    assert not old.parent.exists()
 
 
 def test_a_gain_is_not_called_a_loss():

@@ -62,13 +62,13 @@ def export_web(
     files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
     for path in files:
         check_new(path, "--web", overwrite=overwrite)
-    for path in () if single_file else _photographs_in(out):
-        if path not in files:
-            path.unlink(missing_ok=True)
-            remove_if_empty(path.parent, out)
+    old = set() if single_file else set(_photographs_in(out))
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
+    for path in old - set(files):
+        path.unlink(missing_ok=True)
+        remove_if_empty(path.parent, out)
     page, total = out if single_file else out / "index.html", sum(map(len, files.values()))
     return Exported(page, len(data), len(files), total, source.model, _losses_of(source))
 

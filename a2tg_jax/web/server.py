@@ -12,7 +12,9 @@ import secrets
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 from a2tg_jax.host import signals
@@ -155,11 +157,12 @@ def serve(
       ValueError: if waitress is not installed, the port is taken, or this machine has no such address.
       Stopped: if the process is asked to end otherwise (`signals.raised`).
     """
-    with served(routes, host=host, port=port) as url:  # In a thread, for waitress hides how its loop was ended.
+    with _running(routes, host, port) as (url, ended):  # In a thread, for waitress hides how its loop was ended.
         try:
             on_start(url)
-            while True:
+            while not ended.done():
                 time.sleep(1)
+            ended.result()
         except signals.Stopped:
             raise
         except KeyboardInterrupt:
@@ -168,18 +171,45 @@ def serve(
 
 @contextlib.contextmanager
 def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) -> Iterator[str]:
-    """Serve in a thread within the block, and yield the address. Arguments and errors are those of `serve`."""
+    """Serve in a thread within the block, and yield the address. Arguments and errors are those of `serve`.
+
+    An error that ends the server is a warning at the end of the block.
+    """
+    with _running(routes, host, port) as (url, ended):
+        yield url
+    if error := ended.exception():
+        warnings.warn(f"the viewer's server ended early: {error}", stacklevel=3)
+
+
+@contextlib.contextmanager
+def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tuple[str, Future[None]]]:
+    """Yield the address of a server in a thread, and what tells its end and the error that ended it."""
     connections: dict[int, Any] = {}
     server, url = _opened(routes, host, port, connections)
-    thread = threading.Thread(target=server.run, daemon=True)
+    ended: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            server.run()
+            ended.set_result(None)
+        except BaseException as error:
+            ended.set_exception(error)
+
+    thread = threading.Thread(target=run, daemon=True)
     thread.start()
     try:
-        yield url
+        yield url, ended
     finally:
         # In the server's own thread, which ends when all is closed.
-        server.trigger.pull_trigger(lambda: [connection.close() for connection in list(connections.values())])
+        server.trigger.pull_trigger(lambda: _close(connections))
         thread.join()
+        _close(connections)  # If an error has ended the thread.
         server.task_dispatcher.shutdown()
+
+
+def _close(connections: Mapping[int, Any]) -> None:
+    for connection in list(connections.values()):
+        connection.close()
 
 
 def _opened(routes: Mapping[str, Route], host: str, port: int, connections: dict[int, Any]) -> tuple[Any, str]:
