@@ -28,7 +28,7 @@ from a2tg_jax.host import startup
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import finishing, frames, run_training, web_export
+from a2tg_jax.results import finishing, frame_folder, frames, run_training, web_export
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.frame_folder import LIST
 from a2tg_jax.results.history import read_history

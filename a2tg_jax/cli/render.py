@@ -88,11 +88,11 @@ class Render:
 
     def _write_video(self, out: Path, frames: list[Path]) -> None:
         """Write an MP4, or an animated WebP without ffmpeg."""
-        video = out / "flight.mp4"
-        if write_video(frames, video, frames_per_second=self.fps):
+        video = out / video_name()
+        if video.suffix == ".mp4":
+            write_video(frames, video, frames_per_second=self.fps)
             print(f"video: {video}")
             return
         print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
-        animation = out / "flight.webp"
-        write_animation(frames, animation, frames_per_second=self.fps)
-        print(f"animation: {animation}")
+        write_animation(frames, video, frames_per_second=self.fps)
+        print(f"animation: {video}")

@@ -276,7 +276,7 @@ def train_defaults(arguments: list[str]) -> Train:
         # Several processes read the folder at a time; the first one claims it later.
         is_alone = not _value_of("--coordinator", arguments)
         with opened(out) if is_alone else contextlib.nullcontext(open_run(out)) as run:
-            read_record(run)
+            read_record(run)  # A run that another version refuses is named as such, before its options are read.
             path = path or str(run.record)
             preset = _checked_preset(run, preset)
     file = read_run_file(Path(path)) if path else RunFile()

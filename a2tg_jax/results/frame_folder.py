@@ -26,20 +26,20 @@ class FrameFolder:
     path: Path
 
     @property
-    def listed(self) -> dict[str, set[str]]:
-        """SHA-256 of what renders wrote, by file name: the newest, and older ones if a render was killed."""
-        found: dict[str, set[str]] = {}
+    def listed(self) -> dict[str, list[str]]:
+        """SHA-256 of what renders wrote, by file name: the newest last, after older ones if a render was killed."""
+        found: dict[str, list[str]] = {}
         if is_regular(self.path / LIST):
             for line in read_regular(self.path / LIST, MOST_BYTES).decode(errors="surrogateescape").splitlines():
                 digest, _, name = line.partition("  ")
-                found.setdefault(name, set()).add(digest)
+                found.setdefault(name, []).append(digest)
         return found
 
     def check(self, names: Iterable[str], *, overwrite: bool) -> None:
         """Raise FileExistsError if a file would be replaced, without `overwrite`, that no render wrote."""
         listed = self.listed
         for name in names:
-            if not self._is_own(name, listed):
+            if self._own_digest(name, listed.get(name, ())) is None:
                 check_new(self.path / name, "--out", overwrite=overwrite)
 
     @contextlib.contextmanager
@@ -50,16 +50,25 @@ class FrameFolder:
             with open(self.path / LIST, "a", encoding="utf-8", errors="surrogateescape") as file:
                 file.write(f"{sha256_of(temporary)}  {name}\n")
 
-    def drop_frames(self, kept: Collection[str]) -> None:
-        """Delete the frames of earlier flights, except those of some names, and list only what is left."""
-        listed = self.listed
-        for name in listed:
-            if FRAME.fullmatch(name) and name not in kept and self._is_own(name, listed):
-                (self.path / name).unlink()
-        left = [f"{sha256_of(self.path / name)}  {name}\n" for name in listed if self._is_own(name, listed)]
-        with replacing(self.path / LIST) as temporary:
-            temporary.write_text("".join(left), encoding="utf-8", errors="surrogateescape")
+    def tidy(self, rendered: Collection[str], *, drops_frames: bool) -> None:
+        """List only what is left after a render.
 
-    def _is_own(self, name: str, listed: dict[str, set[str]]) -> bool:
-        """Return whether a render wrote what a file holds now."""
-        return name in listed and is_regular(self.path / name) and sha256_of(self.path / name) in listed[name]
+        Args:
+          rendered: names of the files that it wrote.
+          drops_frames: whether other frames of flights are deleted.
+        """
+        left = {}
+        for name, digests in self.listed.items():
+            digest = digests[-1] if name in rendered else self._own_digest(name, digests)
+            if drops_frames and digest is not None and name not in rendered and FRAME.fullmatch(name):
+                (self.path / name).unlink()
+            elif digest is not None:
+                left[name] = digest
+        with replacing(self.path / LIST) as temporary:
+            lines = [f"{digest}  {name}\n" for name, digest in left.items()]
+            temporary.write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
+
+    def _own_digest(self, name: str, digests: Collection[str]) -> str | None:
+        """Return the SHA-256 of a file if it is one of those that renders wrote, or None."""
+        digest = sha256_of(self.path / name) if digests and is_regular(self.path / name) else None
+        return digest if digest in digests else None

@@ -95,8 +95,7 @@ def render_frames(
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         with folder.writing(file_name) as temporary:
             Image.fromarray(to_uint8(renderer(camera).color)).save(temporary, "PNG", optimize=True)
-    if route != "test":
-        folder.drop_frames(cameras)
+    folder.tidy(cameras, drops_frames=route != "test")
     return [out / file_name for file_name in cameras]
 
 
