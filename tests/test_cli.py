@@ -610,10 +610,42 @@ def test_a_killed_finish_goes_on_by_the_same_command(tiny_run, tmp_path, monkeyp
         new.finish.with_name(".finish.json.1.partial").touch()
         if killed_in != "write_json":
             assert "is not empty; choose another --out" in fails(capsys, *command, "--polish-steps", "2")
+        if killed_in == "write_record":
+            mine = new.path / "mine.txt"
+            mine.touch()
+            before = sorted(new.path.rglob("*"))
+            assert "mine.txt is not of the finishing that was begun there: move it" in fails(capsys, *command)
+            assert sorted(new.path.rglob("*")) == before and len(polished) == 1
+            mine.unlink()
     assert cli.main(command) == 0 and len(polished) == (1 if killed_in == "evaluate_run" else 2)
     assert load_model(new.model("a2tg-textures")).num_bytes == load_model(run.model("a2tg-textures")).num_bytes
     assert read_record(new) == read_record(run) and not list(new.path.glob(".*.partial"))
     assert "is not empty; choose another --out" in fails(capsys, *command)
+
+
+def test_a_finish_that_was_overtaken_deletes_nothing(tiny_run, tmp_path, monkeypatch, capsys):
+    """Another process finishes into the folder while this one, which went on there, loads the scene."""
+    run, *_ = tiny_run
+    new, command = RunFolder(tmp_path / "new"), ["finish", str(run.path), "--out", str(tmp_path / "new")]
+    loads = [lambda: None, lambda: cli.main(command), lambda: None]
+
+    def load(self):
+        loads.pop(0)()
+        return SimpleNamespace(train=())
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SceneSource, "load", load)
+    monkeypatch.setattr(finishing, "_measured", lambda model, *_: finishing.Measured(model.num_bytes, 20.0, None))
+    monkeypatch.setattr(finishing, "_changed", lambda model, *_: iter([("polished", model)]))
+    monkeypatch.setattr(finishing, "evaluate_run", lambda run, *_, **__: run.own(run.report).touch())
+    with monkeypatch.context() as patch:
+        patch.setattr(finishing, "write_record", stop)
+        assert cli.main(command) == 130
+    capsys.readouterr()
+    assert "is not empty; choose another --out" in fails(capsys, *command)
+    assert new.report.is_file() and new.model("a2tg-textures").is_file() and not loads
 
 
 def test_what_polishing_spoils_is_left_out():
@@ -649,6 +681,24 @@ def test_a_shorter_flight_leaves_no_frames_of_a_longer_one(tiny_run, tmp_path, m
         assert cli.main(["render", str(run.path), "--frames", str(num), "--out", str(tmp_path), "--size", "12x8"]) == 0
         made = {"frame_0000.png", "frame_0001.png", "flight.webp", LIST}
         assert {path.name for path in tmp_path.iterdir()} == names | made
+
+
+def test_the_list_of_frames_stays_short_and_each_file_is_read_once(tmp_path, monkeypatch):
+    """Frames just written are not read again; a file that changed since leaves the list."""
+    read, folder = [], frame_folder.FrameFolder(tmp_path)
+    monkeypatch.setattr(frame_folder, "sha256_of", lambda path: read.append(path.name) or sha256_of(path))
+    for text in ("old", "new"):
+        for name in ("frame_0000.png", "frame_0001.png", "a.png", "changed.png"):
+            with folder.writing(name) as temporary:
+                temporary.write_text(f"{text} {name}")
+    (tmp_path / "changed.png").write_text("mine")
+    for drops, left in ((False, ["frame_0000.png", "frame_0001.png", "a.png"]), (True, ["frame_0000.png", "a.png"])):
+        read.clear()
+        folder.tidy(["frame_0000.png"], drops_frames=drops)
+        assert "frame_0000.png" not in read and len(read) == len(set(read))
+        assert folder.listed == {name: [sha256_of(tmp_path / name)] for name in left}
+        assert (tmp_path / "frame_0001.png").exists() is not drops
+    assert (tmp_path / "changed.png").read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", ["frame_0001.png", "flight.webp"])

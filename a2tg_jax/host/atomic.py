@@ -59,8 +59,13 @@ def left_over(folder: Path) -> dict[Path, Path]:
     """Return the partial files of a folder, with the files they were to become."""
     if not folder.is_dir():
         return {}
-    names = {entry: PARTIAL.fullmatch(entry.name) for entry in folder.iterdir()}
-    return {entry: folder / match[1] for entry, match in names.items() if match}
+    return {entry: final_of(entry) for entry in folder.iterdir() if PARTIAL.fullmatch(entry.name)}
+
+
+def final_of(path: Path) -> Path:
+    """Return the file that a partial file was to become, and any other as it is."""
+    match = PARTIAL.fullmatch(path.name)
+    return path.with_name(match[1]) if match else path
 
 
 @functools.lru_cache(maxsize=64)

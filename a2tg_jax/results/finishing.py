@@ -9,14 +9,14 @@ from typing import Any
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import final_of, replacing
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.results.corrected import refined_views
 from a2tg_jax.results.finish_options import FinishOptions
-from a2tg_jax.results.folder import RunFolder, check_free, create_run, read_json, resuming_command, write_json
+from a2tg_jax.results.folder import RunFolder, check_free, read_json, resuming_command, write_json
 from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.plan import PlannedStage
@@ -88,31 +88,45 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
             f"{source.path} has no finished {planned.name}; continue with: {resuming_command(source)}"
         )
     run, told = RunFolder(out), _told(source, planned, options)
-    is_begun = _is_begun(run, told)
-    if not is_begun:
-        check_free(out, in_use="is not empty; choose another --out")
+    _is_written(run, told)
     model, scene = load_model(path), record.scene.load()
     _check(model, planned, options)
     finished_stages(source, record.plan)
-    is_written = is_begun and run.record.is_file()
-    changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
-    steps = {"before": (model, _measured(model, scene, planned))}
-    for name, after in changed:
-        steps[name] = after, _measured(after, scene, planned)
-    last, _ = steps[kept_step({name: found for name, (_, found) in steps.items()})]
     with claimed(run):
-        if is_begun and not is_written:
-            run.clear()
+        is_written = _is_written(run, told)  # Another process may have been here meanwhile.
+        changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
+        models, steps = {"before": model}, {"before": _measured(model, scene, planned)}
+        for name, after in changed:
+            models[name], steps[name] = after, _measured(after, scene, planned)
         if not is_written:
-            _write_run(create_run(out), source, record, planned, last, told)
+            run.clear()
+            _write_run(run, source, record, planned, models[kept_step(steps)], told)
         result = evaluate_run(run, scene, lpips_weights=lpips_weights)
-    return Finished({name: found for name, (_, found) in steps.items()}, result)
+    return Finished(steps, result)
 
 
 def _told(source: RunFolder, planned: PlannedStage, options: FinishOptions) -> dict[str, Any]:
     """Return the content of finish.json: from which model of which run the new one is made, and how."""
     origin = {"source": str(source.path.resolve()), "model": planned.name}
     return {**origin, "sha256": sha256_of(source.model(planned.name)), **dataclasses.asdict(options)}
+
+
+def _is_written(run: RunFolder, told: Mapping[str, Any]) -> bool:
+    """Return whether a process was killed in a folder after it had done the same and written the model.
+
+    Raises:
+      FileExistsError: if there is anything in the folder but what such a process left.
+    """
+    if not _is_begun(run, told):
+        check_free(run.path, in_use="is not empty; choose another --out")
+        return False
+    if run.record.is_file():
+        return True
+    own = {run.path / name for name in run.written()}
+    other = next((path for path in run.path.rglob("*") if path.is_file() and final_of(path) not in own), None)
+    if other is not None:
+        raise FileExistsError(f"{other} is not of the finishing that was begun there: move it, or choose another --out")
+    return False
 
 
 def _is_begun(run: RunFolder, told: Mapping[str, Any]) -> bool:
