@@ -13,9 +13,9 @@ from lab import tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
 from lab.grid import Method, has_scale, read_grid, splats_in
-from lab.grid_file import GRIDS
+from lab.grid_file import GRIDS, Block
 from lab.jobs import Folders
-from lab.scenes import SceneAt, own_scene
+from lab.scenes import SceneAt, chosen_scenes, own_scene
 from run import chosen, experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
@@ -198,7 +198,7 @@ def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
         ("budgets = [0.3]", "gaussians = []", "small.gaussians must not be empty"),
         ("[small]", "[small]\niterations = [60]", r"small.iterations must be list of 2 int \| None; got \[60\]"),
         ("[small]", "[small]\niterations = [60, -40]", "small.iterations must be at least 0; got -40"),
-        ('system = "bytewise"', 'like = "A2TG"', "mine.toml: 'bytewise' is like: there is no method 'A2TG'"),
+        ('system = "bytewise"', 'like = "A2TG"', "mine.toml: 'bytewise' is like 'A2TG', which is no method above it"),
         ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
     ],
 )
@@ -208,6 +208,12 @@ def test_mistakes_in_a_grid_file_are_told(tmp_path, before, after, words):
         text = text.replace("[small.scenes]", "[full.scenes]")
     with pytest.raises(ValueError, match=words):
         read_grid(own_grid(tmp_path, text), "small")
+
+
+@pytest.mark.parametrize(("only", "labels"), [(None, ["a", "b"]), ((), []), (("b",), ["b"])])
+def test_a_block_has_all_scenes_or_those_that_it_names(only, labels):
+    scenes = {label: SceneAt(label, label) for label in "ab"}
+    assert [scene.label for scene in chosen_scenes(scenes, Block(only=only), None, True, "mine.toml")] == labels
 
 
 def test_tables_of_a_budget_show_the_gaussians_of_the_runs():

@@ -232,7 +232,10 @@ def _methods(file: GridFile, place: str) -> dict[str, Method]:
     tables |= method_tables(file.variants, f"{place}: variants.")
     methods: dict[str, Method] = {}
     for label, table in tables.items():
-        base = None if table.like is None else _found(table.like, methods, f"{place}: {label!r} is like")
+        base = None
+        if table.like is not None:
+            missing = f"{label!r} is like {table.like!r}, which is no method above it"
+            base = _found(table.like, methods, place, missing)
         methods[label] = _method(label, table, base, place)
     return methods
 
@@ -246,10 +249,11 @@ def _method(label: str, table: MethodTable, base: Method | None, place: str) -> 
     return Method(label, system, options, table.floats, table.most)
 
 
-def _found(label: str, methods: Mapping[str, Method], place: str) -> Method:
+def _found(label: str, methods: Mapping[str, Method], place: str, missing: str | None = None) -> Method:
+    """Return a method by its label; `missing` is the error's text in place of the usual one."""
     if label not in methods:
         hint = did_you_mean(label, methods) or f"; there are {', '.join(methods)}"
-        raise ValueError(f"{place}: there is no method {label!r}{hint}")
+        raise ValueError(f"{place}: {missing or f'there is no method {label!r}'}{hint}")
     return methods[label]
 
 

@@ -80,7 +80,7 @@ def chosen_scenes(
     Raises:
       ValueError: if a wanted scene is unknown.
     """
-    labels = wanted or block.only or scenes
+    labels = wanted or (scenes if block.only is None else block.only)
     for label in labels:
         if label not in scenes:
             hint = did_you_mean(label, scenes) or f"; there are {', '.join(scenes)}"
