@@ -1,5 +1,6 @@
 """Places to write to, and budgets too small to show a scene, are told before any work."""
 
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -11,12 +12,13 @@ import pytest
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import MovableKernels
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli import mesh
 from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output import check_new, check_output
+from a2tg_jax.results.output import check_export, check_new, check_output
 from a2tg_jax.results.preflight import warn_of_small_budget
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
@@ -150,6 +152,36 @@ def test_no_file_of_a_page_is_replaced_unasked(tmp_path, capsys, name):
     assert cli.main(["export", str(model), "--ply", str(site / "x.ply"), "--web", str(site)]) == 2
     assert f"{name} exists; add --overwrite to replace it, or choose another --web" in capsys.readouterr().err
     assert [(path.name, path.read_text()) for path in site.iterdir()] == [(name, "mine")]
+
+
+@pytest.mark.parametrize(("name", "is_export"), [("models/x.a2tgz", True), ("mesh.glb", True), ("models/x.npz", False)])
+def test_exports_into_a_run_are_replaced_by_default_or_if_asked(tmp_path, name, is_export):
+    """Files that the run itself wrote are not, even if asked."""
+    run = create_run(tmp_path)
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.touch()
+    with pytest.raises(FileExistsError, match="add --overwrite"):
+        check_export(path, path, "--out", overwrite=False)
+    run.own(path)
+    check_export(path, path, "--out", overwrite=False)
+    with contextlib.nullcontext() if is_export else pytest.raises(ValueError, match="belongs to the run"):
+        check_export(path, tmp_path / "other", "--out", overwrite=True)
+    if is_export:
+        with pytest.raises(FileExistsError, match="add --overwrite"):
+            check_new(path, "OUT", overwrite=False)
+
+
+def test_the_mesh_of_a_run_is_replaced_unasked_once_it_was_written_so(tmp_path, monkeypatch, capsys):
+    write_record(create_run(tmp_path), RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg()))
+    out = tmp_path / "mesh.glb"
+    monkeypatch.setattr(mesh, "open_source", lambda *_: None)
+    monkeypatch.setattr(mesh, "write_mesh", lambda source, out, options: out.write_text("mesh"))
+    out.write_text("mine")
+    assert cli.main(["mesh", str(tmp_path)]) == 2 and out.read_text() == "mine"
+    assert "mesh.glb exists; add --overwrite" in capsys.readouterr().err
+    for words in (["--overwrite"], [], ["--out", str(out)]):
+        assert cli.main(["mesh", str(tmp_path), *words]) == 0 and out.read_text() == "mesh"
 
 
 def test_a_page_in_a_folder_is_not_replaced_unasked(tmp_path):

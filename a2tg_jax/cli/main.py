@@ -30,18 +30,11 @@ from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import FORMATS
-from a2tg_jax.results.compression import (
-    SUFFIX,
-    check_compact,
-    compress,
-    compression_text,
-    default_output,
-    is_written_by,
-)
+from a2tg_jax.results.compression import SUFFIX, check_compact, compress, compression_text, default_output
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.lock import opened
-from a2tg_jax.results.output import check_new, check_output
+from a2tg_jax.results.output import check_export, check_output
 from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.summary import metrics_json
 from a2tg_jax.results.whole_run import LESS_MEMORY, measure
@@ -146,8 +139,7 @@ class Compress:
         out = self.out or default
         check_compact(out)
         check_output(out)
-        if out.resolve() != default.resolve() or not is_written_by(self.source, default):
-            check_new(out, "--out", overwrite=self.overwrite)
+        check_export(out, default, "--out", overwrite=self.overwrite)
         tell = functools.partial(print, flush=True)
         found = compress(self.source, out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell)
         print(compression_text(found))

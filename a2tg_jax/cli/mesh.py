@@ -9,8 +9,9 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.events import from_options
 from a2tg_jax.mesh.files import mesh_files
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
-from a2tg_jax.results.output import check_new, check_not_source, check_output
+from a2tg_jax.results.output import check_export, check_not_source, check_output
 from a2tg_jax.results.viewing import open_source
 
 
@@ -53,20 +54,20 @@ class Mesh:
     model: LastModel = None
     """Name of a run's model, as a2tg info prints it."""
     overwrite: bool = False
-    """Replace files that exist. RUN/mesh.glb, the default of a run, is always replaced."""
+    """Replace files that exist. The default of a run is always replaced once a2tg mesh has written it."""
 
     def run(self) -> None:
         is_run = self.source.is_dir()
-        out = self.out or self.source / "mesh.glb"
-        if self.out is None and not is_run:
-            out = self.source.with_name(f"{self.source.stem}-mesh.glb")
+        default = self.source / "mesh.glb" if is_run else self.source.with_name(f"{self.source.stem}-mesh.glb")
+        out = self.out or default
         options = from_options(MeshOptions, self)
         options.check(out)
         files = mesh_files(out, has_texture=options.texture != "none")
         check_not_source(files, self.source, "--out")
         source = open_source(self.source, self.model)
         check_output(out)
-        if self.out is not None or not is_run:
-            for file in files:
-                check_new(file, "--out", overwrite=self.overwrite)
+        for file in files:
+            check_export(file, default, "--out", overwrite=self.overwrite)
         print(write_mesh(source, out, options))
+        if is_run and out.resolve() == default.resolve():
+            RunFolder(self.source).own(default)

@@ -75,11 +75,6 @@ def default_output(source: Path) -> Path:
     return source.with_suffix(SUFFIX)
 
 
-def is_written_by(source: Path, file: Path) -> bool:
-    """Return whether a file is one that the run in a folder wrote."""
-    return source.is_dir() and file.relative_to(source).as_posix() in RunFolder(source).written()
-
-
 def check_compact(out: Path) -> None:
     """Raise ValueError if `out` is a folder or has another suffix than a2tgz."""
     if out.is_dir() or out.suffix.lower() != SUFFIX:

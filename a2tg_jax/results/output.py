@@ -8,6 +8,9 @@ from pathlib import Path
 
 from a2tg_jax.results.folder import RunFolder
 
+EXPORTS = (".a2tgz", ".glb")
+"""Suffixes of what `a2tg compress` and `a2tg mesh` write into the folder of a run, which needs none of it."""
+
 
 def check_output(path: Path) -> None:
     """Raise if a file or folder cannot be made.
@@ -47,15 +50,21 @@ def check_new(path: Path, flag: str, *, overwrite: bool) -> None:
 
     Raises:
       FileExistsError: if it exists, and `overwrite` is not set.
-      ValueError: if it is one that a run wrote into its folder.
+      ValueError: if it is one that a run, and no export, wrote into its folder.
     """
     if not path.is_file():
         return
     run = _run_that_wrote(path)
-    if run is not None:
+    if run is not None and path.suffix.lower() not in EXPORTS:
         raise ValueError(f"{path} belongs to the run in {run}; choose another {flag}")
     if not overwrite:
         raise FileExistsError(f"{path} exists; add --overwrite to replace it, or choose another {flag}")
+
+
+def check_export(path: Path, default: Path, flag: str, *, overwrite: bool) -> None:
+    """Call `check_new`, unless the path is the default and the same command wrote it into a run folder before."""
+    if path.resolve() != default.resolve() or _run_that_wrote(path) is None:
+        check_new(path, flag, overwrite=overwrite)
 
 
 def _run_that_wrote(path: Path) -> Path | None:
