@@ -252,7 +252,7 @@ def test_a_rule_defined_anew_is_compiled_anew():
     ("settings", "words"),
     [
         ({"compositor": "XLA"}, "got 'XLA'"),
-        ({"tile_size": 65}, "1..64"),
+        ({"tile_size": 65}, "1 to 64"),
         ({"compositor": "cuda"}, "NVIDIA GPU and NVRTC"),
     ],
 )

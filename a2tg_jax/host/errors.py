@@ -33,13 +33,13 @@ def error_text(error: Exception, less_memory: str) -> str | None:
 
 def _full_disk_text(error: OSError) -> str:
     """Return which file a disk has no room for, how much is free, and what to do."""
-    state, advice = "the disk is full", "make room, or write to another disk"
+    state, advice = ": the disk is full", ": make room, or write to another disk"
     if not isinstance(error.filename, str | os.PathLike):
-        return f"{state}: {advice}"
+        return f"{state[2:]}{advice}"
     free = _free_bytes(Path(error.filename)) if error.errno == errno.ENOSPC else None
     if free is not None:
         state += f"{' or has no inodes left' if free > PLENTY else ''}, {free / 1e6:.1f} MB are free"
-    return f"{error.filename}: {state}: {advice}"
+    return f"{error.filename}{state}{advice}"
 
 
 def _free_bytes(path: Path) -> int | None:
