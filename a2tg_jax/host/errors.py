@@ -33,13 +33,12 @@ def error_text(error: Exception, less_memory: str) -> str | None:
 
 def _full_disk_text(error: OSError) -> str:
     """Return which file a disk has no room for, how much is free, and what to do."""
-    state, advice = ": the disk is full", ": make room, or write to another disk"
-    if not isinstance(error.filename, str | os.PathLike):
-        return f"{state[2:]}{advice}"
-    free = _free_bytes(Path(error.filename)) if error.errno == errno.ENOSPC else None
-    if free is not None:
-        state += f"{' or has no inodes left' if free > PLENTY else ''}, {free / 1e6:.1f} MB are free"
-    return f"{error.filename}{state}{advice}"
+    is_named = isinstance(error.filename, str | os.PathLike)
+    free = _free_bytes(Path(error.filename)) if is_named and error.errno == errno.ENOSPC else None
+    inodes = " or has no inodes left" if free is not None and free > PLENTY else ""
+    room = "" if free is None else f", {free / 1e6:.1f} MB are free"
+    text = f"{error.filename}: the disk is full{inodes}{room}: make room, or write to another disk"
+    return text if is_named else text.removeprefix(f"{error.filename}: ")
 
 
 def _free_bytes(path: Path) -> int | None:
