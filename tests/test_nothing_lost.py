@@ -123,7 +123,7 @@ def test_a_write_deletes_old_partial_files_of_the_same_file(tmp_path):
 
 @pytest.mark.parametrize("name", ["iterdir", "unlink"])
 def test_old_partial_files_that_stay_keep_nothing_from_being_written(tmp_path, monkeypatch, name):
-    """As another user's in a sticky folder, or any in a folder that cannot be listed."""
+    """A partial file may belong to another user, or lie in a folder that cannot be listed."""
     partial = tmp_path / ".a.npz.1.partial"
     partial.touch()
     os.utime(partial, (0, 0))

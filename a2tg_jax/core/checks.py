@@ -63,21 +63,26 @@ def check_number(
     """
     limits = {"at least": least, "above": above, "at most": most, "below": below}
     wanted = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if limit is not None)
-    is_array = hasattr(value, "dtype") and np.shape(value) == () and jnp.issubdtype(value.dtype, jnp.number)
-    if is_array and isinstance(value, jax.core.Tracer):
-        return
-    if not is_array and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
+    if not _is_numeric(value) or np.shape(value) != ():
         found = described(value) if hasattr(value, "dtype") else repr(value)
         raise ValueError(f"{name} must be {f'a number {wanted}'.rstrip()}; got {found}")
+    if isinstance(value, jax.core.Tracer):
+        return
     if not _is_within(float(value), least, above, most, below):
         raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
 
 
 def check_numeric(name: str, value: Any) -> None:
     """Raise ValueError unless a value is a number or an array of numbers of any shape; none is read."""
-    is_array = hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.number)
-    if not is_array and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
+    if not _is_numeric(value):
         raise ValueError(f"{name} must be a number, or an array of numbers; got {described(value)}")
+
+
+def _is_numeric(value: Any) -> bool:
+    """Return whether a value is a real number, or an array or a tracer of numbers."""
+    if hasattr(value, "dtype"):
+        return bool(jnp.issubdtype(value.dtype, jnp.number))
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 def _is_within(

@@ -100,11 +100,11 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     Args:
       start: rate at iteration 0, in units of the parameter per step.
       final_factor: rate at `total` divided by that at 0, positive.
-      iteration: current iteration; may be traced.
+      iteration: current iteration, or an array of iterations; may be traced.
       total: iterations of the stage, at least 1.
 
     Returns:
-      A scalar of the default float dtype.
+      Rates of the default float dtype, of the shape of `iteration`.
 
     Raises:
       ValueError: if an argument is no number, or one out of range.

@@ -56,7 +56,6 @@ def check_similarity(similarity: Similarity, what: str) -> None:
             f"{what} must have a positive scale and a finite translation, up to {LARGEST_NUMBER:g}, the scale from "
             f"{1 / LARGEST_NUMBER:g}; got {scale:g}, {np.asarray(translation).tolist()}"
         )
-    rotation = np.asarray(rotation)
     is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW) and np.linalg.det(rotation) > 0
     if not is_rotation:  # Also of NaN.
         raise ValueError(f"{what} must have a rotation; got {np.asarray(rotation).tolist()}")

@@ -16,7 +16,8 @@ NONE = "None"
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:
-    """Return a dataclass of numbers, texts, tuples and dataclasses as nested dictionaries; tuples become lists."""
+    """Return a dataclass of numbers, texts, tuples and dataclasses as nested dictionaries, with lists for tuples and
+    arrays."""
     return {field.name: _to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
@@ -82,14 +83,7 @@ def check_config(config: Any, prefix: str = "") -> None:
             check_kind(name, value, hint, f"say {hint.__name__}({shortened(given)})")
             check_config(value, f"{name}.")
         elif _is_plain(hint):
-            _from_json(hint, _without_arrays(value), name)
-
-
-def _without_arrays(value: Any) -> Any:
-    """Return numbers, tuples and arrays of NumPy and JAX as JSON has them."""
-    if isinstance(value, tuple):
-        return [_without_arrays(item) for item in value]
-    return value.tolist() if hasattr(value, "tolist") else value
+            _from_json(hint, _to_json(value), name)
 
 
 def _is_plain(hint: Any) -> bool:
@@ -139,9 +133,11 @@ def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _to_json(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return config_to_dict(value)
-    return [_to_json(item) for item in value] if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return [_to_json(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _from_json(hint: Any, value: Any, where: str) -> Any:

@@ -21,7 +21,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder, resuming_command
 from a2tg_jax.results.frame_folder import FRAME_NAME, FrameFolder
-from a2tg_jax.results.images import picture_names, to_uint8
+from a2tg_jax.results.images import picture_names, to_uint8, write_png
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 
@@ -94,7 +94,7 @@ def render_frames(
     renderer = Renderer(model, cameras=cameras.values(), settings=settings, has_geometry=False)
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         with folder.writing(file_name) as temporary:
-            Image.fromarray(to_uint8(renderer(camera).color)).save(temporary, "PNG", optimize=True)
+            write_png(temporary, to_uint8(renderer(camera).color))
     folder.tidy(cameras, drops_frames=route != "test")
     return [out / file_name for file_name in cameras]
 

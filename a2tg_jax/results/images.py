@@ -139,9 +139,14 @@ def _of_file(stem: str) -> str:
 
 def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
     """Write a PNG atomically."""
-    picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     with replacing(path) as temporary:
-        picture.save(temporary, format="PNG", optimize=True)
+        write_png(temporary, picture)
+
+
+def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
+    """Write a PNG to a path that a caller then moves."""
+    picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
+    picture.save(path, format="PNG", optimize=True)
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
