@@ -67,6 +67,11 @@ def test_histories_that_are_none(tmp_path, text):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
+def test_a_missing_history_says_what_to_do(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"a\.csv is missing: .*train the stage again"):
+        read_history(tmp_path / "a.csv")
+
+
 def test_a_history_without_rows_is_shown(tmp_path):
     write_history(tmp_path / "a.csv", History.empty())
     found = read_history(tmp_path / "a.csv")

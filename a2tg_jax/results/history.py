@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.training import History
 
@@ -31,9 +31,12 @@ def read_history(path: Path) -> History:
     """Return the history that `write_history` wrote.
 
     Raises:
+      FileNotFoundError: if there is none.
       ValueError: naming the file, if it has other columns, or a row is not one of numbers, of which only PSNR may be
         infinite.
     """
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
     with io.TextIOWrapper(open_regular(path, MOST_BYTES), encoding="utf-8", newline="") as file:
         try:
             rows = csv.reader(file)

@@ -122,7 +122,10 @@ class Lab:
         path = self.folders.model(job)
         if path.is_file():
             return a2tg.load_model(path)
-        print(f"{result.label} on {result.run.cell.scene.label}: left out, its model is missing in {path.parent}")
+        print(
+            f"{result.label} on {result.run.cell.scene.label}: left out, its model is missing in {path.parent}; --work "
+            "names the folder that has it, --out NEW trains it again"
+        )
         return None
 
     def write(self, name: str, text: str, *, has_old_rows: bool = True) -> None:
