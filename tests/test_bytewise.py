@@ -7,12 +7,14 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance.shaped import SMALLEST_EXPONENT, exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
 from a2tg_jax.io.config_json import config_to_dict
+from a2tg_jax.results.plan import fingerprint
 from a2tg_jax.results.record import RunFile, compared_system
-from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import system_from_dict, system_to_dict, with_changes, with_earlier_options
 from a2tg_jax.training.step import jitted_step
@@ -186,7 +188,7 @@ def test_options_by_hand_of_a_subclass_are_no_record():
     assert with_earlier_options(Other, {"memory_budget": 1.0}) == {"memory_budget": 1.0}
     record = config_to_dict(Other())
     del record["kernel"]
-    assert with_earlier_options(Other, record)["kernel"] == {"rate": 0.0}
+    assert with_earlier_options(Other, record)["kernel"]["rate"] == 0
 
 
 def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():
@@ -200,9 +202,28 @@ def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():
     assert by_hand.chosen("mine.toml").kernel.rate == Bytewise().kernel.rate > 0
 
 
+def test_runs_of_before_exponents_had_a_least_go_on_without_one():
+    record = system_to_dict(Bytewise.preset("quick"))
+    del record["options"]["kernel"]["least_exponent"]
+    before = system_from_dict(record, "model.npz").kernel
+    assert before == KernelConfig(Bytewise().kernel.rate, SMALLEST_EXPONENT)
+    whole = with_changes(Bytewise.preset("quick"), {"kernel": {"least_exponent": SMALLEST_EXPONENT}}, "test")
+    assert "least_exponent" not in fingerprint(whole, 0)  # so that what was trained before is known
+    assert "least_exponent" in fingerprint(Bytewise.preset("quick"), 0)
+
+
+def test_the_least_exponent_reaches_both_stages(scene):
+    system = smoke(kernel={"rate": 1.0, "least_exponent": 0.8})
+    model = a2tg.fit(scene, system, progress=False).model
+    exponents = exponents_of(model.appearance.shapes(model.params))[: model.num]
+    np.testing.assert_allclose(exponents.min(), 0.8, rtol=1e-5)
+    assert exponents.max() > 1
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
+        ({"kernel": {"least_exponent": 0.2}}, "kernel.least_exponent must lie in 0.367"),
         ({"texture": {"share": 0.5}, "view_dependence": {"share": 0.5}}, "must leave bytes for Gaussians"),
         ({"texture": {"share": 1.5}}, "texture.share must lie in 0..1; got 1.5"),
         ({"view_dependence": {"share": -0.1}}, "view_dependence.share must lie in 0..1; got -0.1"),

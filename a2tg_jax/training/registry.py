@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
+from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, merged
 from a2tg_jax.training.options import System
 
 SYSTEMS = {
@@ -112,7 +112,7 @@ def with_earlier_options(kind: type[System], options: Any) -> Any:
     shared = {field.name for field in dataclasses.fields(System)}
     groups = {name for name, value in config_to_dict(kind()).items() if isinstance(value, Mapping)} - shared
     is_record = groups - kind.earlier_options.keys() <= options.keys()
-    return {**kind.earlier_options, **options} if is_record else options
+    return merged(kind.earlier_options, options) if is_record else options
 
 
 def with_changes(system: System, changes: Mapping[str, Any], where: str) -> System:
