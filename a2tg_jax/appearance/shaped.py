@@ -36,7 +36,7 @@ OFFSET = 0.02
 LARGEST_LOG_EXPONENT = 1.0
 """Largest logarithm of an exponent, and of its inverse."""
 SMALLEST_EXPONENT = math.exp(-LARGEST_LOG_EXPONENT)
-"""Smallest exponent of all."""
+"""Exponent that those of all shapes are above."""
 MOST_SHARE = 1 - 1e-7
 """Largest tanh of a shape that is read, so that the shape is finite."""
 MOST_ROUNDED = 1.5
@@ -155,12 +155,13 @@ class Shaped(AppearanceAround):
     it."""
 
     inner: Appearance = dataclasses.field(default_factory=Plain)
-    least_exponent: float = dataclasses.field(default=SMALLEST_EXPONENT, metadata={"is_addition": True})
-    """Smallest exponent that training leaves, 1/e to 1. The smaller it is, the more pixels a kernel's tails reach."""
+    least_exponent: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
+    """Smallest exponent that training leaves, 0 to 1; all are above 1/e in any case. The smaller it is, the more pixels
+    a kernel's tails reach."""
 
     def __post_init__(self) -> None:
         """Refuse an inner appearance with degrees, with shapes of its own, or of billboards."""
-        check_number("least_exponent", self.least_exponent, least=SMALLEST_EXPONENT, most=1)
+        check_number("least_exponent", self.least_exponent, least=0, most=1)
         inner = self.inner
         if inner.has_degrees or inner.shapes_name is not None or isinstance(inner, Billboards):
             raise ValueError(REFUSAL.format(type(inner).__name__))
@@ -195,7 +196,7 @@ class Shaped(AppearanceAround):
     def project(self, params: ShapedParams) -> ShapedParams:
         """Return the parameters with exponents that are no smaller than the least, up to rounding."""
         projected: ShapedParams = super().project(params)
-        if self.least_exponent == SMALLEST_EXPONENT:
+        if self.least_exponent <= SMALLEST_EXPONENT:
             return projected
         least = math.atanh(math.log(self.least_exponent) / LARGEST_LOG_EXPONENT)
         return projected._replace(shapes=jnp.maximum(params.shapes, least))

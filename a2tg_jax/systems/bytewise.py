@@ -17,7 +17,6 @@ from a2tg_jax.appearance import (
     Textured,
     TextureOptions,
 )
-from a2tg_jax.appearance.shaped import SMALLEST_EXPONENT
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
@@ -59,7 +58,8 @@ class KernelConfig:
     """Adam's learning rate of the shapes; 0: all kernels are Gaussians, as other programs draw them, for which a
     view_dependence.share of 0.23 is better."""
     least_exponent: float = 0.6
-    """Smallest exponent of a kernel, 1/e to 1; smaller ones have longer tails, which take longer to draw."""
+    """Smallest exponent of a kernel, 0 to 1; smaller ones have longer tails, which take longer to draw. 0: no limit but
+    1/e."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Bytewise(System):
 
     name: ClassVar[str] = "bytewise"
     version: ClassVar[int] = 2
-    earlier_options: ClassVar[Mapping[str, Any]] = {"kernel": {"rate": 0.0, "least_exponent": SMALLEST_EXPONENT}}
+    earlier_options: ClassVar[Mapping[str, Any]] = {"kernel": {"rate": 0.0, "least_exponent": 0.0}}
     ranges: ClassVar[Ranges] = {**LOOKUP_RANGES, **PRUNE_RANGES}
     event_options: ClassVar[Mapping[str, str]] = {
         **MCMC_OPTIONS,
@@ -216,7 +216,7 @@ class Bytewise(System):
         ranges = {
             "base_degree": (self.base_degree, 0, self.sh_degree),
             "kernel.rate": (self.kernel.rate, 0, math.inf),
-            "kernel.least_exponent": (self.kernel.least_exponent, SMALLEST_EXPONENT, 1),
+            "kernel.least_exponent": (self.kernel.least_exponent, 0, 1),
             "view_dependence.share": (view.share, 0, 1),
             "view_dependence.rate": (view.rate, 0, math.inf),
             "view_dependence.idle": (view.idle, 0, math.inf),
