@@ -7,11 +7,12 @@ from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
+BYTEWISE = "Bytewise, long tails"
 LARGER, SMALLER = "larger_pictures", "equal_bytes"
 COMPARED = (
     ("A²TG, as quick has it", "2DGS*-MCMC"),
-    ("Bytewise", "Bytewise, without textures"),
-    ("Bytewise", "2DGS*-MCMC, degree 0"),
+    (BYTEWISE, f"{BYTEWISE}, without textures"),
+    (BYTEWISE, "2DGS*-MCMC, degree 0"),
 )
 """Methods, each with the one that it is compared with."""
 

@@ -11,7 +11,7 @@ from lab.grid import Grid
 from lab.versions import is_from_before
 
 BYTEWISE, TEXTURED, PLAIN = "Bytewise", "A²TG, as quick has it", "2DGS*-MCMC"
-GAUSSIAN = f"{BYTEWISE}, Gaussian kernels"
+GAUSSIAN, LONG = f"{BYTEWISE}, Gaussian kernels", f"{BYTEWISE}, long tails"
 MCMC_0 = f"{PLAIN}, degree 0"
 UNPRUNED_METHODS = (MCMC_0, "2DGS*, degree 0")
 PLAIN_METHODS = (*UNPRUNED_METHODS, *(f"{label}, pruned" for label in UNPRUNED_METHODS))
@@ -22,6 +22,7 @@ OTHERS = {
     f"{GAUSSIAN}, less {BEST}": (GAUSSIAN, BEST),
     f"{BYTEWISE} less {BEST_UNPRUNED}": (BYTEWISE, BEST_UNPRUNED),
     f"{BYTEWISE} less the same with Gaussian kernels": (BYTEWISE, GAUSSIAN),
+    f"{BYTEWISE} less the same with long tails": (BYTEWISE, LONG),
     f"{BYTEWISE} less MCMC of degree 0": (BYTEWISE, MCMC_0),
     f"{BYTEWISE} less MCMC of degree 3": (BYTEWISE, PLAIN),
 }
