@@ -85,8 +85,12 @@ def on_scene(results: Sequence[tables.Result], scene: str, label: str, other: st
 
 
 def panels(results: Sequence[tables.Result]) -> list:
-    """Return curves of PSNR and LPIPS against bytes: means over the scenes, if a method was trained on all of them."""
+    """Return curves of PSNR and LPIPS against bytes: means over the scenes, if a method was trained on all of them.
+
+    Methods with such a mean at half of the sizes or fewer are left to the tables.
+    """
     scenes = {result.run.cell.scene for result in results}
+    num_sizes = len({result.run.cell.budget for result in results})
     found = []
     for figure, told in FIGURES:
         curves = {
@@ -97,7 +101,8 @@ def panels(results: Sequence[tables.Result]) -> list:
             ]
             for label, sizes in by_budget(results).items()
         }
-        found.append((f"mean of {len(scenes)} scenes", curves, "MB", told))
+        shown = {label: points for label, points in curves.items() if 2 * len(points) > num_sizes}
+        found.append((f"mean of {len(scenes)} scenes", shown, "MB", told))
     return found
 
 
