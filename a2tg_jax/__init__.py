@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from a2tg_jax.densify.clone_split import CloneSplitPrune as CloneSplitPrune
     from a2tg_jax.densify.clone_split import FillingDensity as FillingDensity
     from a2tg_jax.densify.clone_split import OpacityReset as OpacityReset
+    from a2tg_jax.densify.exponents import LimitExponents as LimitExponents
     from a2tg_jax.densify.floaters import PruneFloaters as PruneFloaters
     from a2tg_jax.densify.pruning import Prune as Prune
     from a2tg_jax.densify.splitting import SplitByGradient as SplitByGradient
@@ -188,6 +189,7 @@ _NAMES = {
         "with_validation_views",
     ),
     "a2tg_jax.densify.clone_split": ("CloneSplitPrune", "FillingDensity", "OpacityReset"),
+    "a2tg_jax.densify.exponents": ("LimitExponents",),
     "a2tg_jax.densify.floaters": ("PruneFloaters",),
     "a2tg_jax.densify.pruning": ("Prune",),
     "a2tg_jax.densify.splitting": ("SplitByGradient",),

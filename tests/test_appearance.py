@@ -11,7 +11,7 @@ from a2tg_jax import Model, TextureOptions, Textures, load_model, render_appeara
 from a2tg_jax.appearance import Appearance, Banded, Billboards, MovableKernels, Plain, Shaped, Textured, appearance_for
 from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.layers import layer_without, layers_in_words
-from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, exponents_of
+from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
 from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.gaussians import logit
 from a2tg_jax.texture import allocate_textures
@@ -148,24 +148,6 @@ def test_what_is_trained_is_projected():
     _, params, _ = allocated(Billboards())
     (bucket,) = Billboards().project(moved(params)).buckets
     assert bucket[..., 3].min() == 0 and bucket[..., 3].max() == 1 and bucket[..., :3].min() < -3
-
-
-def test_exponents_are_projected_to_the_least():
-    inner = Textured((2, 3), TextureOptions(rgb="unit"))
-    _, params, _ = allocated(Shaped(inner))
-    params = params._replace(shapes=jnp.linspace(-20.0, 20.0, params.shapes.shape[0]))
-    np.testing.assert_array_equal(Shaped(inner).project(params).shapes, params.shapes)
-    projected = Shaped(inner, least_exponent=0.6).project(moved(params))
-    exponents = exponents_of(projected.shapes)
-    np.testing.assert_allclose(exponents, np.maximum(exponents_of(moved(params).shapes), 0.6), rtol=1e-6)
-    assert exponents.min() < 0.601 and exponents.max() > 2.7
-    assert projected.inner.buckets[0].min() == 0  # the texels' projection is kept
-
-
-@pytest.mark.parametrize("least", [-0.1, 1.1, float("nan"), "small"])
-def test_least_exponents_out_of_range(least):
-    with pytest.raises(ValueError, match="least_exponent must be"):
-        Shaped(least_exponent=least)
 
 
 def test_copies_of_a_billboard_show_what_one_did():

@@ -2,13 +2,19 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_values import some_gaussians
 
 import a2tg_jax as a2tg
+from a2tg_jax import Model
 from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance import Banded, Shaped, Textured
 from a2tg_jax.appearance.shaped import exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
+from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
 from a2tg_jax.io.config_json import config_to_dict
@@ -141,7 +147,7 @@ def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_pat
 
 def test_without_a_budget_the_cap_says_how_many_bytes():
     system = dataclasses.replace(Bytewise.preset("quick"), memory_budget=None)
-    degrees, textures = system.stages()[1].events
+    degrees, textures, _ = system.stages()[1].events
     assert isinstance(degrees, AdaptDegrees) and isinstance(textures, Upscale)
     assert textures.budget_mb == pytest.approx(56e-6 * system.densify.cap)
     assert degrees.budget_mb == pytest.approx((1 - system.texture.share) * textures.budget_mb)
@@ -154,7 +160,7 @@ def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
     changes = {"view_dependence": {"share": shares[0]}, "texture": {"share": shares[1]}}
     system = Bytewise.preset("quick", **changes, **limit)
     system.check_given_number(most)
-    for event in system.stages()[1].events:
+    for event in system.stages()[1].events[:-1]:
         assert event_budget(bytes_of(event.budget_mb), 56 * most, 1, 1) >= 0
     name = "densify.cap" if "densify" in limit else "memory_budget"
     with pytest.raises(ValueError, match=rf"^{name} .*has room for {most:,} .* and {most + 1:,} are given: raise it"):
@@ -208,8 +214,8 @@ def test_runs_of_before_exponents_had_a_least_go_on_without_one():
     before = system_from_dict(record, "model.npz").kernel
     assert before == KernelConfig(Bytewise().kernel.rate, 0.0)
     whole = with_changes(Bytewise.preset("quick"), {"kernel": {"least_exponent": 0.0}}, "test")
-    assert "least_exponent" not in fingerprint(whole, 0)  # so that what was trained before is known
-    assert "least_exponent" in fingerprint(Bytewise.preset("quick"), 0)
+    assert "LimitExponents" not in fingerprint(whole, 0)  # so that what was trained before is known
+    assert "LimitExponents" in fingerprint(Bytewise.preset("quick"), 0)
 
 
 def test_the_least_exponent_reaches_both_stages(scene):
@@ -218,6 +224,22 @@ def test_the_least_exponent_reaches_both_stages(scene):
     exponents = exponents_of(model.appearance.shapes(model.params))[: model.num]
     np.testing.assert_allclose(exponents.min(), 0.8, rtol=1e-5)
     assert exponents.max() > 1
+
+
+def test_exponents_are_limited_whatever_is_around_them():
+    gaussians = some_gaussians()
+    for appearance in (Shaped(), Banded(Shaped(Textured((2, 3))))):
+        model = Model(gaussians, *appearance.allocate(jax.random.key(0), gaussians), appearance=appearance)
+        shapes = jnp.linspace(-20.0, 20.0, gaussians.num)
+        model = dataclasses.replace(model, params=appearance.with_shapes(model.params, shapes))
+        limited = jax.jit(lambda model: LimitExponents(0.6).apply(None, model, None, ()).model)(model)
+        exponents = exponents_of(appearance.shapes(limited.params))
+        np.testing.assert_allclose(exponents, np.maximum(exponents_of(shapes), 0.6), rtol=1e-6)
+
+
+def test_a_limit_of_exponents_wants_shapes():
+    with pytest.raises(ValueError, match="LimitExponents wants kernels with shapes"):
+        LimitExponents().apply(None, Model(some_gaussians()), None, ())
 
 
 @pytest.mark.parametrize(

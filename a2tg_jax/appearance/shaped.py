@@ -25,7 +25,6 @@ from a2tg_jax.appearance.billboards import Billboards
 from a2tg_jax.appearance.plain import Plain
 from a2tg_jax.appearance.rule import Factor, Residual, RuleAround, has_gaussian_falloff
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.spread_arrays import rows_moved
 
@@ -35,8 +34,8 @@ OFFSET = 0.02
 """δ, in squared standard deviations."""
 LARGEST_LOG_EXPONENT = 1.0
 """Largest logarithm of an exponent, and of its inverse."""
-SMALLEST_EXPONENT = math.exp(-LARGEST_LOG_EXPONENT)
-"""Exponent that those of all shapes are above."""
+LEAST_EXPONENT = math.exp(-LARGEST_LOG_EXPONENT)
+"""Lower bound of the exponents of all shapes."""
 MOST_SHARE = 1 - 1e-7
 """Largest tanh of a shape that is read, so that the shape is finite."""
 MOST_ROUNDED = 1.5
@@ -155,13 +154,9 @@ class Shaped(AppearanceAround):
     it."""
 
     inner: Appearance = dataclasses.field(default_factory=Plain)
-    least_exponent: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
-    """Smallest exponent that training leaves, 0 to 1; all are above 1/e in any case. The smaller it is, the more pixels
-    a kernel's tails reach."""
 
     def __post_init__(self) -> None:
         """Refuse an inner appearance with degrees, with shapes of its own, or of billboards."""
-        check_number("least_exponent", self.least_exponent, least=0, most=1)
         inner = self.inner
         if inner.has_degrees or inner.shapes_name is not None or isinstance(inner, Billboards):
             raise ValueError(REFUSAL.format(type(inner).__name__))
@@ -192,14 +187,6 @@ class Shaped(AppearanceAround):
     def rates(self, rate: Any, params: ShapedParams) -> ShapedParams:
         """Return the rates of `ShapedRates`."""
         return ShapedParams(rate.shapes, self.inner.rates(rate.inner, params.inner))
-
-    def project(self, params: ShapedParams) -> ShapedParams:
-        """Return the parameters with exponents that are no smaller than the least, up to rounding."""
-        projected: ShapedParams = super().project(params)
-        if self.least_exponent <= SMALLEST_EXPONENT:
-            return projected
-        least = math.atanh(math.log(self.least_exponent) / LARGEST_LOG_EXPONENT)
-        return projected._replace(shapes=jnp.maximum(params.shapes, least))
 
     def num_floats(self, layout: ShapedLayout, num: int) -> int:
         return num + self.inner.num_floats(layout.inner, num)

@@ -17,7 +17,9 @@ from a2tg_jax.appearance import (
     Textured,
     TextureOptions,
 )
+from a2tg_jax.appearance.shaped import LEAST_EXPONENT
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
+from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
@@ -58,8 +60,8 @@ class KernelConfig:
     """Adam's learning rate of the shapes; 0: all kernels are Gaussians, as other programs draw them, for which a
     view_dependence.share of 0.23 is better."""
     least_exponent: float = 0.6
-    """Smallest exponent of a kernel, 0 to 1; smaller ones have longer tails, which take longer to draw. 0: no limit but
-    1/e."""
+    """Lower limit of the exponents of kernels, 0 to 1; smaller ones have longer tails, which take longer to draw. 0: no
+    limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +117,7 @@ class Bytewise(System):
     event_options: ClassVar[Mapping[str, str]] = {
         **MCMC_OPTIONS,
         **PRUNE_OPTIONS,
+        "LimitExponents.least": "kernel.least_exponent",
         "AdaptDegrees.at": "view_dependence.at",
         "AdaptDegrees.idle": "view_dependence.idle",
         "AdaptDegrees.highest": "sh_degree",
@@ -136,7 +139,13 @@ class Bytewise(System):
         """Return the events that fill all bytes, prune during growth, and finally make room for details."""
         grow = SplitByGradient(self._num_gaussians())
         last = (Prune(keep=self._num_kept()),) if self._share else ()
-        return Noise(), grow, *self.prune.events(self.stage1_iterations, densify_times), *last
+        return Noise(), grow, *self.prune.events(self.stage1_iterations, densify_times), *last, *self._limits()
+
+    def _limits(self) -> tuple[Event, ...]:
+        """Return the event that limits the exponents of kernels, if there is a limit that matters."""
+        kernel = self.kernel
+        is_limited = kernel.rate and kernel.least_exponent > LEAST_EXPONENT
+        return (LimitExponents(kernel.least_exponent),) if is_limited else ()
 
     @property
     def _share(self) -> float:
@@ -185,10 +194,7 @@ class Bytewise(System):
 
     def _shaped(self, inner: Appearance, rates: Any) -> tuple[Appearance, Any]:
         """Return an appearance and its rates with shapes of the kernels, if they are trained."""
-        kernel = self.kernel
-        if not kernel.rate:
-            return inner, rates
-        return Shaped(inner, kernel.least_exponent), ShapedRates(kernel.rate, rates)
+        return (Shaped(inner), ShapedRates(self.kernel.rate, rates)) if self.kernel.rate else (inner, rates)
 
     def _details(self) -> tuple[Event, ...]:
         """Return the events of degrees, up to their share of the bytes, then of texels for the rest."""
@@ -200,7 +206,7 @@ class Bytewise(System):
             events.append(from_options(AdaptDegrees, view, budget_mb=most, highest=self.sh_degree))
         if texture.share:
             events.append(from_options(Upscale, texture, select="budget", budget_mb=megabytes))
-        return tuple(events)
+        return (*events, *self._limits())
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
