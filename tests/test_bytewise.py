@@ -237,6 +237,16 @@ def test_exponents_are_limited_whatever_is_around_them():
         np.testing.assert_allclose(exponents, np.maximum(exponents_of(shapes), 0.6), rtol=1e-6)
 
 
+@pytest.mark.parametrize("least", [0.0, 0.3, 0.36])
+def test_a_limit_below_all_exponents_changes_none(least):
+    gaussians = some_gaussians()
+    params, layout = Shaped().allocate(jax.random.key(0), gaussians)
+    shapes = jnp.linspace(-20.0, 20.0, gaussians.num)
+    model = Model(gaussians, params._replace(shapes=shapes), layout, appearance=Shaped())
+    limited = LimitExponents(least).apply(None, model, None, ()).model
+    np.testing.assert_allclose(exponents_of(limited.params.shapes), exponents_of(shapes), rtol=1e-6)
+
+
 def test_a_limit_of_exponents_wants_shapes():
     with pytest.raises(ValueError, match="LimitExponents wants kernels with shapes"):
         LimitExponents().apply(None, Model(some_gaussians()), None, ())
