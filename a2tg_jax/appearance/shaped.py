@@ -10,7 +10,6 @@ which is 1 at the centre and 1/e at ρ = 2 for every β, as a Gaussian's is. δ 
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -34,8 +33,6 @@ OFFSET = 0.02
 """δ, in squared standard deviations."""
 LARGEST_LOG_EXPONENT = 1.0
 """Largest logarithm of an exponent, and of its inverse."""
-LEAST_EXPONENT = math.exp(-LARGEST_LOG_EXPONENT)
-"""Lower bound of the exponents of all shapes."""
 MOST_SHARE = 1 - 1e-7
 """Largest tanh of a shape that is read, so that the shape is finite."""
 MOST_ROUNDED = 1.5

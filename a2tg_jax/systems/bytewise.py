@@ -17,7 +17,6 @@ from a2tg_jax.appearance import (
     Textured,
     TextureOptions,
 )
-from a2tg_jax.appearance.shaped import LEAST_EXPONENT
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.pruning import Prune
@@ -142,10 +141,9 @@ class Bytewise(System):
         return Noise(), grow, *self.prune.events(self.stage1_iterations, densify_times), *last, *self._limits()
 
     def _limits(self) -> tuple[Event, ...]:
-        """Return the event that limits the exponents of kernels, if there is a limit that matters."""
+        """Return the event that limits the exponents of kernels, if they are trained and have a limit."""
         kernel = self.kernel
-        is_limited = kernel.rate and kernel.least_exponent > LEAST_EXPONENT
-        return (LimitExponents(kernel.least_exponent),) if is_limited else ()
+        return (LimitExponents(kernel.least_exponent),) if kernel.rate and kernel.least_exponent else ()
 
     @property
     def _share(self) -> float:
