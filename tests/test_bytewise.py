@@ -194,7 +194,7 @@ def test_options_by_hand_of_a_subclass_are_no_record():
     assert with_earlier_options(Other, {"memory_budget": 1.0}) == {"memory_budget": 1.0}
     record = config_to_dict(Other())
     del record["kernel"]
-    assert with_earlier_options(Other, record)["kernel"]["rate"] == 0
+    assert with_earlier_options(Other, record)["kernel"] == {"rate": 0.0, "least_exponent": 0.0}
 
 
 def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():
